@@ -1,0 +1,1 @@
+"""The daemon: ties devices (`hal`) and numbers (`estimator`) into one asyncio process that publishes poses."""

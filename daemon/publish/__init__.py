@@ -1,0 +1,1 @@
+"""Publishers: one snapshot, many forms (Modbus, UDP datagrams)."""

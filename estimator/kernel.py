@@ -1,0 +1,101 @@
+"""The one way to make a numba function here, and the one place where its compiled form is kept.
+
+Every hot function is written as a plain Python function and decorated with :func:`kernel`:
+
+* an explicit signature: it compiles when imported, never inside a cycle, and a wrong dtype is a ``TypeError``;
+* ``nogil``: the worker may run it beside the event loop;
+* NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
+* ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
+* cached on disk under a directory named by a hash of *all* kernel sources and of the compiler's versions. numba's own
+  key does not cover callees in other files, so an edited callee would leave a stale caller behind.
+
+This is the only module of the room that touches the file system; it does so once, when first imported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, ParamSpec, TypeVar
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import config as _numba_config
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+FASTMATH: Final = {"contract", "reassoc", "arcp", "nsz"}
+
+
+def source_key() -> str:
+    """Hash of every source file of this room and of the versions that turn it into machine code."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    versions = (sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__)
+    digest.update(repr(versions).encode())
+    return digest.hexdigest()[:16]
+
+
+def _writable(directory: Path) -> bool:
+    """numba ignores a cache directory it cannot create a file in, silently; find out first."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            return True
+    except OSError:
+        return False
+
+
+def _cache_roots() -> list[Path]:
+    """Candidates in order: explicit, the service manager's CacheDirectory, the user's cache, a temporary directory."""
+    env = os.environ
+    named = [env[name] for name in ("NUMBA_CACHE_DIR", "CACHE_DIRECTORY") if env.get(name)]
+    home = env.get("XDG_CACHE_HOME") or (str(Path(env["HOME"]) / ".cache") if env.get("HOME") else "")
+    roots = [Path(name) for name in named]
+    if home:
+        roots.append(Path(home) / "lumiloop")
+    roots.append(Path(tempfile.gettempdir()) / f"lumiloop-{os.getuid()}")
+    return roots
+
+
+def _choose_cache() -> Path:
+    key = source_key()
+    for root in _cache_roots():
+        directory = root / f"kernels-{key}"
+        if _writable(directory):
+            return directory
+    raise RuntimeError("no writable directory for compiled kernels; set NUMBA_CACHE_DIR to one")
+
+
+CACHE_DIR: Final = _choose_cache()
+"""Where compiled kernels of exactly these sources live."""
+
+_numba_config.CACHE_DIR = str(CACHE_DIR)
+
+
+def cache_is_warm() -> bool:
+    """Whether an earlier start has left compiled kernels of these sources for this directory."""
+    return any(CACHE_DIR.rglob("*.nbc"))
+
+
+def kernel(signature: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
+
+    The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        compiled: Any = numba.njit(
+            signature, nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", boundscheck=None
+        )(function)
+        return compiled  # type: ignore[no-any-return]  # numba has no types
+
+    return decorate

@@ -1,0 +1,107 @@
+"""Typed SI records that go into `step`, each with the interval of ``t_mono`` in which it was true.
+
+Frames follow REP-103: x forward, y left, yaw counter-clockwise, metres, radians, seconds. ``T_a_b`` maps b coordinates
+into a; a planar transform is a float64 array ``(x, y, yaw)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class Beam(IntEnum):
+    """A beam says one of three things (glass and darkness make the third one necessary)."""
+
+    HIT = 1  # there is a surface at `range_m`
+    FREE = 2  # nothing up to `range_m`
+    NONE = 0  # no statement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One revolution of a lidar in SI units. All arrays have one element per beam, in order of measurement.
+
+    Attributes:
+        t_begin, t_end: ``t_mono`` of the first and of the last beam; equal when the log does not say.
+        T_base_lidar: mount of the lidar on the robot.
+        bearing_rad: in the lidar frame, inversion already applied.
+        range_m: metres; meaningful where ``beam`` is HIT (surface) or FREE (bound).
+        beam: uint8 of :class:`Beam`.
+        intensity: device units or None; the Q of the paper's quality filter.
+        sigma_m: one-sigma range noise of this kind of device.
+        seq: the device's scan counter, so that results can be told apart.
+    """
+
+    t_begin: float
+    t_end: float
+    seq: int
+    T_base_lidar: Array
+    bearing_rad: Array
+    range_m: Array
+    beam: npt.NDArray[np.uint8]
+    sigma_m: float
+    intensity: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Increment of the base pose over ``[t_begin, t_end]``, expressed in the base frame at ``t_begin``."""
+
+    t_begin: float
+    t_end: float
+    delta: Array  # (dx, dy, dyaw)
+
+
+@dataclass(frozen=True, slots=True)
+class Imu:
+    """Yaw turned over ``[t_begin, t_end]`` according to a gyro, rad."""
+
+    t_begin: float
+    t_end: float
+    dyaw: float
+
+
+class Order(Enum):
+    """What a person or a PLC may ask of the estimator."""
+
+    SET_POSE = "set_pose"
+    RESET = "reset"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Command:
+    """An order with the pose it carries, if any (``T_map_base``)."""
+
+    t_begin: float
+    order: Order
+    T_map_base: Array | None = None
+
+
+Record = Scan | Odometry | Imu | Command
+"""What `step` takes; light epochs join this union with the photodiode."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The time budget of one cycle, already turned into caps; nothing in this room reads a clock.
+
+    Attributes:
+        icp_iterations: cap on matching iterations.
+        points: cap on query points per match (the scan is thinned evenly above it).
+        update_map: whether keyframe and map work may run in this cycle.
+    """
+
+    icp_iterations: int
+    points: int
+    update_map: bool
+
+
+UNLIMITED: Final = Limits(icp_iterations=50, points=100_000, update_map=True)
+"""Caps that never bind; what replay of a foreign log uses."""

@@ -1,0 +1,32 @@
+"""Wheel odometry as an input of its own: cumulative pose of the base in a frame that drifts but does not jump."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class RawOdometry:
+    """A cumulative odometry reading.
+
+    Attributes:
+        t_rx: ``t_mono`` of arrival (kernel receive stamp where there is one).
+        t_mono: ``t_mono`` at which the pose held; equals ``t_rx`` when the sender has no shared clock.
+        x, y: metres. yaw: rad, counter-clockwise, not necessarily wrapped.
+    """
+
+    t_rx: float
+    t_mono: float
+    x: float
+    y: float
+    yaw: float
+
+
+class OdometrySource(Protocol):
+    """Anything that yields odometry: a UDP listener, a Modbus write, a log."""
+
+    async def run(self, on_odometry: Callable[[RawOdometry], None]) -> None:
+        """Deliver readings from the loop thread until cancelled or exhausted."""
+        ...

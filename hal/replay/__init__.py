@@ -1,0 +1,1 @@
+"""Recorded logs played back as devices: CARMEN, own recordings, raw SCIP captures."""

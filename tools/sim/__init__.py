@@ -1,0 +1,1 @@
+"""The simulated building: walls, robot, lidar beams."""
