@@ -25,7 +25,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 import llvmlite
 import numba
 import numpy as np
-from numba.core import config as _numba_config
+from numba.core import config
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -45,7 +45,7 @@ def source_key() -> str:
 
 
 def _writable(directory: Path) -> bool:
-    """numba ignores a cache directory it cannot create a file in, silently; find out first."""
+    """Whether a file can be made there: numba ignores a cache directory it cannot create a file in, silently."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=directory):
@@ -78,6 +78,7 @@ def _choose_cache() -> Path:
 CACHE_DIR: Final = _choose_cache()
 """Where compiled kernels of exactly these sources live."""
 
+_numba_config: Any = config  # untyped upstream; read by numba each time a function is decorated
 _numba_config.CACHE_DIR = str(CACHE_DIR)
 
 

@@ -6,6 +6,7 @@ into a; a planar transform is a float64 array ``(x, y, yaw)``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Final
@@ -84,7 +85,29 @@ class Command:
     T_map_base: Array | None = None
 
 
-Record = Scan | Odometry | Imu | Command
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work that must not delay a cycle (rendering, later loop search and the pose graph).
+
+    Attributes:
+        priority: lower runs first. run: calls nogil kernels in slices of at most 20 ms; returns the answer's payload.
+    """
+
+    job_id: int
+    priority: int
+    run: Callable[[], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A job's payload, handed back in the cycle in which it is applied (recorded, so that replay repeats it)."""
+
+    t_begin: float
+    job_id: int
+    payload: object
+
+
+Record = Scan | Odometry | Imu | Command | Answer
 """What `step` takes; light epochs join this union with the photodiode."""
 
 

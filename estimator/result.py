@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from estimator.records import Array
+from estimator.records import Array, Job
 
 
 class Reason(Enum):
@@ -71,7 +71,10 @@ class StepResult:
         known_axes: (x, y, yaw) 1 known, 0 unknown, in the map frame.
         match: the scan match, None in a step without a scan.
         keyframe: ID of a keyframe laid in this step, or -1. loop: accepted in this step, or None.
+        anchor, T_anchor_base: keyframe this pose hangs on and the pose relative to it (0 is the start), so that a
+            trajectory kept as anchors follows every later correction of the map.
         jumps: how often T_map_odom moved by more than 5 cm or 1 deg at once, since the start.
+        jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
     t_mono: float
@@ -83,4 +86,7 @@ class StepResult:
     match: MatchResult | None
     keyframe: int
     loop: Loop | None
+    anchor: int
+    T_anchor_base: Array
     jumps: int
+    jobs: tuple[Job, ...] = ()

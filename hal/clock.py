@@ -33,9 +33,11 @@ class SystemClock:
     """CLOCK_MONOTONIC, which is also what asyncio's loops use for ``loop.time()`` on Linux."""
 
     def now(self) -> float:
+        """Seconds of CLOCK_MONOTONIC."""
         return time.monotonic()
 
     def utc(self) -> float:
+        """Seconds since the Unix epoch."""
         return time.time()
 
 
@@ -47,9 +49,11 @@ class LoopClock:
         self._utc_at_zero = utc_at_zero
 
     def now(self) -> float:
+        """Seconds of the loop's virtual time."""
         return self._loop.time()
 
     def utc(self) -> float:
+        """The epoch chosen at construction plus virtual time."""
         return self._utc_at_zero + self._loop.time()
 
 
@@ -83,6 +87,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._clock_resolution = 1e-9
 
     def time(self) -> float:
+        """Virtual seconds, as timers see them."""
         return self._jumping.virtual_now
 
 

@@ -38,7 +38,7 @@ class DeviceMissing(HalError):
 
 
 class DeviceRefused(HalError):
-    """The device is there but not for us (permission, busy, not the expected kind). Policy: retry slowly, ask a person."""
+    """The device is there but not for us (permission, busy, another kind). Policy: retry slowly, ask a person."""
 
 
 class DeviceFault(HalError):
