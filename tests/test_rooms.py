@@ -17,7 +17,9 @@ MAY_IMPORT = {
     "hal": {"hal"},
     "daemon": {"daemon", "hal", "estimator"},
 }
-ESTIMATOR_NEVER = set("os asyncio time socket serial threading pathlib io subprocess logging random".split())
+ESTIMATOR_NEVER = set(
+    ["os", "asyncio", "time", "socket", "serial", "threading", "pathlib", "io", "subprocess", "logging", "random"]
+)
 ESTIMATOR_EXCEPTION = "kernel.py"  # finds the kernel cache once, at import
 
 

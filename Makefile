@@ -1,0 +1,58 @@
+# lumiloop: every job a person or a CI machine does, by name. `make help` lists them.
+# System packages (Debian/Ubuntu): python3 (>= 3.11) python3-venv make
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.dev-stamp
+RUN    := $(BIN)/python -W default
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test test-system test-all check bench lock docs clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+
+$(STAMP): requirements/dev.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "lumiloop needs Python >= 3.11; set PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "the venv module is missing: apt-get install python3-venv"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/dev.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+venv: $(STAMP)  ## make .venv with everything at the locked versions
+
+demo: venv  ## the daemon on a simulated robot in a simulated building, for a minute, then a map picture
+	$(RUN) -m tools.demo $(ARGS)
+
+check: venv  ## formatting, lint, strict types
+	$(BIN)/ruff format --check --quiet .
+	$(BIN)/ruff check --quiet .
+	$(BIN)/mypy
+
+test: check  ## everything quick (no root, <= 12 minutes)
+	$(BIN)/python -m pytest -q -m "not system and not slow" $(ARGS)
+	$(BIN)/python -m tools.floors
+
+test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)
+	$(BIN)/python -m pytest -q -m "system and not slow" $(ARGS)
+
+test-all: check  ## all of it, the long ones included
+	$(BIN)/python -m pytest -q $(ARGS)
+	$(BIN)/python -m tools.floors
+
+bench: venv requirements/bench.lock  ## figures as a table and as out/bench/*.json, ratios against peers in the same run
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
+	$(RUN) -m tools.bench $(ARGS)
+
+docs: venv  ## regenerate the documents that come from code
+	$(RUN) -m tools.docs
+
+lock:  ## renew the lock files (needs uv)
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade pyproject.toml -o requirements/core.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot pyproject.toml -o requirements/dev.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot --extra bench pyproject.toml -o requirements/bench.lock
+
+clean:  ## remove what the targets above made
+	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

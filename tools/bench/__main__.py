@@ -1,0 +1,48 @@
+"""``python -m tools.bench [name ...]``: run the benchmarks, print their tables, write ``out/bench/<name>.json``.
+
+A benchmark is a module of this package with ``run() -> list[Figure]``. Times are compared with a peer in the same run,
+because this kind of machine is shared and noisy; a missed target is printed, never turned into a failed test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pkgutil
+import sys
+from pathlib import Path
+
+import tools.bench
+from tools.figures import save, table
+
+
+def names() -> list[str]:
+    """Benchmarks that exist, sorted."""
+    return sorted(m.name for m in pkgutil.iter_modules(tools.bench.__path__) if not m.name.startswith("_"))
+
+
+def main() -> int:
+    """Run what was asked for; exit status 1 when a benchmark could not run at all."""
+    parser = argparse.ArgumentParser(prog="python -m tools.bench", description=__doc__)
+    parser.add_argument("name", nargs="*", help=f"which ones (default: all of {', '.join(names())})")
+    parser.add_argument("--out", type=Path, default=Path("out/bench"))
+    options = parser.parse_args()
+    unknown = set(options.name) - set(names())
+    if unknown:
+        parser.error(f"no such benchmark: {', '.join(sorted(unknown))}; there are {', '.join(names())}")
+    failed = False
+    for name in options.name or names():
+        print(f"\n== {name}", flush=True)
+        try:
+            figures = importlib.import_module(f"tools.bench.{name}").run()
+        except Exception as error:  # noqa: BLE001  one broken benchmark must not hide the others' figures
+            print(f"{name} could not run: {error!r}")
+            failed = True
+            continue
+        print(table(figures))
+        print(f"written: {save(name, figures, options.out)}")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
