@@ -6,10 +6,12 @@ driver code runs over all three kinds, which is what lets virtual-time tests car
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Protocol
 
-from hal.errors import HalError
+from hal.clock import Clock
+from hal.errors import DeviceMissing, DeviceRefused, HalError
 
 OnData = Callable[[bytes, float], None]
 """Called with bytes and the ``t_mono`` taken before anything else was done with them."""
@@ -53,3 +55,109 @@ class PortOpener(Protocol):
             DeviceMissing: nothing there. DeviceRefused: permission, busy, not a tty.
         """
         ...
+
+
+async def open_port(device: str, baud: int) -> Port:
+    """Open a real device: the :class:`PortOpener` of the daemon.
+
+    Args:
+        device: path of a serial port (``/dev/ttyACM0``) or ``tcp://host:port`` (SCIP: port 10940, the default).
+        baud: line rate in bit/s; without meaning on USB CDC and TCP.
+
+    Raises:
+        DeviceMissing: no such path, unplugged, host unreachable.
+        DeviceRefused: permission, busy, not a serial port, or a name of neither kind.
+    """
+    if device.startswith("tcp://"):
+        from hal.tcp_port import open_tcp_port
+
+        return await open_tcp_port(device)
+    if device.startswith("/"):
+        from hal.serial_port import open_serial_port
+
+        return await open_serial_port(device, baud)
+    raise DeviceRefused(device, "not a device name", "expected a path such as /dev/ttyACM0, or tcp://host:port")
+
+
+class MemoryPort:
+    """One end of a pair that carries bytes inside one event loop, in virtual or real time.
+
+    Every write arrives at the other end as one piece, from the loop, never inside the writer's call. There is no
+    latency, no line rate and no limit to what is in flight: a fake device that wants those makes its own delays and
+    pieces. :attr:`peer_baud` lets it notice that the driver listens at another rate.
+    """
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self._name = name
+        self._clock = clock
+        self._peer: MemoryPort | None = None
+        self._inbox: list[bytes] = []
+        self._on_data: OnData | None = None
+        self._on_lost: OnLost | None = None
+        self._closed = False
+        self._lost: HalError | None = None
+        self.baud = 0
+
+    @property
+    def name(self) -> str:
+        """The name given to :func:`memory_pair`."""
+        return self._name
+
+    @property
+    def closed(self) -> bool:
+        """True once this end was closed or the other end went away and that was told."""
+        return self._closed
+
+    @property
+    def peer_baud(self) -> int:
+        """Line rate the other end was last set to, 0 if never."""
+        return self._peer.baud if self._peer else 0
+
+    def start(self, on_data: OnData, on_lost: OnLost) -> None:
+        """Begin delivering; what the other end wrote before comes first."""
+        self._on_data, self._on_lost = on_data, on_lost
+        self._wake()
+
+    def write(self, data: bytes) -> None:
+        """Hand ``data`` to the other end; raises `DeviceMissing` after either end was closed."""
+        if self._closed or self._lost or self._peer is None:
+            raise DeviceMissing(self._name, "the port is closed")
+        self._peer._inbox.append(bytes(data))
+        self._peer._wake()
+
+    def set_baud(self, baud: int) -> None:
+        """Remember the rate for the other end to look at."""
+        self.baud = baud
+
+    def close(self) -> None:
+        """Close; the other end is told, after the bytes already written to it (an unplug, or a daemon that left)."""
+        if self._closed:
+            return
+        self._closed = True
+        self._inbox.clear()
+        if self._peer is not None and not self._peer._closed:
+            self._peer._lost = DeviceMissing(self._name, "the other end was closed")
+            self._peer._wake()
+
+    def _wake(self) -> None:
+        if self._on_data is not None:
+            asyncio.get_running_loop().call_soon(self._deliver)
+
+    def _deliver(self) -> None:
+        while self._inbox and self._on_data is not None and not self._closed:
+            self._on_data(self._inbox.pop(0), self._clock.now())
+        if self._lost is not None and self._on_lost is not None and not self._closed:
+            self._closed = True
+            self._on_lost(self._lost)
+
+
+def memory_pair(clock: Clock, name: str = "memory") -> tuple[MemoryPort, MemoryPort]:
+    """Two ends of a byte channel in memory, for fakes and replay; which end is whose does not matter.
+
+    Args:
+        clock: gives the arrival times, a :class:`hal.clock.LoopClock` under virtual time.
+        name: what both ends are called in errors.
+    """
+    ends = MemoryPort(name, clock), MemoryPort(name, clock)
+    ends[0]._peer, ends[1]._peer = ends[1], ends[0]
+    return ends
