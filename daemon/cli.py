@@ -1,0 +1,182 @@
+"""The command line. Each command's body is imported only when it runs, so that small commands stay small.
+
+Exit codes: 0 done, 1 it failed (the text says what and what to do), 2 wrong usage or configuration, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+OK: Final = 0
+FAILED: Final = 1
+USAGE: Final = 2
+INTERRUPTED: Final = 130
+
+Body = Callable[[argparse.Namespace], int]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code. Wrong usage raises SystemExit(2) after explaining itself."""
+    parser = _parser()
+    args = parser.parse_args(argv)
+    body: Body | None = getattr(args, "body", None)
+    if body is None:
+        parser.print_help(sys.stderr)
+        return USAGE
+    try:
+        return body(args)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has gone; there is nobody to tell
+        return OK
+
+
+def fail(message: str, code: int = FAILED) -> int:
+    """Say on stderr what went wrong and return the exit code."""
+    sys.stderr.write(f"lumiloop: {message}\n")
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="lumiloop",
+        description="Indoor robot localisation from a 2D lidar: a pose over Modbus and UDP. Not a safety function.",
+    )
+    _print_option(parser, "--version", _version, "the version")
+    _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
+    _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
+    _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _run(commands.add_parser("run", help="read the lidar, publish the pose, until stopped"))
+    _check(commands.add_parser("check", help="say whether a configuration file is good"))
+    _probe(commands.add_parser("probe", help="find lidars and say what they are"))
+    _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
+    _status(commands.add_parser("status", help="show what a running daemon publishes"))
+    _map(commands.add_parser("map", help="work with maps"))
+    return parser
+
+
+def _print_option(parser: argparse.ArgumentParser, flag: str, text: Callable[[], str], what: str) -> None:
+    def body(args: argparse.Namespace) -> int:
+        sys.stdout.write(text())
+        return OK
+
+    parser.add_argument(flag, action="store_const", const=body, dest="body", help=f"print {what}")
+
+
+def _config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
+    if file:
+        parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
+    parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
+
+
+def _run(parser: argparse.ArgumentParser) -> None:
+    _config_arguments(parser)
+    parser.add_argument("--lidar", metavar="DEVICE", help="same as --set lidar.device=DEVICE")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record raw bytes and cycles into this directory")
+    parser.set_defaults(body=_later("daemon.main", "main"))
+
+
+def _check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
+    _config_arguments(parser, file=False)
+    parser.set_defaults(body=_configured(_good))
+
+
+def _probe(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("devices", nargs="*", metavar="DEVICE", help="where to look; default: everywhere it may be")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    _config_arguments(parser)
+    parser.set_defaults(body=_later("daemon.probe", "main"))
+
+
+def _replay(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="LOG", help="CARMEN log (.gz too), or a recording's directory")
+    parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the results")
+    _config_arguments(parser)
+    parser.set_defaults(body=_later("daemon.replay", "main"))
+
+
+def _status(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("address", nargs="?", metavar="HOST[:PORT]", help="default: the configuration's Modbus server")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
+    _config_arguments(parser)
+    parser.set_defaults(body=_later("daemon.publish.client", "main"))
+
+
+def _map(parser: argparse.ArgumentParser) -> None:
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    export = verbs.add_parser("export", help="write map.pgm, map.yaml and map.png")
+    export.add_argument("log", type=Path, metavar="LOG", help="a log or a recording to take the map from")
+    export.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the files")
+    _config_arguments(export)
+    export.set_defaults(body=_later("daemon.export", "main"))
+
+
+def _later(module: str, name: str) -> Body:
+    """A body that resolves the configuration (``args.settings``: `daemon.config.Config`) and then loads its module."""
+
+    def body(args: argparse.Namespace) -> int:
+        run: Body = getattr(import_module(module), name)
+        return run(args)
+
+    return _configured(body)
+
+
+def _configured(body: Body) -> Body:
+    def resolve_and_run(args: argparse.Namespace) -> int:
+        from daemon import configfile
+
+        overrides = list(args.set)
+        if getattr(args, "lidar", None):
+            overrides.append(f"lidar.device={args.lidar}")
+        try:
+            args.settings = configfile.load(args.config, overrides)
+        except configfile.ConfigError as error:
+            return fail(str(error), USAGE)
+        if args.print_config:
+            sys.stdout.write(configfile.dump(args.settings))
+            return OK
+        return body(args)
+
+    return resolve_and_run
+
+
+def _good(args: argparse.Namespace) -> int:
+    sys.stdout.write(f"{args.config}: good\n")
+    return OK
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"lumiloop {version('lumiloop')}\n"
+    except PackageNotFoundError:
+        return "lumiloop, run from its source tree without being installed\n"
+
+
+def _schema() -> str:
+    from daemon.configfile import schema
+
+    return schema()
+
+
+def _reference() -> str:
+    from daemon.configfile import reference
+
+    return reference()
+
+
+def _defaults() -> str:
+    from daemon.configfile import dump, load
+
+    return dump(load(None))

@@ -1,0 +1,79 @@
+"""The command line's own behaviour: dispatch, exit codes, and that refusals are text, not tracebacks."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+import types
+from pathlib import Path
+
+import pytest
+
+from daemon import cli
+from daemon.config import Config
+
+
+def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("[modbus]\nport = 5020\n")
+    assert cli.main(["check", str(file)]) == cli.OK
+    assert capsys.readouterr().out == f"{file}: good\n"
+    file.write_text("[modbus]\nport = 'x'\n")
+    assert cli.main(["check", str(file)]) == cli.USAGE
+    assert capsys.readouterr().err.startswith(f"lumiloop: {file}:2: Expected `int`, got `str` - at `$.modbus.port`")
+
+
+def test_print_config_resolves_file_and_overrides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("name = 'r7'\n")
+    words = ["run", "--config", str(file), "--lidar", "/dev/ttyACM1", "--set", "modbus.port=0", "--print-config"]
+    assert cli.main(words) == cli.OK
+    printed = tomllib.loads(capsys.readouterr().out)
+    assert (printed["name"], printed["lidar"]["device"], printed["modbus"]["port"]) == ("r7", "/dev/ttyACM1", 0)
+
+
+@pytest.mark.parametrize("flag", ["--schema", "--reference", "--print-config", "--version"])
+def test_printed_facts(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([flag]) == cli.OK
+    assert capsys.readouterr().out.endswith("\n")
+
+
+def test_no_command_shows_help_as_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == cli.USAGE
+    assert "COMMAND" in capsys.readouterr().err
+
+
+def test_unknown_command_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["fly"])
+    assert caught.value.code == cli.USAGE
+    assert "fly" in capsys.readouterr().err
+
+
+def _command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> list[object]:
+    """Replace replay's module by one that keeps what it was called with."""
+    seen: list[object] = []
+
+    def body(args: object) -> int:
+        seen.append(args)
+        if error is not None:
+            raise error
+        return 7
+
+    module = types.ModuleType("daemon.replay")
+    module.main = body  # type: ignore[attr-defined]  # a module made for this test
+    monkeypatch.setitem(sys.modules, "daemon.replay", module)
+    return seen
+
+
+def test_a_command_gets_the_settings_and_its_code_is_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = _command(monkeypatch, None)
+    assert cli.main(["replay", "x.log", "--out", "o", "--set", "name=r9"]) == 7
+    settings = seen[0].settings  # type: ignore[attr-defined]  # argparse.Namespace
+    assert isinstance(settings, Config)
+    assert settings.name == "r9"
+
+
+def test_an_interrupt_is_not_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    _command(monkeypatch, KeyboardInterrupt())
+    assert cli.main(["replay", "x.log", "--out", "o"]) == cli.INTERRUPTED

@@ -1,0 +1,168 @@
+"""The configuration tree: few options, precise refusals, and a print that can be pasted back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon import configfile
+from daemon.config import Config, LidarConfig, Mask, ModbusConfig, Mount, PoseConfig, parse_endpoint
+from daemon.configfile import ConfigError, load
+
+ROOT = Path(__file__).parents[2]
+
+
+def refused(tmp_path: Path, text: str, *overrides: str) -> str:
+    file = tmp_path / "robot.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load(file, overrides)
+    return str(caught.value).replace(f"{tmp_path}/", "")
+
+
+def test_few_options_and_each_one_described() -> None:
+    options = configfile.options()
+    assert 10 <= len(options) <= 25
+    assert [option.path for option in options if not option.description] == []
+
+
+def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "empty.toml"
+    file.write_text("")
+    assert load(file) == load(None) == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("\n[modbus]\nport = 70000", "robot.toml:3: Expected `int` <= 65535 - at `$.modbus.port`"),
+        ("[modbus]\nwrite = 1", "robot.toml:2: Expected `bool`, got `int` - at `$.modbus.write`"),
+        ("[lidar]\nmount = {x = nan}", "robot.toml:2: Expected `float` >= -100.0 - at `$.lidar.mount.x`"),
+        ("lidar.mount.x = inf", "robot.toml:1: Expected `float` <= 100.0 - at `$.lidar.mount.x`"),
+        ("lidar = 3", "robot.toml:1: Expected `object`, got `int` - at `$.lidar`"),
+        ("[lidar.mask]\nsectors = [[1, 2], [3]]", "Expected `array` of length 2, got 1 - at `$.lidar.mask.sectors[1]`"),
+        ("[lidar.mask]\nsectors = [[1, 1]]", "robot.toml:2: Expected two different bearings in `sectors`"),
+        ("bind = 'robot'", "robot.toml:1: Expected an IP address of this machine in `bind`, got `robot`"),
+        ("[pose]\nreceivers = ['plc']", "robot.toml:2: Expected `host:port` or `[ipv6]:port`, got `plc`"),
+        ("[pose]\nreceivers = ['a:1', 'plc:0']", "got `plc:0` in `receivers[1]` - at `$.pose`"),
+        ("[odometry]\nport = 1502", "robot.toml:2: Expected a port other than Modbus's in `odometry.port`, got 1502"),
+        ("name = ''", "robot.toml:1: Expected `str` matching regex"),
+        ("x y", "robot.toml: not valid TOML: Expected '=' after a key"),
+    ],
+)
+def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, text: str, expected: str) -> None:
+    assert expected in refused(tmp_path, text)
+
+
+def test_a_refusal_says_what_the_key_is_for(tmp_path: Path) -> None:
+    assert refused(tmp_path, "[modbus]\nport = -1").endswith("(UDP and TCP port; 0: no Modbus)")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[modbus]\nprot = 1", "robot.toml:2: unknown key `modbus.prot`; did you mean `modbus.port`?"),
+        ("port = 1", "robot.toml:1: unknown key `port`; did you mean `odometry.port` or `modbus.port`?"),
+        (
+            "[lidar]\ninverted = true",
+            "robot.toml:2: unknown key `lidar.inverted`; did you mean `lidar.mount.inverted`?",
+        ),
+        ("qqq = 1", "robot.toml:1: unknown key `qqq`; `lumiloop --print-config` lists all keys"),
+    ],
+)
+def test_an_unknown_key_names_its_path_and_the_nearest_known_one(tmp_path: Path, text: str, expected: str) -> None:
+    assert refused(tmp_path, text) == expected
+
+
+def test_a_missing_or_unreadable_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.toml: no such file"):
+        load(tmp_path / "nowhere.toml")
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        load(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b"name = '\xe9'")
+    with pytest.raises(ConfigError, match=r"latin\.toml: not UTF-8 text at byte 8"):
+        load(tmp_path / "latin.toml")
+
+
+def test_overrides_beat_the_file_and_take_bare_words(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("[modbus]\nport = 5020")
+    config = load(file, ["modbus.port=0", "lidar.device=/dev/ttyACM3", "pose.receivers=['10.0.0.2:9000']"])
+    assert config.modbus.port == 0
+    assert config.lidar.device == "/dev/ttyACM3"
+    assert config.pose.receivers == ("10.0.0.2:9000",)
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("modbus.port", "--set modbus.port: expected KEY=VALUE"),
+        ("=3", "--set =3: expected KEY=VALUE"),
+        ("modbus.port=x", "--set modbus.port=x: Expected `int`, got `str` - at `$.modbus.port`"),
+        ("name.x=1", "--set name.x=1: `name` is a value"),
+        ("modbus.prot=1", "--set modbus.prot=1: unknown key `modbus.prot`; did you mean `modbus.port`?"),
+    ],
+)
+def test_a_wrong_override_is_refused_as_such(tmp_path: Path, override: str, expected: str) -> None:
+    assert refused(tmp_path, "name = 'r1'", override).startswith(expected)
+
+
+bearings = st.floats(-360, 360)
+configs = st.builds(
+    Config,
+    name=st.from_regex(r"\A[A-Za-z0-9_.-]{1,32}\Z"),
+    bind=st.sampled_from(["127.0.0.1", "0.0.0.0", "::1"]),
+    state_dir=st.text(st.characters(blacklist_categories=["Cs"])),
+    lidar=st.builds(
+        LidarConfig,
+        device=st.text(st.characters(blacklist_categories=["Cs"]), min_size=1),
+        mount=st.builds(Mount, x=st.floats(-100, 100), y=st.floats(-100, 100), yaw=bearings, inverted=st.booleans()),
+        mask=st.builds(
+            Mask,
+            sectors=st.lists(st.tuples(bearings, bearings).filter(lambda s: s[0] != s[1])).map(tuple),
+            near=st.floats(0, 10),
+        ),
+    ),
+    modbus=st.builds(ModbusConfig, port=st.integers(0, 65535), write=st.booleans()),
+    pose=st.builds(PoseConfig, receivers=st.lists(st.sampled_from(["a:1", "10.0.0.1:9000", "[::1]:7"])).map(tuple)),
+)
+
+
+@given(config=configs)
+def test_what_is_printed_reads_back_equal(config: Config, tmp_path_factory: pytest.TempPathFactory) -> None:
+    file = tmp_path_factory.mktemp("printed") / "printed.toml"
+    file.write_text(configfile.dump(config))
+    assert load(file) == config
+
+
+def test_schema_is_json_and_knows_every_key() -> None:
+    schema = json.loads(configfile.schema())
+    assert set(schema["$defs"]["Config"]["properties"]) == set(msgspec.to_builtins(Config()))
+    assert schema["$defs"]["ModbusConfig"]["properties"]["port"]["maximum"] == 65535
+
+
+def test_the_reference_page_is_current_and_can_be_pasted(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "configuration.md").read_text()
+    assert page == configfile.reference(), "run: lumiloop --reference > docs/configuration.md"
+    pasted = tmp_path / "pasted.toml"
+    pasted.write_text(page.split("```toml\n")[1].split("```")[0])
+    assert load(pasted) == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("plc:9000", ("plc", 9000)), ("10.0.0.2:1", ("10.0.0.2", 1)), ("[::1]:65535", ("::1", 65535))],
+)
+def test_endpoints(text: str, expected: tuple[str, int]) -> None:
+    assert parse_endpoint(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "plc", "plc:", ":9000", "plc:0", "plc:65536", "::1:80", "[plc]:80", "a b:1"])
+def test_wrong_endpoints(text: str) -> None:
+    with pytest.raises(ValueError, match="Expected"):
+        parse_endpoint(text)
