@@ -25,7 +25,7 @@ class LidarGeometry:
 
     Attributes:
         ares: steps per full turn; not necessarily whole for a log.
-        afrt: step that points along the device's x axis (front).
+        afrt: step that points along the device's x axis (front); not necessarily whole for a log.
         amin, amax: first and last measurable step.
         dmin, dmax: legal distances in range units; below ``dmin`` a value is an error code, above ``dmax`` no return.
         range_unit_m: metres per range unit (SCIP: 0.001).
