@@ -21,8 +21,6 @@ ESTIMATOR_NEVER = {
     *("os", "pathlib", "io", "subprocess", "logging"),
     *("asyncio", "threading", "time", "socket", "serial", "random"),
 }
-    ["os", "asyncio", "time", "socket", "serial", "threading", "pathlib", "io", "subprocess", "logging", "random"]
-)
 ESTIMATOR_EXCEPTION = "kernel.py"  # finds the kernel cache once, at import
 
 
