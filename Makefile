@@ -32,14 +32,16 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/mypy
 
 test: check  ## everything quick (no root, <= 12 minutes)
-	$(BIN)/python -m pytest -q -m "not system and not slow" $(ARGS)
+	$(BIN)/python -m coverage run -m pytest -q -m "not system and not slow" $(ARGS)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m nojit tests/estimator
 	$(BIN)/python -m tools.floors
 
 test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)
 	$(BIN)/python -m pytest -q -m "system and not slow" $(ARGS)
 
 test-all: check  ## all of it, the long ones included
-	$(BIN)/python -m pytest -q $(ARGS)
+	$(BIN)/python -m coverage run -m pytest -q $(ARGS)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m nojit tests/estimator
 	$(BIN)/python -m tools.floors
 
 bench: venv requirements/bench.lock  ## figures as a table and as out/bench/*.json, ratios against peers in the same run
