@@ -28,7 +28,8 @@ class Snapshot:
     """What is published after one cycle. SI units, `T_map_base` unless said otherwise; None: not known.
 
     Attributes:
-        seq: counts snapshots. t_mono: instant the pose is true for. t_sent: when this was built. t_utc: the same, UTC.
+        seq: counts snapshots. t_mono: instant the pose is true for. t_sent: when this was built. t_utc: `t_sent` as
+            seconds since the Unix epoch.
         pose: T_map_base (x, y, yaw). odom: T_odom_base. predicted: T_map_base carried to `t_sent` by `velocity`.
         covariance: (xx, xy, yy, x-yaw, y-yaw, yaw-yaw), m and rad.
         velocity: (v_x, v_y, yaw rate) in the base frame.
