@@ -1,0 +1,77 @@
+"""The same fake device on a memory port, a pty or TCP."""
+
+from __future__ import annotations
+
+from hal.clock import Clock
+from hal.errors import DeviceMissing, DeviceRefused, HalError
+from hal.fake.hokuyo import FakeHokuyo
+from hal.port import MemoryPort, Port, memory_pair
+
+
+class MemoryHost:
+    """The sensor's end of a memory port."""
+
+    def __init__(self, port: MemoryPort, device: FakeHokuyo) -> None:
+        self._port, self._device = port, device
+        self.open = True
+        device.attach(self)
+        port.start(lambda data, _t: device.receive(data), self._lost)
+
+    def take(self, data: bytes) -> bool:
+        """See :class:`hal.fake.outlet.HostEnd`."""
+        self._port.write(data)
+        return True
+
+    def hang_up(self) -> None:
+        """See :class:`hal.fake.outlet.HostEnd`."""
+        if self.open:
+            self.open = False
+            self._device.detach()
+            self._port.close()
+
+    def _lost(self, _error: HalError) -> None:
+        if self.open:
+            self.open = False
+            self._device.detach()
+
+
+class FakeOpener:
+    """A :class:`hal.port.PortOpener` under which fake devices are plugged in by name.
+
+    Args:
+        clock: gives arrival times; a :class:`hal.clock.LoopClock` in virtual time.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._devices: dict[str, FakeHokuyo] = {}
+        self._hosts: dict[str, MemoryHost] = {}
+
+    def plug(self, name: str, device: FakeHokuyo) -> None:
+        """Make ``device`` openable as ``name``."""
+        self._devices[name] = device
+
+    def unplug(self, name: str) -> None:
+        """Take the device away; whoever has it open loses it."""
+        del self._devices[name]
+        if name in self._hosts:
+            self._hosts.pop(name).hang_up()
+
+    async def __call__(self, device: str, baud: int) -> Port:
+        """Open a plugged-in device.
+
+        Raises:
+            DeviceMissing: nothing is plugged in under that name. DeviceRefused: it is open already.
+        """
+        fake = self._devices.get(device)
+        if fake is None:
+            raise DeviceMissing(
+                device, "no such device", f"plugged in: {', '.join(sorted(self._devices)) or 'nothing'}"
+            )
+        held = self._hosts.get(device)
+        if held is not None and held.open:
+            raise DeviceRefused(device, "already open", "one client at a time")
+        ours, theirs = memory_pair(self._clock, device)
+        theirs.set_baud(baud)
+        self._hosts[device] = MemoryHost(ours, fake)
+        return theirs
