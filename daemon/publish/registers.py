@@ -85,7 +85,8 @@ def _cycle(snapshot: Snapshot) -> Value:
 
 
 def _heartbeat(snapshot: Snapshot) -> Value:
-    return int(snapshot.t_sent * 10.0) if math.isfinite(snapshot.t_sent) else 0
+    tenths = snapshot.t_sent * 10.0
+    return int(tenths) if math.isfinite(tenths) else 0
 
 
 Bit = tuple[str, str, Callable[[Snapshot], bool]]
