@@ -90,13 +90,16 @@ def cache_is_warm() -> bool:
 def kernel(signature: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
 
-    The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage.
+    The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage. With
+    ``NUMBA_DISABLE_JIT=1`` nothing is compiled and every kernel is its own ``.py_func``.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         compiled: Any = numba.njit(
             signature, nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", boundscheck=None
         )(function)
+        if _numba_config.DISABLE_JIT:
+            compiled.py_func = function
         return compiled  # type: ignore[no-any-return]  # numba has no types
 
     return decorate
