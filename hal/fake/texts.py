@@ -22,27 +22,28 @@ class Live:
     laser: bool
     baud: int
     tick: int
+    speed: str = "Initial"
     trouble: str = ""
 
 
-def identity(model: LidarModel, unit: Unit, suffix: str = "") -> Lines:
-    """Key and value of each VV line; ``suffix`` is appended to the firmware's text."""
+def identity(model: LidarModel, unit: Unit) -> Lines:
+    """Key and value of each VV line."""
     protocol = "SCIP 2.0" if model.profile == "2.0" else "SCIP 2.2"
     return [
         ("VEND", model.vend),
         ("PROD", model.prod),
-        ("FIRM", model.firm + suffix),
+        ("FIRM", model.firm),
         ("PROT", protocol),
         ("SERI", unit.serial),
     ]
 
 
-def parameters(model: LidarModel, dmax: int) -> Lines:
-    """Key and value of each PP line, with the DMAX that the sensor claims."""
+def parameters(model: LidarModel) -> Lines:
+    """Key and value of each PP line."""
     return [
         ("MODL", model.modl),
         ("DMIN", str(model.dmin)),
-        ("DMAX", str(dmax)),
+        ("DMAX", str(model.dmax)),
         ("ARES", str(model.ares)),
         ("AMIN", str(model.amin)),
         ("AMAX", str(model.amax)),
@@ -58,7 +59,7 @@ def state(model: LidarModel, live: Live) -> Lines:
     return [
         ("MODL", model.modl),
         ("LASR", "ON" if live.laser else "OFF"),
-        ("SCSP", f"Initial({model.rpm}[rpm])<-Default setting by user"),
+        ("SCSP", f"{live.speed}({model.rpm}[rpm])<-Default setting by user"),
         ("MESM", model.modes[mode]),
         ("SBPS", link),
         ("TIME", f"{live.tick:06X}"),

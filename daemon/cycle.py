@@ -1,0 +1,281 @@
+"""The cycle: take what has arrived, step the estimator, judge, publish. One per scan, or at 1.5 scan periods without.
+
+:class:`Cycle` is synchronous and knows no timer, so that replay can drive it as well; :class:`Pacemaker` runs it when
+it is due, in real or in virtual time. What a cycle consumed and decided goes to a tap as a :class:`CycleRecord`: with
+the raw streams that is all it takes to repeat the run exactly.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from daemon.bridge import ImuBridge, OdometryBridge, ScanBridge
+from daemon.budget import Budget
+from daemon.evidence import Observer
+from daemon.inbox import Inbox, Taken
+from daemon.pace import ScanPeriod
+from daemon.picture import Facts, Painter
+from daemon.publish.snapshot import Snapshot, State
+from daemon.state import REASONS, Memory, judge
+from daemon.worker import Worker
+from estimator.records import Command, Limits, Order, Record
+from estimator.result import StepResult
+from hal.clock import Clock
+from hal.lidar import LidarStatus, RawScan
+
+log = logging.getLogger(__name__)
+
+IDLE_PERIODS: Final = 1.5
+"""Scan periods after which a cycle starts without a scan."""
+OWN_SHARE: Final = 0.5
+"""Part of the scan period that is the budget where none is configured."""
+
+Sink = Callable[[Snapshot], None]
+"""Takes every snapshot; called from the loop thread, never waited for: it must return at once."""
+
+Step = Callable[[tuple[Record, ...], Limits], StepResult]
+"""The estimator with its state inside."""
+
+
+@dataclass(frozen=True, slots=True)
+class CycleRecord:
+    """What one cycle consumed and decided.
+
+    Attributes:
+        cycle: counts cycles from 1. t_mono: when it began.
+        scan: `RawScan.seq` of the scan consumed, None without one. dropped: those that a later scan replaced.
+        odometry, imu: readings received since the start, all of them consumed by now.
+        commands: consumed. answers: job IDs of the answers applied, in order.
+        limits: the step's caps; None where nothing had arrived and no step was made.
+        result: of the step, or the previous one's; None before the first. snapshot: what was published.
+        stage_us: measured microseconds by stage, empty without a stopwatch.
+    """
+
+    cycle: int
+    t_mono: float
+    scan: int | None
+    dropped: tuple[int, ...]
+    odometry: int
+    imu: int
+    commands: tuple[Command, ...]
+    answers: tuple[int, ...]
+    limits: Limits | None
+    result: StepResult | None
+    snapshot: Snapshot
+    stage_us: dict[str, int]
+
+
+Tap = Callable[[CycleRecord], None]
+
+
+@dataclass(slots=True)
+class Parts:
+    """What a cycle is made of; every part can be replaced.
+
+    Attributes:
+        status: of the lidar driver, live. odometry: an odometry input is configured.
+        budget_us: time budget of a cycle, 0: half of the scan period.
+        stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
+        fault: number of the gravest present fault. map_id: identity of the map frame.
+    """
+
+    clock: Clock
+    step: Step
+    scans: ScanBridge
+    budget: Budget
+    worker: Worker
+    status: LidarStatus
+    odometry: bool = False
+    budget_us: float = 0.0
+    stopwatch: Callable[[], float] | None = None
+    sinks: list[Sink] = field(default_factory=list)
+    tap: Tap | None = None
+    fault: Callable[[], int] = int
+    map_id: int = 0
+
+
+class Cycle:
+    """One localisation cycle after the other. Devices call the ``inbox``; :meth:`run` does the rest."""
+
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self.inbox = Inbox()
+        self.period = ScanPeriod()
+        self.odometry = OdometryBridge()
+        self.imu = ImuBridge()
+        self.cycles = 0
+        self.overruns = 0
+        self.sinks_failed = 0
+        self.verdict = Memory()
+        self.result: StepResult | None = None
+        self.observer = Observer(parts.clock.now(), parts.odometry)
+        self._painter = Painter(parts.map_id)
+        self._cycle_us: int | None = None
+        self._failing: set[int] = set()
+
+    def run(self) -> Snapshot:
+        """Run one cycle with whatever has arrived."""
+        stages = _Stages(self.parts.stopwatch)
+        self.cycles += 1
+        t_mono = self.parts.clock.now()
+        taken = self.inbox.take()
+        answers = self.parts.worker.collect(t_mono)
+        records = (*answers, *taken.commands, *self._bridge(taken))
+        stages.lap("bridge")
+        limits = self._step(records, stages)
+        verdict = self._judge(t_mono, records, None if limits is None else self.result)
+        snapshot = self._painter.paint(self.result, verdict, self._facts(self.parts.clock.now()))
+        stages.lap("judge")
+        self._publish(snapshot)
+        stages.lap("publish")
+        self._account(stages)
+        if self.parts.tap is not None:
+            record = CycleRecord(
+                cycle=self.cycles,
+                t_mono=t_mono,
+                scan=None if taken.scan is None else taken.scan.seq,
+                dropped=taken.dropped,
+                odometry=taken.odometry_total,
+                imu=taken.imu_total,
+                commands=taken.commands,
+                answers=tuple(answer.job_id for answer in answers),
+                limits=limits,
+                result=self.result,
+                snapshot=snapshot,
+                stage_us=stages.us,
+            )
+            self.parts.tap(record)
+        return snapshot
+
+    @property
+    def budget_us(self) -> float:
+        """Microseconds that a cycle may take."""
+        return self.parts.budget_us or OWN_SHARE * self.period.seconds * 1e6
+
+    def _bridge(self, taken: Taken) -> list[Record]:
+        """SI records of everything taken; the estimator orders them by time itself."""
+        records: list[Record] = []
+        for reading in taken.odometry:
+            jumps = self.odometry.jumps
+            if (increment := self.odometry.increment(reading)) is not None:
+                records.append(increment)
+            if self.odometry.jumps > jumps:
+                self.observer.witnesses.restart()
+            self.observer.on_odometry(reading.t_rx)
+        records += [turn for reading in taken.imu if (turn := self.imu.turn(reading)) is not None]
+        if taken.scan is not None:
+            self.period.learn(taken.scan)
+            self.observer.on_scan(taken.scan.t_rx)
+            records.append(self.parts.scans.scan(taken.scan))
+        return records
+
+    def _step(self, records: tuple[Record, ...], stages: _Stages) -> Limits | None:
+        """Step the estimator under the budget's caps and return them; None where there was nothing to step over."""
+        if not records:
+            return None
+        parts = self.parts
+        limits = parts.budget.limits(self.budget_us)
+        self.result = parts.step(records, limits)
+        step_us = stages.lap("step")
+        if parts.stopwatch is not None:
+            parts.budget.learn(step_us, limits, self.result)
+        parts.worker.submit(self.result.jobs)
+        if any(isinstance(record, Command) and record.order is Order.RESET for record in records):
+            self._painter.map_id = (self._painter.map_id + 1) % 2**32
+        return limits
+
+    def _judge(self, t_mono: float, records: tuple[Record, ...], fresh: StepResult | None) -> Memory:
+        """What may be said about the pose; a change goes to the log."""
+        evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
+        before, self.verdict = self.verdict, judge(self.verdict, evidence)
+        if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
+            meaning, remedy = REASONS[self.verdict.reason]
+            log.info("%s: %s%s", self.verdict.state.name, meaning, f" ({remedy})" if remedy else "")
+        return self.verdict
+
+    def _facts(self, t_mono: float) -> Facts:
+        parts, silence = self.parts, self.observer.silence(t_mono, self.period.seconds)
+        alive = silence is not None and self.verdict.state is not State.NO_LIDAR
+        rate = None if silence is None else 1.0 / self.period.seconds if alive else 0.0
+        return Facts(
+            t_mono=t_mono,
+            t_utc=parts.clock.utc(),
+            period=self.period.seconds,
+            scan_rate=rate,
+            missed=parts.status.missed + self.inbox.dropped,
+            overruns=self.overruns,
+            cycle_us=self._cycle_us,
+            lidar_ok=alive,
+            odometry_ok=self.observer.odometry_ok(t_mono),
+            fault=parts.fault(),
+        )
+
+    def _publish(self, snapshot: Snapshot) -> None:
+        """Hand the snapshot to every sink; a sink that raises harms neither the cycle nor the others."""
+        for number, sink in enumerate(self.parts.sinks):
+            try:
+                sink(snapshot)
+            except Exception:
+                self.sinks_failed += 1
+                if number not in self._failing:
+                    log.exception("a publisher has failed; said once, counted from now on")
+                self._failing.add(number)
+            else:
+                self._failing.discard(number)
+
+    def _account(self, stages: _Stages) -> None:
+        if self.parts.stopwatch is not None:
+            self._cycle_us = sum(stages.us.values())
+            self.overruns += self._cycle_us > self.budget_us
+
+
+class _Stages:
+    """Microseconds per stage, in order; empty without a stopwatch."""
+
+    def __init__(self, stopwatch: Callable[[], float] | None) -> None:
+        self.us: dict[str, int] = {}
+        self._stopwatch = stopwatch
+        self._last = stopwatch() if stopwatch is not None else 0.0
+
+    def lap(self, stage: str) -> float:
+        """End a stage; microseconds it took, 0 without a stopwatch."""
+        if self._stopwatch is None:
+            return 0.0
+        now = self._stopwatch()
+        took_us = (now - self._last) * 1e6
+        self._last = now
+        self.us[stage] = round(took_us)
+        return took_us
+
+
+class Pacemaker:
+    """Starts a cycle when a scan is complete, or at 1.5 scan periods without one."""
+
+    def __init__(self, cycle: Cycle) -> None:
+        self._cycle = cycle
+        self._due: asyncio.Future[None] | None = None
+
+    def on_scan(self, scan: RawScan) -> None:
+        """Take a scan from the driver; the cycle starts in the next turn of the loop, with the latest by then."""
+        self._cycle.inbox.put_scan(scan)
+        self._wake()
+
+    async def run(self) -> None:
+        """Run cycles until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            self._due = loop.create_future()
+            timer = loop.call_at(loop.time() + IDLE_PERIODS * self._cycle.period.seconds, self._wake)
+            try:
+                await self._due
+            finally:
+                timer.cancel()
+            self._cycle.run()
+
+    def _wake(self) -> None:
+        if self._due is not None and not self._due.done():
+            self._due.set_result(None)

@@ -1,0 +1,111 @@
+"""Turns what a cycle has seen (step result, device status, odometry) into evidence for the state machine."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from daemon.state import SILENT_PERIODS, Evidence, Match
+from daemon.witness import Witnesses
+from estimator.records import Array, Command, Odometry, Record
+from estimator.result import MatchResult, Reason, StepResult
+from hal.lidar import LidarStatus, Link
+
+ENOUGH_INLIERS: Final = 0.4
+"""Part of the beams that has to find its place in the map for a match to count as good."""
+OPENING_S: Final = 10.0
+"""A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
+ODOMETRY_SILENT_S: Final = 1.0
+"""Odometry that has not arrived for this long is silent."""
+EARLY: Final = 0.01
+"""Part of a scan period by which a timer may be early and still stand for the whole period."""
+
+
+class Observer:
+    """Watches the cycles go by. Its memory: witnesses, when devices last spoke, what was known when all was known."""
+
+    def __init__(self, t_mono: float, odometry: bool) -> None:
+        """Start watching; ``odometry``: an odometry input is configured."""
+        self.witnesses = Witnesses()
+        self._t_start = t_mono
+        self._odometry = odometry
+        self._t_scan: float | None = None
+        self._t_odometry = t_mono
+        self._P_complete: Array | None = None
+        self._mapped = False
+
+    def odometry_ok(self, t_mono: float) -> bool | None:
+        """Whether odometry is arriving; None where none is configured."""
+        return t_mono - self._t_odometry <= ODOMETRY_SILENT_S if self._odometry else None
+
+    def silence(self, t_mono: float, period: float) -> float | None:
+        """Scan periods since the last scan was taken; None before the first."""
+        return None if self._t_scan is None else (t_mono - self._t_scan) / period
+
+    def on_scan(self, t_rx: float) -> None:
+        """A valid scan has arrived."""
+        self._t_scan = t_rx
+
+    def on_odometry(self, t_rx: float) -> None:
+        """A valid odometry reading has arrived."""
+        self._odometry = True
+        self._t_odometry = t_rx
+
+    def evidence(
+        self, t_mono: float, period: float, status: LidarStatus, records: tuple[Record, ...], result: StepResult | None
+    ) -> Evidence:
+        """What one cycle adds; call it once per cycle with everything the cycle consumed."""
+        for record in records:
+            if isinstance(record, Odometry):
+                self.witnesses.on_odometry(record)
+        match = self._match(result)
+        sigma_m, sigma_rad = self._sigma(match, result)
+        silence = self.silence(t_mono, period)
+        late = self._t_scan is None and t_mono - self._t_start > OPENING_S
+        return Evidence(
+            t_mono=t_mono,
+            silence=None if silence is None else silence + EARLY * SILENT_PERIODS,
+            unreachable=status.link is Link.WAITING or late,
+            match=match,
+            mapped=self._mapped,
+            sigma_m=sigma_m,
+            sigma_rad=sigma_rad,
+            odometry=self.odometry_ok(t_mono),
+            agree=self.witnesses.agree(),
+            ordered=any(isinstance(record, Command) for record in records),
+        )
+
+    def _match(self, result: StepResult | None) -> Match | None:
+        if result is None or result.match is None:
+            return None
+        found = result.match
+        self._mapped = found.reason is not Reason.NO_MAP
+        if not self._mapped:
+            return None
+        x, y, yaw = (bool(axis) for axis in result.known_axes)
+        match = Match(good(found), (x, y, yaw))
+        self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(match.known))
+        return match
+
+    def _sigma(self, match: Match | None, result: StepResult | None) -> tuple[float, float]:
+        """Uncertainty gained since a match last fixed every axis: larger axis in m, heading in rad.
+
+        Not the covariance itself: that of a pose in the map grows with the way from the start, while the place in the
+        surroundings is as good as ever.
+        """
+        if result is None:
+            return 0.0, 0.0
+        P = result.covariance
+        if self._P_complete is None or not self._mapped or (match is not None and match.good and all(match.known)):
+            self._P_complete = P
+        grown = P - self._P_complete
+        mean, half = 0.5 * (grown[0, 0] + grown[1, 1]), 0.5 * (grown[0, 0] - grown[1, 1])
+        largest = mean + math.hypot(half, grown[0, 1])
+        return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, float(grown[2, 2])))
+
+
+def good(match: MatchResult) -> bool:
+    """Whether a match is a result that enough of the scan took part in."""
+    return match.ok and match.inliers >= ENOUGH_INLIERS * match.queries and bool(np.isfinite(match.T_odom_base).all())

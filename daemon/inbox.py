@@ -1,0 +1,86 @@
+"""What has arrived since the last cycle: one scan (the latest wins), odometry without loss, gyro readings, commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from estimator.records import Command
+from hal.imu import RawImu
+from hal.lidar import RawScan
+from hal.odometry import RawOdometry
+
+DEEPEST: Final = 256
+"""Readings held of one kind. Beyond, every other one goes: odometry is cumulative, so no motion is lost with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What one cycle consumes.
+
+    Attributes:
+        dropped: sequence numbers of scans that a later one has replaced.
+        odometry_total, imu_total: readings received since the start, all of them consumed with this cycle.
+    """
+
+    scan: RawScan | None
+    dropped: tuple[int, ...]
+    odometry: tuple[RawOdometry, ...]
+    odometry_total: int
+    imu: tuple[RawImu, ...]
+    imu_total: int
+    commands: tuple[Command, ...]
+
+
+class Inbox:
+    """Filled by the devices' callbacks, emptied by the cycle; never longer than :data:`DEEPEST`."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._scan: RawScan | None = None
+        self._dropped: list[int] = []
+        self._odometry: list[RawOdometry] = []
+        self._odometry_total = 0
+        self._imu: list[RawImu] = []
+        self._imu_total = 0
+        self._commands: list[Command] = []
+
+    def put_scan(self, scan: RawScan) -> None:
+        """Hold a scan; one that no cycle has taken yet is dropped for it and counted."""
+        if self._scan is not None:
+            self._dropped.append(self._scan.seq)
+            self.dropped += 1
+        self._scan = scan
+
+    def put_odometry(self, reading: RawOdometry) -> None:
+        """Hold a cumulative reading."""
+        self._odometry_total += 1
+        self._odometry.append(reading)
+        if len(self._odometry) > DEEPEST:
+            self._odometry = self._odometry[::2]
+
+    def put_imu(self, reading: RawImu) -> None:
+        """Hold a gyro reading."""
+        self._imu_total += 1
+        self._imu.append(reading)
+        if len(self._imu) > DEEPEST:
+            del self._imu[0]
+
+    def put_command(self, command: Command) -> None:
+        """Hold an order; the latest few are kept."""
+        self._commands = [*self._commands, command][-DEEPEST:]
+
+    def take(self) -> Taken:
+        """Everything that is held; the inbox is empty afterwards."""
+        taken = Taken(
+            self._scan,
+            tuple(self._dropped),
+            tuple(self._odometry),
+            self._odometry_total,
+            tuple(self._imu),
+            self._imu_total,
+            tuple(self._commands),
+        )
+        self._scan = None
+        self._dropped, self._odometry, self._imu, self._commands = [], [], [], []
+        return taken

@@ -1,0 +1,103 @@
+"""Builds the snapshot: one step's result with its age, the pose carried to now, and the state that was judged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from daemon.publish.snapshot import Snapshot
+from daemon.state import Memory
+from estimator import se2
+from estimator.records import Array
+from estimator.result import StepResult
+
+Triple = tuple[float, float, float]
+
+LONGEST_CARRY_PERIODS: Final = 3.0
+"""A velocity is not carried further than this many scan periods; beyond, nothing is predicted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the daemon knows besides the estimate; see `Snapshot` for the meaning of each."""
+
+    t_mono: float = 0.0
+    t_utc: float = 0.0
+    period: float = 0.1
+    scan_rate: float | None = None
+    missed: int = 0
+    overruns: int = 0
+    cycle_us: int | None = None
+    lidar_ok: bool | None = None
+    odometry_ok: bool | None = None
+    fault: int = 0
+
+
+@dataclass(slots=True)
+class Painter:
+    """Numbers the snapshots and remembers the latest loop.
+
+    Attributes:
+        map_id: identity of the map frame, 0: not known.
+    """
+
+    map_id: int = 0
+    _seq: int = 0
+    _loop: tuple[int, int | None, int | None] = (0, None, None)
+
+    def paint(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
+        """One snapshot of this moment."""
+        self._seq += 1
+        if result is not None and result.loop is not None:
+            self._loop = (result.loop.counter, result.loop.keyframe_new, result.loop.keyframe_old)
+        estimate = None if result is None or not math.isfinite(result.t_mono) else result
+        return Snapshot(
+            seq=self._seq,
+            t_mono=facts.t_mono if estimate is None else estimate.t_mono,
+            t_sent=facts.t_mono,
+            t_utc=facts.t_utc,
+            state=verdict.state,
+            reason=verdict.reason,
+            pose=None if estimate is None else _pose(estimate),
+            odom=None if estimate is None else _triple(estimate.T_odom_base),
+            predicted=None if estimate is None else _predicted(estimate, facts),
+            covariance=None if estimate is None else _upper(estimate.covariance),
+            velocity=None if estimate is None else _triple(estimate.velocity),
+            known=verdict.known,
+            jumps=0 if estimate is None else estimate.jumps,
+            map_id=self.map_id,
+            loop_counter=self._loop[0],
+            loop_new=self._loop[1],
+            loop_old=self._loop[2],
+            scan_rate=facts.scan_rate,
+            missed=facts.missed,
+            overruns=facts.overruns,
+            cycle_us=facts.cycle_us,
+            lidar_ok=facts.lidar_ok,
+            odometry_ok=facts.odometry_ok,
+            fault=facts.fault,
+        )
+
+
+def _pose(result: StepResult) -> Triple:
+    return _triple(se2.compose(result.T_map_odom, result.T_odom_base))
+
+
+def _predicted(result: StepResult, facts: Facts) -> Triple | None:
+    """The pose carried to now at constant velocity; None where the velocity is too old to say anything."""
+    ahead = facts.t_mono - result.t_mono
+    if ahead > LONGEST_CARRY_PERIODS * facts.period:
+        return None
+    moved = se2.exp(result.velocity * max(0.0, ahead))
+    return _triple(se2.compose(se2.compose(result.T_map_odom, result.T_odom_base), moved))
+
+
+def _triple(values: Array) -> Triple:
+    x, y, yaw = values.tolist()
+    return (x, y, yaw)
+
+
+def _upper(P: Array) -> tuple[float, float, float, float, float, float]:
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = P.tolist()
+    return (xx, xy, yy, xt, yt, tt)

@@ -1,0 +1,270 @@
+"""What is said about the pose: one pure state machine, fed once per cycle with evidence.
+
+The rule it keeps: TRACKING is only said when two witnesses agree (wheel odometry and laser about the motion of the
+last seconds) or when the laser has proved itself (matches that are good, small and know every axis, for a while).
+Every other state comes with a reason, and a reason comes with a remedy. Bad news counts fast, good news slowly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Final
+
+from daemon.publish.snapshot import State
+
+SILENT_PERIODS: Final = 3.0
+"""Scan periods without a valid scan after which the lidar is said to be gone."""
+PROOF_S: Final = 2.0
+PROOF_SCANS: Final = 10
+"""A witness has proved itself after this many good scans in a row that span at least this time."""
+RELOCATED_PROOF_S: Final = 5.0
+"""The same after the pose was lost: the right place has to be told from a similar one."""
+FAILED_SCANS: Final = 3
+"""Matches in a row that may fail before it is said; one bad scan among people is no news."""
+AXIS_LOST_SCANS: Final = 3
+AXIS_FOUND_SCANS: Final = 5
+"""Scans in a row after which an axis changes between known and unknown."""
+CLEAN_S: Final = 1.0
+"""Every axis has to be known for this long before TRACKING is said (again)."""
+DISAGREE_S: Final = 0.5
+"""Disagreement of the witnesses has to last this long: stamps jitter."""
+HELD_S: Final = 1.0
+"""Without odometry a pose is held by its last velocity for this long after the last good match, then it is lost."""
+LOST_M: Final = 1.0
+LOST_RAD: Final = 0.26
+"""One-sigma uncertainty beyond which a pose is not worth using."""
+VAGUE_M: Final = 0.15
+VAGUE_RAD: Final = 0.1
+"""One-sigma uncertainty beyond which TRACKING is not said."""
+
+
+HELD: Final = (State.TRACKING, State.DEGRADED)
+"""States in which a proved pose is held."""
+
+
+class Reason(IntEnum):
+    """Why the state is what it is. Numbers are part of the contract: never renumber."""
+
+    NONE = 0
+    WARMING_UP = 1
+    OPENING_LIDAR = 2
+    LIDAR_UNREACHABLE = 3
+    LIDAR_SILENT = 4
+    UNPROVED = 5
+    AXIS_UNKNOWN = 6
+    MATCH_FAILED = 7
+    WITNESSES_DISAGREE = 8
+    ODOMETRY_SILENT = 9
+    UNCERTAIN = 10
+    NO_WITNESS = 11
+    SEVERAL_PLACES = 12
+    SEARCHING = 13
+    CONFIRMING = 14
+
+
+REASONS: Final[dict[Reason, tuple[str, str]]] = {
+    Reason.NONE: ("nothing to report", ""),
+    Reason.WARMING_UP: ("starting up", "wait; the first start ever compiles for up to a minute"),
+    Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
+    Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
+    Reason.LIDAR_SILENT: ("no valid scan for three scan periods", "check the lidar's power and cable"),
+    Reason.UNPROVED: ("the pose follows the laser, nothing has confirmed it yet", "wait, or drive a metre or two"),
+    Reason.AXIS_UNKNOWN: ("the surroundings do not fix every axis of the pose", "read the known-axis bits"),
+    Reason.MATCH_FAILED: ("scans do not fit the map, the pose is held", "is the lidar covered, lifted or crowded in?"),
+    Reason.WITNESSES_DISAGREE: (
+        "odometry and laser disagree about the motion",
+        "wheel slip; if it lasts, check odometry scale and lidar mount",
+    ),
+    Reason.ODOMETRY_SILENT: ("odometry is configured and does not arrive", "check its sender and `odometry.port`"),
+    Reason.UNCERTAIN: ("the pose has become too uncertain", "drive to where the lidar sees walls"),
+    Reason.NO_WITNESS: ("nothing has confirmed the pose for too long", "set the pose, or drive to where it was known"),
+    Reason.SEVERAL_PLACES: ("several places fit", "drive on until one is left"),
+    Reason.SEARCHING: ("looking for the place in the map", "wait"),
+    Reason.CONFIRMING: ("scans fit again; being confirmed", "wait a few seconds"),
+}
+"""For every reason what it means and what a person can do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """What one scan's match says, already judged by the cycle.
+
+    Attributes:
+        good: it is a result and enough of the scan took part.
+        known: (x, y, yaw) whether the match fixed the axis.
+    """
+
+    good: bool
+    known: tuple[bool, bool, bool]
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one cycle knows. Times in seconds of ``t_mono``.
+
+    Attributes:
+        t_mono: now. ready: warm-up is over.
+        silence: scan periods since the last valid scan; None before the first.
+        unreachable: the driver is backing off and says why.
+        match: of the scan of this cycle; None without a scan or before there is a map to match against.
+        mapped: there is something to match against.
+        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained since a match last fixed every axis.
+        odometry: whether it is arriving; None where none is configured.
+        agree: whether wheels and laser told the same motion lately; None where that cannot be said.
+        places: how many places fit while the place is looked for (0: none yet); None: not looking.
+        ordered: a person has set the pose or reset the map in this cycle.
+    """
+
+    t_mono: float
+    ready: bool = True
+    silence: float | None = None
+    unreachable: bool = False
+    match: Match | None = None
+    mapped: bool = False
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
+    odometry: bool | None = None
+    agree: bool | None = None
+    places: int | None = None
+    ordered: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """What the machine remembers between cycles; start with ``Memory()``.
+
+    Attributes:
+        good, good_since: good scans in a row and when the first of them was. failed: failed scans in a row.
+        good_last: when a match was last good. axes: per axis, scans in a row against what is shown.
+        known: the axes as shown. known_since: when the last of them became known.
+        disagree_since: None while the witnesses do not disagree.
+        doubt: the place itself has to be proved again, because nothing told the motion for a while.
+        lost: the pose was given up and is not confirmed yet; implies ``doubt``.
+    """
+
+    state: State = State.STARTING
+    reason: Reason = Reason.WARMING_UP
+    good: int = 0
+    good_since: float = 0.0
+    good_last: float | None = None
+    failed: int = 0
+    axes: tuple[int, int, int] = (0, 0, 0)
+    known: tuple[bool, bool, bool] = (False, False, False)
+    known_since: float = 0.0
+    disagree_since: float | None = None
+    doubt: bool = False
+    lost: bool = False
+
+
+def judge(memory: Memory, evidence: Evidence) -> Memory:
+    """Take in one cycle's evidence; ``state``, ``reason`` and ``known`` of the answer are what is published."""
+    if evidence.ordered:
+        memory = Memory(memory.state, memory.reason)
+    memory = _remember(memory, evidence)
+    state, reason = _say(memory, evidence)
+    lost = state is State.LOST or (memory.lost and state in (State.RELOCATING, State.AMBIGUOUS, State.NO_LIDAR))
+    doubt = lost or (memory.doubt and state is not State.TRACKING)
+    return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt)
+
+
+def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
+    """The table, gravest first."""
+    if not evidence.ready:
+        return State.STARTING, Reason.WARMING_UP
+    if evidence.silence is None:
+        return (
+            (State.NO_LIDAR, Reason.LIDAR_UNREACHABLE)
+            if evidence.unreachable
+            else (State.STARTING, Reason.OPENING_LIDAR)
+        )
+    if evidence.silence >= SILENT_PERIODS:
+        return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE if evidence.unreachable else Reason.LIDAR_SILENT
+    if evidence.places is not None and evidence.places != 1:
+        several = evidence.places > 1
+        return (State.AMBIGUOUS, Reason.SEVERAL_PLACES) if several else (State.RELOCATING, Reason.SEARCHING)
+    if not evidence.mapped:
+        return State.MAPPING, Reason.UNPROVED
+    if memory.lost and not _proved(memory, evidence):
+        fits = memory.good >= AXIS_FOUND_SCANS
+        return (State.RELOCATING, Reason.CONFIRMING) if fits else (State.LOST, Reason.NO_WITNESS)
+    return _say_of_pose(memory, evidence)
+
+
+def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
+    """The part of the table for a pose that is held: is it lost, degraded, unproved or good."""
+    if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
+        return State.LOST, Reason.UNCERTAIN
+    if memory.failed >= FAILED_SCANS:
+        if not evidence.odometry and evidence.t_mono - (memory.good_last or 0.0) > HELD_S:
+            return State.LOST, Reason.NO_WITNESS
+        return State.DEGRADED, Reason.MATCH_FAILED
+    if not all(memory.known) and (memory.good >= AXIS_FOUND_SCANS or memory.state in HELD):
+        return State.DEGRADED, Reason.AXIS_UNKNOWN
+    if memory.disagree_since is not None and evidence.t_mono - memory.disagree_since >= DISAGREE_S:
+        return State.DEGRADED, Reason.WITNESSES_DISAGREE
+    if evidence.odometry is False:
+        return State.DEGRADED, Reason.ODOMETRY_SILENT
+    if evidence.sigma_m > VAGUE_M or evidence.sigma_rad > VAGUE_RAD:
+        return State.DEGRADED, Reason.UNCERTAIN
+    if memory.state is State.TRACKING or _proved(memory, evidence) or _agreed(memory, evidence):
+        return State.TRACKING, Reason.NONE
+    return (State.DEGRADED, Reason.CONFIRMING) if memory.state is State.DEGRADED else (State.MAPPING, Reason.UNPROVED)
+
+
+def _clean(memory: Memory, evidence: Evidence) -> bool:
+    """Good scans in a row that know every axis, for long enough not to flicker."""
+    return memory.good >= PROOF_SCANS and all(memory.known) and evidence.t_mono - memory.known_since >= CLEAN_S
+
+
+def _proved(memory: Memory, evidence: Evidence) -> bool:
+    """Whether the laser has proved itself."""
+    seconds = RELOCATED_PROOF_S if memory.doubt else PROOF_S
+    return _clean(memory, evidence) and evidence.t_mono - memory.good_since >= seconds
+
+
+def _agreed(memory: Memory, evidence: Evidence) -> bool:
+    """Whether two witnesses tell the same motion; it says nothing about a place that is in doubt."""
+    return _clean(memory, evidence) and evidence.agree is True and not memory.doubt
+
+
+def _remember(memory: Memory, evidence: Evidence) -> Memory:
+    now = evidence.t_mono
+    if evidence.silence is not None and evidence.silence >= SILENT_PERIODS:
+        blind = not evidence.odometry and memory.good_last is not None and now - memory.good_last > HELD_S
+        forgotten = Memory(memory.state, memory.reason, lost=memory.lost, doubt=memory.doubt or blind)
+        return replace(forgotten, good_last=memory.good_last)
+    since = memory.disagree_since if memory.disagree_since is not None else now
+    memory = replace(memory, disagree_since=since if evidence.agree is False else None)
+    if evidence.match is None:
+        return memory
+    return _take_good(memory, evidence.match, now) if evidence.match.good else _take_failed(memory)
+
+
+def _take_failed(memory: Memory) -> Memory:
+    failed = memory.failed + 1
+    known = memory.known if failed < FAILED_SCANS else (False, False, False)
+    return replace(memory, good=0, failed=failed, known=known)
+
+
+def _take_good(memory: Memory, match: Match, now: float) -> Memory:
+    x, y, yaw = (_count(*axis) for axis in zip(memory.known, memory.axes, match.known, strict=True))
+    known = (x[0], y[0], yaw[0])
+    return replace(
+        memory,
+        good=memory.good + 1,
+        good_since=memory.good_since if memory.good else now,
+        good_last=now,
+        failed=0,
+        known=known,
+        axes=(x[1], y[1], yaw[1]),
+        known_since=memory.known_since if all(memory.known) or not all(known) else now,
+    )
+
+
+def _count(shown: bool, against: int, seen: bool) -> tuple[bool, int]:
+    """One axis' hysteresis: (shown, scans in a row that say otherwise)."""
+    if seen == shown:
+        return shown, 0
+    limit = AXIS_FOUND_SCANS if seen else AXIS_LOST_SCANS
+    return (seen, 0) if against + 1 >= limit else (shown, against + 1)

@@ -1,0 +1,91 @@
+"""Do the wheels and the laser tell the same motion? A sliding window over the last seconds.
+
+The laser's witness is ``T_odom_base`` at scans whose match fixed every axis; the wheels' witness is the bare chain of
+odometry increments, which the laser never touches. Where a match did not fix an axis, the pose took that axis from the
+wheels, and agreement would be an echo: such scans empty the window.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Final
+
+from estimator import se2
+from estimator.records import Array, Odometry
+
+WINDOW_S: Final = 2.0
+"""Long against stamp jitter, short against odometry drift."""
+SHORTEST: Final = 0.5
+"""Part of the window that has to be covered before anything is said."""
+PART_M: Final = 0.15
+FLOOR_M: Final = 0.06
+PART_RAD: Final = 0.15
+FLOOR_RAD: Final = 0.06
+"""Allowed disagreement: a part of the motion (slip, scale) and a floor (stamps: 50 ms at walking pace)."""
+
+
+class Witnesses:
+    """Compares both motions; holds a few seconds of poses and nothing else."""
+
+    def __init__(self) -> None:
+        self._wheels: deque[tuple[float, Array]] = deque()
+        self._laser: deque[tuple[float, Array]] = deque()
+        self._T_start_base = se2.identity()
+
+    def restart(self) -> None:
+        """Forget the window: the odometry has jumped, or a person has moved the pose."""
+        self._wheels.clear()
+        self._laser.clear()
+
+    def on_odometry(self, record: Odometry) -> None:
+        """Take in one increment of the wheels."""
+        if not self._wheels:
+            self._wheels.append((record.t_begin, self._T_start_base))
+        self._T_start_base = se2.compose(self._T_start_base, record.delta)
+        self._wheels.append((record.t_end, self._T_start_base))
+        while self._wheels[-1][0] - self._wheels[0][0] > 2.0 * WINDOW_S:
+            self._wheels.popleft()
+
+    def on_match(self, t_mono: float, T_odom_base: Array, complete: bool) -> None:
+        """Take in the laser's pose at one scan; ``complete``: the match is good and fixed every axis."""
+        if not complete:
+            self._laser.clear()
+            return
+        self._laser.append((t_mono, T_odom_base))
+        while self._laser[-1][0] - self._laser[0][0] > 2.0 * WINDOW_S:
+            self._laser.popleft()
+
+    def agree(self) -> bool | None:
+        """Whether both told the same motion over the window; None while that cannot be said."""
+        span = self._span()
+        if span is None:
+            return None
+        (t_old, T_odom_old), (t_new, T_odom_new) = span
+        laser = se2.between(T_odom_old, T_odom_new)
+        wheels = se2.between(self._wheel_pose(t_old), self._wheel_pose(t_new))
+        dx, dy, dyaw = se2.between(laser, wheels).tolist()
+        way = max(math.hypot(*laser[:2].tolist()), math.hypot(*wheels[:2].tolist()))
+        turned = max(abs(float(laser[2])), abs(float(wheels[2])))
+        swing = FLOOR_M + PART_M * way + PART_RAD * turned * way
+        return math.hypot(dx, dy) <= swing and abs(dyaw) <= FLOOR_RAD + PART_RAD * turned
+
+    def _span(self) -> tuple[tuple[float, Array], tuple[float, Array]] | None:
+        """Oldest and newest laser pose inside the window for which the wheels have spoken too."""
+        if not self._wheels:
+            return None
+        first, last = self._wheels[0][0], self._wheels[-1][0]
+        covered = [pose for pose in self._laser if max(first, last - WINDOW_S) <= pose[0] <= last]
+        if not covered or covered[-1][0] - covered[0][0] < SHORTEST * WINDOW_S:
+            return None
+        return covered[0], covered[-1]
+
+    def _wheel_pose(self, t_mono: float) -> Array:
+        """The wheels' pose at an instant inside their history, at constant twist between two readings."""
+        after = next(index for index, (t, _) in enumerate(self._wheels) if t >= t_mono)
+        t_new, T_new = self._wheels[after]
+        if after == 0 or t_new == t_mono:
+            return T_new
+        t_old, T_old = self._wheels[after - 1]
+        part = (t_mono - t_old) / (t_new - t_old)
+        return se2.compose(T_old, se2.exp(part * se2.log(se2.between(T_old, T_new))))

@@ -1,0 +1,155 @@
+"""Background work: nogil jobs that must not delay a cycle, and the cycle in which each answer is applied.
+
+Three workers behind one interface: a thread for real time; a fixed number of cycles for virtual time; a recorded
+schedule for replay. Answers are applied only where a cycle collects them, so what a run did can be repeated exactly.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Iterable, Mapping
+from typing import Final, Protocol
+
+from estimator.records import Answer, Job
+
+log = logging.getLogger(__name__)
+
+ANSWER_CYCLES: Final = 4
+"""Under the virtual clock a job answers after this many cycles."""
+
+
+class Worker(Protocol):
+    """Takes jobs at the end of a cycle, gives answers at the start of a later one."""
+
+    @property
+    def failed(self) -> int:
+        """Jobs that raised; they never answer."""
+        ...
+
+    def submit(self, jobs: Iterable[Job]) -> None:
+        """Take jobs; returns at once."""
+        ...
+
+    def collect(self, t_mono: float) -> tuple[Answer, ...]:
+        """Answers that are ready, in the order they were finished, stamped with the cycle's start. Once per cycle."""
+        ...
+
+    def close(self) -> None:
+        """Drop what waits; idempotent."""
+        ...
+
+
+class ThreadWorker:
+    """One thread, jobs by priority, first come first served within one. Real time only."""
+
+    def __init__(self) -> None:
+        self.failed = 0
+        self._waiting: queue.PriorityQueue[tuple[int, int, Job | None]] = queue.PriorityQueue()
+        self._done: queue.SimpleQueue[tuple[int, object]] = queue.SimpleQueue()
+        self._submitted = 0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="lumiloop-worker", daemon=True)
+        self._thread.start()
+
+    def submit(self, jobs: Iterable[Job]) -> None:
+        """Take jobs; returns at once."""
+        for job in jobs:
+            self._submitted += 1
+            self._waiting.put((job.priority, self._submitted, job))
+
+    def collect(self, t_mono: float) -> tuple[Answer, ...]:
+        """Answers that are ready by now."""
+        answers = []
+        while not self._done.empty():
+            job_id, payload = self._done.get_nowait()
+            answers.append(Answer(t_mono, job_id, payload))
+        return tuple(answers)
+
+    def close(self) -> None:
+        """Drop what waits and give the running job a second; the thread dies with the process otherwise."""
+        self._closed.set()
+        self._waiting.put((-1, 0, None))
+        self._thread.join(timeout=1.0)
+
+    def _work(self) -> None:
+        while not self._closed.is_set():
+            _, _, job = self._waiting.get()
+            if job is None:
+                continue
+            done = _run(job)
+            if done is None:
+                self.failed += 1
+            else:
+                self._done.put(done)
+
+
+class CycleWorker:
+    """Virtual time: every job answers a fixed number of cycles after it was submitted, by priority."""
+
+    def __init__(self, cycles: int = ANSWER_CYCLES) -> None:
+        self.failed = 0
+        self._cycles = cycles
+        self._cycle = 0
+        self._due: dict[int, list[Job]] = {}
+
+    def submit(self, jobs: Iterable[Job]) -> None:
+        """Take jobs; they run when they are due."""
+        self._due.setdefault(self._cycle + self._cycles, []).extend(jobs)
+
+    def collect(self, t_mono: float) -> tuple[Answer, ...]:
+        """Run and answer what is due in this cycle."""
+        self._cycle += 1
+        due = sorted(self._due.pop(self._cycle, ()), key=lambda job: job.priority)
+        done = [_run(job) for job in due]
+        self.failed += done.count(None)
+        return tuple(Answer(t_mono, *item) for item in done if item is not None)
+
+    def close(self) -> None:
+        """Drop what waits."""
+        self._due.clear()
+
+
+class ScheduledWorker:
+    """Replay of a recording: each answer is applied in the cycle in which it was applied when recorded."""
+
+    def __init__(self, schedule: Mapping[int, tuple[int, ...]]) -> None:
+        """Take the schedule: cycle number, counted from 1, to the job IDs applied in it, in order."""
+        self.failed = 0
+        self._schedule = schedule
+        self._cycle = 0
+        self._jobs: dict[int, Job] = {}
+
+    def submit(self, jobs: Iterable[Job]) -> None:
+        """Keep jobs until the schedule calls for them; one it never calls for had not answered when recorded."""
+        self._jobs.update((job.job_id, job) for job in jobs)
+
+    def collect(self, t_mono: float) -> tuple[Answer, ...]:
+        """Run and answer what the schedule says.
+
+        Raises:
+            LookupError: the recording applied an answer to a job that this run has not asked for.
+        """
+        self._cycle += 1
+        answers = []
+        for job_id in self._schedule.get(self._cycle, ()):
+            if job_id not in self._jobs:
+                raise LookupError(f"cycle {self._cycle}: job {job_id} was never asked for; recorded by other software?")
+            done = _run(self._jobs.pop(job_id))
+            if done is not None:
+                answers.append(Answer(t_mono, *done))
+        return tuple(answers)
+
+    def close(self) -> None:
+        """Drop what waits."""
+        self._jobs.clear()
+
+
+def _run(job: Job) -> tuple[int, object] | None:
+    """Run one job; a defect in it is logged and costs its answer, never the daemon."""
+    try:
+        return job.job_id, job.run()
+    except Exception:  # a job is arbitrary work; its failure is counted, published and logged in full
+        log.exception("background job %d failed", job.job_id)
+        return None
