@@ -72,7 +72,7 @@ class Point:
         wire: integer type. value: takes it from a snapshot, in `unit`; None or NaN: not known.
         per_unit: raw counts per `unit` (10 000 per m: 0.1 mm each). unit: SI, empty for numbers without one.
         rule: see :class:`Rule`. ceil: round up, for uncertainties, which must never be published too small.
-        can_be_unknown: whether the not-known value has its meaning here. text: for the documents.
+        can_be_unknown: whether the not-known value has its meaning here. access: R or RW. text: for the documents.
     """
 
     name: str
@@ -85,6 +85,7 @@ class Point:
     rule: Rule = Rule.SATURATE
     ceil: bool = False
     can_be_unknown: bool = True
+    access: str = "R"
 
     def encode(self, value: Value) -> int:
         """Raw integer for a value in `unit`; NaN and None give the not-known value, infinities saturate."""
@@ -106,6 +107,11 @@ class Point:
         if self.can_be_unknown and raw == self.wire.not_known:
             return None
         return raw if self.per_unit == 1 else raw / self.per_unit
+
+
+def from_client(_: Snapshot) -> Value:
+    """Value of a point that clients write: a snapshot has none."""
+    return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,9 +28,14 @@ def chosen_steps(distance: Ints, wanted: Measure, dmin: int) -> npt.NDArray[np.i
     return np.asarray(wanted.start + np.arange(groups) * wanted.cluster + nearest)
 
 
-def payload(name: str, wanted: Measure, scan: FakeScan, dmin: int) -> bytes:
-    """Characters of one scan as command ``name`` sends them (MD GD, MS GS, ME GE, ND HD, NE HE)."""
+def payload(name: str, wanted: Measure, scan: FakeScan, dmin: int, extra: int = 0) -> bytes:
+    """Characters of one scan as command ``name`` sends them (MD GD, MS GS, ME GE, ND HD, NE HE).
+
+    ``extra`` is the fault of sending more steps than were asked for (the last one again), or fewer.
+    """
     steps = chosen_steps(scan.ranges_mm, wanted, dmin)
+    if extra:
+        steps = np.append(steps, np.repeat(steps[-1:], extra)) if extra > 0 else steps[:extra]
     distance = scan.ranges_mm[steps]
     if name in ("MD", "GD"):
         return scip_encoder.distances(distance)

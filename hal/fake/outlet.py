@@ -7,6 +7,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
+MAX_JOIN = 100
+"""Scans that can be gathered into one write."""
+
 
 class HostEnd(Protocol):
     """Where the bytes go: a memory port, a pty, a TCP connection."""
@@ -19,14 +22,20 @@ class HostEnd(Protocol):
         """Tear the connection as a pulled plug or a closing sensor does."""
         ...
 
+    def baud(self) -> int:
+        """Line rate the host listens at; 0 when that means nothing or is not known."""
+        ...
+
 
 @dataclass(slots=True)
 class Pacing:
     """How bytes leave.
 
     Attributes:
-        rate: bytes per second of the line; 0: no limit. piece: bytes per write; 0: whole replies.
-        split_end: the last LF of every reply comes as a piece of its own. join: data replies gathered into one write.
+        rate: bytes per second of the line; 0: no limit.
+        piece: bytes per write; 0: whole replies.
+        split_end: the last LF of every reply comes as a piece of its own.
+        join: data replies gathered into one write.
         backlog: data replies that may wait for the line before new ones are lost inside the sensor.
     """
 
@@ -39,10 +48,15 @@ class Pacing:
 
 @dataclass(slots=True)
 class Parcel:
-    """Bytes on their way: written in ``total`` pieces, the last of them at ``t_end``."""
+    """Bytes on their way: they occupy the line from ``line_start`` to ``line_end`` and arrive, in ``total`` pieces.
+
+    The last piece arrives at ``t_end``.
+    """
 
     pieces: deque[bytes]
     total: int
+    line_start: float
+    line_end: float
     t_start: float
     t_end: float
     is_scan: bool
@@ -50,12 +64,18 @@ class Parcel:
 
 @dataclass(slots=True)
 class OutletCounts:
-    """What became of the replies: handed over, lost in the sensor, refused by the host's full queue, unheard."""
+    """What became of the replies.
+
+    Attributes:
+        sent: handed to the host. unheard: nobody had opened the line.
+        lost_in_sensor: scans for which the line was too slow.
+        refused_by_host: the host's queue was full (nobody reads).
+    """
 
     sent: int = 0
+    unheard: int = 0
     lost_in_sensor: int = 0
     refused_by_host: int = 0
-    unheard: int = 0
 
 
 class Outlet:
@@ -69,46 +89,65 @@ class Outlet:
         self._queue: deque[Parcel] = deque()
         self._gathered: list[bytes] = []
         self._timer: asyncio.TimerHandle | None = None
-        self._free_at = 0.0
+        self._line_free = self._arrived = loop.time()
+        self._held = False
 
-    def send(self, data: bytes, *, is_scan: bool = False, not_before: float = 0.0) -> None:
-        """Queue a reply; it begins at ``not_before`` or when the line is free. Scans are lost when too many wait."""
+    def send(self, data: bytes, *, is_scan: bool = False, delay: float = 0.0) -> None:
+        """Queue a reply; it occupies the line when that is free and arrives ``delay`` seconds later, in order.
+
+        Scans are lost when as many as the sensor can hold wait for the line already.
+        """
         if is_scan and self.pacing.join > 1:
             self._gathered.append(data)
             if len(self._gathered) < self.pacing.join:
                 return
             data = b"".join(self._gathered)
             self._gathered.clear()
-        if is_scan and sum(parcel.is_scan for parcel in self._queue) > self.pacing.backlog:
+        now = self._loop.time()
+        if is_scan and sum(p.is_scan and p.line_start > now for p in self._queue) >= self.pacing.backlog:
             self.counts.lost_in_sensor += 1
             return
-        start = max(self._loop.time(), self._free_at, not_before)
+        start = max(now, self._line_free)
         end = start + (len(data) / self.pacing.rate if self.pacing.rate > 0 else 0.0)
-        self._free_at = end
-        self._queue.append(self._parcel(data, start, end, is_scan))
+        t_start = max(self._arrived, start + delay)
+        t_end = max(t_start, end + delay)
+        self._line_free, self._arrived = end, t_end
+        pieces = self._pieces(data)
+        self._queue.append(Parcel(pieces, len(pieces), start, end, t_start, t_end, is_scan))
         self._wake()
 
     def drop_waiting_scans(self) -> None:
         """Forget scans that have not begun to leave (the stream was stopped); the one on the line is finished."""
         now = self._loop.time()
-        self._gathered.clear()
-        self._queue = deque(p for p in self._queue if not p.is_scan or p.t_start < now)
-        self._free_at = self._queue[-1].t_end if self._queue else now
-        self._restart()
+        self._keep([p for p in self._queue if not p.is_scan or p.line_start <= now])
 
     def clear(self) -> None:
         """Forget everything (power lost, plug pulled)."""
-        self._queue.clear()
-        self._gathered.clear()
-        self._free_at = self._loop.time()
+        self._keep([])
+
+    def hold(self, held: bool) -> None:
+        """Keep everything back on the way to the host; letting go delivers it at once."""
+        self._held = held
         self._restart()
 
-    def _parcel(self, data: bytes, t_start: float, t_end: float, is_scan: bool) -> Parcel:
-        tail = [data[-1:]] if self.pacing.split_end else []
-        body = data[:-1] if self.pacing.split_end else data
+    def rewrap(self, piece: int = 0, split_end: bool = False, join: int = 1) -> None:
+        """Cut and gather the replies to come in another way; without arguments as whole replies."""
+        self.pacing.piece, self.pacing.split_end, self.pacing.join = piece, split_end, join
+        self._gathered.clear()
+
+    def _keep(self, parcels: list[Parcel]) -> None:
+        now = self._loop.time()
+        self._gathered.clear()
+        self._queue = deque(parcels)
+        self._line_free = max((p.line_end for p in parcels), default=now)
+        self._arrived = max((p.t_end for p in parcels), default=now)
+        self._restart()
+
+    def _pieces(self, data: bytes) -> deque[bytes]:
+        tail = [data[-1:]] if self.pacing.split_end and len(data) > 1 else []
+        body = data[:-1] if tail else data
         size = self.pacing.piece or len(body)
-        pieces = deque([body[i : i + size] for i in range(0, len(body), size)] + tail)
-        return Parcel(pieces, len(pieces), t_start, t_end, is_scan)
+        return deque([body[i : i + size] for i in range(0, len(body), size)] + tail)
 
     def _restart(self) -> None:
         if self._timer is not None:
@@ -117,11 +156,10 @@ class Outlet:
         self._wake()
 
     def _wake(self) -> None:
-        if self._timer is None and self._queue:
+        if self._timer is None and self._queue and not self._held:
             head = self._queue[0]
-            written = head.total - len(head.pieces)
-            due = head.t_start + (head.t_end - head.t_start) * (written + 1) / head.total
-            self._timer = self._loop.call_at(due, self._write)
+            nth = head.total - len(head.pieces) + 1
+            self._timer = self._loop.call_at(head.t_start + (head.t_end - head.t_start) * nth / head.total, self._write)
 
     def _write(self) -> None:
         self._timer = None

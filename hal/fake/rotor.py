@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,55 +20,71 @@ class Rotor(Protocol):
         ...
 
     def start_of(self, index: int) -> float | None:
-        """``t_mono`` at which the revolution passes step 0; None when there is no such revolution any more."""
+        """``t_mono`` at which the revolution passes step 0; None when there is no such revolution."""
         ...
 
-    def period(self) -> float:
-        """Seconds a turn takes now."""
+    def period_of(self, index: int) -> float:
+        """Seconds that revolution takes."""
         ...
 
     def set_period(self, t_mono: float, period_s: float) -> None:
-        """Turn at another speed from the revolution after ``t_mono`` on."""
+        """Turn at another speed from the first revolution after ``t_mono`` on."""
         ...
+
+
+class _Run(NamedTuple):
+    first: int
+    t_mono: float
+    period_s: float
 
 
 class EvenRotor:
     """A motor at constant speed: revolution k begins at ``t_mono + k * period_s``, without accumulating rounding."""
 
     def __init__(self, t_mono: float, period_s: float) -> None:
-        self._t_mono, self._index, self._period = t_mono, 0, period_s
+        self._runs = [_Run(0, t_mono, period_s)]
 
     def index_after(self, t_mono: float) -> int:
         """See :class:`Rotor`."""
-        return self._index + math.ceil((t_mono - self._t_mono - TINY) / self._period)
+        for run in reversed(self._runs):
+            index = run.first + math.ceil((t_mono - run.t_mono - TINY) / run.period_s)
+            if index >= run.first:
+                return index
+        return 0
 
     def start_of(self, index: int) -> float | None:
         """See :class:`Rotor`."""
-        return self._t_mono + (index - self._index) * self._period
+        run = self._run(index)
+        return None if index < 0 else run.t_mono + (index - run.first) * run.period_s
 
-    def period(self) -> float:
+    def period_of(self, index: int) -> float:
         """See :class:`Rotor`."""
-        return self._period
+        return self._run(index).period_s
 
     def set_period(self, t_mono: float, period_s: float) -> None:
         """See :class:`Rotor`."""
-        index = self.index_after(t_mono)
-        self._t_mono += (index - self._index) * self._period
-        self._index, self._period = index, period_s
+        index = max(self.index_after(t_mono), self._runs[-1].first)
+        last = self._run(index)
+        t_start = last.t_mono + (index - last.first) * last.period_s
+        self._runs = [*self._runs[-1:], _Run(index, t_start, period_s)]
+
+    def _run(self, index: int) -> _Run:
+        return next((run for run in reversed(self._runs) if index >= run.first), self._runs[0])
 
 
 class TimetableRotor:
     """Revolutions at given instants, so that a recorded log keeps its own uneven rhythm; then no more.
 
     Args:
-        starts: rising ``t_mono`` of step 0. period_s: time a turn takes, for the spread of beams and the latency.
+        starts: rising ``t_mono`` of step 0.
+        period_s: time a turn takes, for the spread of the beams and for when a scan is complete.
     """
 
     def __init__(self, starts: Sequence[float], period_s: float) -> None:
         self._starts = np.asarray(starts, dtype=np.float64)
         if self._starts.size and np.any(np.diff(self._starts) <= 0):
             raise ValueError("the times of a timetable must rise")
-        self._period = period_s
+        self._period_s = period_s
 
     def index_after(self, t_mono: float) -> int:
         """See :class:`Rotor`."""
@@ -78,10 +94,10 @@ class TimetableRotor:
         """See :class:`Rotor`."""
         return float(self._starts[index]) if 0 <= index < self._starts.size else None
 
-    def period(self) -> float:
+    def period_of(self, index: int) -> float:
         """See :class:`Rotor`."""
-        return self._period
+        return self._period_s
 
     def set_period(self, t_mono: float, period_s: float) -> None:
         """A timetable keeps its instants; only the spread of the beams changes."""
-        self._period = period_s
+        self._period_s = period_s

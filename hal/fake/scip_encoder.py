@@ -83,6 +83,10 @@ def text_line_summed_to_mark(key: str, value: str) -> bytes:
     return text + b";" + checksum(summed) + b"\n"
 
 
+TEXT_SUMS = {"plain": text_line, "whole": text_line_summed_whole, "mark": text_line_summed_to_mark}
+"""The ways firmware sums its text lines."""
+
+
 def reply(echo: bytes, status: str, body: bytes = b"") -> bytes:
     """A whole reply: echo of the request, status line, lines of ``body``, empty line."""
     return echo + b"\n" + summed_line(status.encode("ascii")) + body + b"\n"

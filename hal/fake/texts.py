@@ -22,28 +22,27 @@ class Live:
     laser: bool
     baud: int
     tick: int
-    speed: str = "Initial"
     trouble: str = ""
 
 
-def identity(model: LidarModel, unit: Unit) -> Lines:
-    """Key and value of each VV line."""
+def identity(model: LidarModel, unit: Unit, suffix: str = "") -> Lines:
+    """Key and value of each VV line; ``suffix`` is appended to the firmware's text."""
     protocol = "SCIP 2.0" if model.profile == "2.0" else "SCIP 2.2"
     return [
         ("VEND", model.vend),
         ("PROD", model.prod),
-        ("FIRM", model.firm),
+        ("FIRM", model.firm + suffix),
         ("PROT", protocol),
         ("SERI", unit.serial),
     ]
 
 
-def parameters(model: LidarModel) -> Lines:
-    """Key and value of each PP line."""
+def parameters(model: LidarModel, dmax: int) -> Lines:
+    """Key and value of each PP line, with the DMAX that the sensor claims."""
     return [
         ("MODL", model.modl),
         ("DMIN", str(model.dmin)),
-        ("DMAX", str(model.dmax)),
+        ("DMAX", str(dmax)),
         ("ARES", str(model.ares)),
         ("AMIN", str(model.amin)),
         ("AMAX", str(model.amax)),
@@ -59,7 +58,7 @@ def state(model: LidarModel, live: Live) -> Lines:
     return [
         ("MODL", model.modl),
         ("LASR", "ON" if live.laser else "OFF"),
-        ("SCSP", f"{live.speed}({model.rpm}[rpm])<-Default setting by user"),
+        ("SCSP", f"Initial({model.rpm}[rpm])<-Default setting by user"),
         ("MESM", model.modes[mode]),
         ("SBPS", link),
         ("TIME", f"{live.tick:06X}"),

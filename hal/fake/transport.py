@@ -1,4 +1,4 @@
-"""The same fake device on a memory port, a pty or TCP."""
+"""The fake device on memory ports: bytes inside one event loop, in virtual or real time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,15 @@ class MemoryHost:
 
     def take(self, data: bytes) -> bool:
         """See :class:`hal.fake.outlet.HostEnd`."""
-        self._port.write(data)
+        try:
+            self._port.write(data)
+        except DeviceMissing:  # the host has just closed; `_lost` comes in the next turn of the loop
+            return False
         return True
+
+    def baud(self) -> int:
+        """See :class:`hal.fake.outlet.HostEnd`."""
+        return self._port.peer_baud
 
     def hang_up(self) -> None:
         """See :class:`hal.fake.outlet.HostEnd`."""
@@ -46,6 +53,7 @@ class FakeOpener:
         self._clock = clock
         self._devices: dict[str, FakeHokuyo] = {}
         self._hosts: dict[str, MemoryHost] = {}
+        self.opened = 0
 
     def plug(self, name: str, device: FakeHokuyo) -> None:
         """Make ``device`` openable as ``name``."""
@@ -61,17 +69,18 @@ class FakeOpener:
         """Open a plugged-in device.
 
         Raises:
-            DeviceMissing: nothing is plugged in under that name. DeviceRefused: it is open already.
+            DeviceMissing: nothing is plugged in under that name, or it has no power.
+            DeviceRefused: it is open already.
         """
         fake = self._devices.get(device)
-        if fake is None:
-            raise DeviceMissing(
-                device, "no such device", f"plugged in: {', '.join(sorted(self._devices)) or 'nothing'}"
-            )
+        if fake is None or not fake.reachable:
+            there = ", ".join(sorted(name for name, d in self._devices.items() if d.reachable)) or "nothing"
+            raise DeviceMissing(device, "no such device", f"plugged in: {there}")
         held = self._hosts.get(device)
         if held is not None and held.open:
             raise DeviceRefused(device, "already open", "one client at a time")
         ours, theirs = memory_pair(self._clock, device)
         theirs.set_baud(baud)
         self._hosts[device] = MemoryHost(ours, fake)
+        self.opened += 1
         return theirs

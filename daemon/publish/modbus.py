@@ -1,0 +1,333 @@
+"""Modbus server on UDP and TCP: transports of our own around :class:`daemon.publish.requests.Responder`.
+
+* UDP: one datagram is one request. Nothing is kept between datagrams, so one client cannot disturb another.
+* TCP: every request in a segment is answered, in order. A connection that sends what is not Modbus is closed.
+* A turn of the event loop serves at most 64 requests (8 on each of two UDP sockets, one of each of at most 32
+  connections, 16 of those that wait with more), so that no client, and no crowd of them, can delay the cycle.
+* Nothing waits for a client: an answer that the kernel does not take at once is dropped (UDP), and a connection whose
+  answers are not read is left unserved, then closed (TCP).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from daemon.publish import registers
+from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
+from daemon.publish.requests import MAX_FRAME, Responder, frame_size
+from daemon.publish.snapshot import Snapshot, State
+from hal import inet
+from hal.clock import Clock
+from hal.inputs import Continuity
+from hal.odometry import RawOdometry
+
+UDP_PER_TURN: Final = 8
+TCP_WAITING_PER_TURN: Final = 16
+MAX_CONNECTIONS: Final = 32
+IDLE_S: Final = 60.0  # without a whole request
+PARTIAL_S: Final = 5.0  # a request that is not completed
+STUCK_S: Final = 10.0  # answers that are not read
+EVICT_S: Final = 5.0  # a full house drops the longest idle of those idle for longer
+_SWEEP_S: Final = 1.0
+_WRITE_HIGH: Final = 16 * 1024
+_READ_HIGH: Final = 16 * 1024
+_RECEIVE_BUFFER: Final = 256 * 1024
+
+
+@dataclass(slots=True)
+class Counts:
+    """What the server has seen, for the health report."""
+
+    requests: int = 0
+    malformed: int = 0
+    unsent: int = 0
+    connections: int = 0
+    refused: int = 0
+    dropped: int = 0
+
+
+class UdpEndpoint:
+    """Serves one bound datagram socket."""
+
+    def __init__(self, sock: socket.socket, responder: Responder, counts: Counts) -> None:
+        self._sock = sock
+        self._responder = responder
+        self._counts = counts
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(sock, self._serve)
+
+    def close(self) -> None:
+        """Stop serving and close the socket."""
+        self._loop.remove_reader(self._sock)
+        self._sock.close()
+
+    def _serve(self) -> None:
+        for _ in range(UDP_PER_TURN):
+            try:
+                frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
+            except OSError:  # nothing more, or the network's complaint about an earlier answer
+                return
+            if frame_size(frame) != len(frame):
+                self._counts.malformed += 1
+                continue
+            self._counts.requests += 1
+            try:
+                self._sock.sendto(self._responder.answer(frame), peer)
+            except OSError:
+                self._counts.unsent += 1
+
+
+class Connection(asyncio.Protocol):
+    """One TCP client."""
+
+    def __init__(self, server: TcpEndpoint) -> None:
+        self._server = server
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._buffer = bytearray()
+        self._blocked_since: float | None = None
+        self._heard = self._loop.time()
+        self._ended = False
+        self.last_request = self._loop.time()
+        self.waiting = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """asyncio: a client has connected."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=_WRITE_HIGH)
+        self._server.admit(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """asyncio: the client has gone, or we have closed."""
+        self._transport = None
+        self._buffer.clear()
+        self._server.forget(self)
+
+    def data_received(self, data: bytes) -> None:
+        """asyncio: bytes have arrived."""
+        self._buffer += data
+        self._heard = self._loop.time()
+        if not self.waiting and self.serve(1):
+            self._server.wait(self)
+        elif len(self._buffer) > _READ_HIGH and self._transport is not None:
+            self._transport.pause_reading()
+
+    def eof_received(self) -> bool:
+        """asyncio: the client sends no more; it gets the answers it is owed, then the connection closes."""
+        self._ended = True
+        if not self.waiting:
+            self._server.wait(self)
+        return True
+
+    def pause_writing(self) -> None:
+        """asyncio: answers pile up unread."""
+        self._blocked_since = self._loop.time()
+
+    def resume_writing(self) -> None:
+        """asyncio: answers are read again."""
+        self._blocked_since = None
+        if not self.waiting:
+            self._server.wait(self)
+
+    def serve(self, most: int) -> bool:
+        """Answer up to `most` requests; returns whether more can be answered at once."""
+        transport, size = self._transport, 0
+        if transport is None or self._blocked_since is not None:
+            return False
+        answers: list[bytes] = []
+        while len(answers) < most and 0 < (size := frame_size(self._buffer)) <= len(self._buffer):
+            answers.append(self._server.responder.answer(bytes(self._buffer[:size])))
+            del self._buffer[:size]
+        if answers:
+            self._server.counts.requests += len(answers)
+            self.last_request = self._loop.time()
+            transport.write(b"".join(answers))
+        size = frame_size(self._buffer)
+        more = 0 < size <= len(self._buffer)
+        if size < 0 or (self._ended and not more):
+            self._server.counts.malformed += size < 0
+            transport.close()
+        elif len(self._buffer) <= _READ_HIGH and not transport.is_reading():
+            transport.resume_reading()
+        return more
+
+    def overdue(self, now: float) -> bool:
+        """Whether this client has used up our patience."""
+        if self._blocked_since is not None:
+            return now - self._blocked_since > STUCK_S
+        return now - self.last_request > IDLE_S or (bool(self._buffer) and now - self._heard > PARTIAL_S)
+
+    def abort(self) -> None:
+        """Close at once."""
+        if self._transport is not None:
+            self._transport.abort()
+
+
+class TcpEndpoint:
+    """Serves listening sockets and shares each turn fairly among their connections."""
+
+    def __init__(self, responder: Responder, counts: Counts) -> None:
+        self.responder = responder
+        self.counts = counts
+        self._loop = asyncio.get_running_loop()
+        self._connections: dict[Connection, None] = {}
+        self._waiting: deque[Connection] = deque()
+        self._servers: list[asyncio.Server] = []
+        self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
+
+    async def listen(self, sock: socket.socket) -> None:
+        """Accept connections on a bound socket."""
+        server = await self._loop.create_server(lambda: Connection(self), sock=sock, backlog=MAX_CONNECTIONS)
+        self._servers.append(server)
+
+    async def close(self) -> None:
+        """Stop accepting and drop every connection."""
+        self._sweeper.cancel()
+        for server in self._servers:
+            server.close()
+        for connection in list(self._connections):
+            connection.abort()
+        for server in self._servers:
+            await server.wait_closed()
+
+    def admit(self, connection: Connection) -> None:
+        """Take a new connection; a full house first drops its longest idle one, and else refuses the new one."""
+        if len(self._connections) >= MAX_CONNECTIONS:
+            oldest = min(self._connections, key=lambda c: c.last_request)
+            if self._loop.time() - oldest.last_request <= EVICT_S:
+                self.counts.refused += 1
+                connection.abort()
+                return
+            self.counts.dropped += 1
+            oldest.abort()
+            self.forget(oldest)
+        self._connections[connection] = None
+        self.counts.connections = len(self._connections)
+
+    def forget(self, connection: Connection) -> None:
+        """A connection is gone."""
+        self._connections.pop(connection, None)
+        self.counts.connections = len(self._connections)
+
+    def wait(self, connection: Connection) -> None:
+        """Queue a connection that has more requests than its turn allows."""
+        connection.waiting = True
+        self._waiting.append(connection)
+        if len(self._waiting) == 1:
+            self._loop.call_soon(self._serve_waiting)
+
+    def _serve_waiting(self) -> None:
+        """Round robin, each its part of the turn's share."""
+        connections = min(len(self._waiting), TCP_WAITING_PER_TURN)
+        for _ in range(connections):
+            connection = self._waiting.popleft()
+            connection.waiting = connection.serve(TCP_WAITING_PER_TURN // connections)
+            if connection.waiting:
+                self._waiting.append(connection)
+        if self._waiting:
+            self._loop.call_soon(self._serve_waiting)
+
+    def _sweep(self) -> None:
+        now = self._loop.time()
+        for connection in [c for c in self._connections if c.overdue(now)]:
+            self.counts.dropped += 1
+            connection.abort()
+        self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
+
+
+def _ignore(_: object) -> None:
+    """Nobody wants to know."""
+
+
+class ModbusPublisher:
+    """Shows the latest snapshot to Modbus clients on UDP and TCP.
+
+    Args:
+        clock: time of arrival of written odometry.
+        write: whether commands and odometry may be written.
+        on_command: takes each command; tell its end by :meth:`acknowledge`.
+        on_odometry: takes each written odometry reading.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        write: bool = False,
+        on_command: Callable[[Request], None] = _ignore,
+        on_odometry: Callable[[RawOdometry], None] = _ignore,
+    ) -> None:
+        self._clock = clock
+        self._on_odometry = on_odometry
+        self._continuity = Continuity()
+        self._holding = Holding(on_command, self._take_odometry) if write else None
+        self._responder = Responder(self._holding)
+        self._udp: list[UdpEndpoint] = []
+        self._tcp: TcpEndpoint | None = None
+        self.counts = Counts()
+        self.port = 0
+        self.publish(Snapshot(seq=0, t_mono=0.0, t_sent=0.0, t_utc=0.0, state=State.STARTING, reason=0))
+
+    async def start(self, bind: str, port: int) -> None:
+        """Listen on UDP and TCP.
+
+        Args:
+            bind: name or address of this computer; empty: all of them.
+            port: 0: any free one, told by :attr:`port`.
+
+        Raises:
+            DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
+        """
+        addresses = await inet.resolve(bind, port, passive=True)
+        self._tcp = TcpEndpoint(self._responder, self.counts)
+        try:
+            for address in addresses:
+                await self._listen(self._tcp, address)
+        except OSError as error:
+            await self.close()
+            raise inet.refusal(f"Modbus on {bind or '*'}:{port}", "modbus.port", port, error) from error
+
+    async def _listen(self, tcp: TcpEndpoint, address: inet.Address) -> None:
+        family, (host, port) = address
+        stream = inet.listening((family, (host, self.port or port)), socket.SOCK_STREAM)
+        with contextlib.ExitStack() as undo:
+            undo.callback(stream.close)
+            self.port = int(stream.getsockname()[1])
+            datagrams = inet.listening((family, (host, self.port)), socket.SOCK_DGRAM)
+            undo.callback(datagrams.close)
+            datagrams.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+            await tcp.listen(stream)
+            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts))
+            undo.pop_all()
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Show a snapshot from now on; never waits."""
+        self._responder.show(registers.encode_block(snapshot), registers.encode_mirror(snapshot))
+
+    def acknowledge(self, number: int, outcome: Outcome) -> None:
+        """Tell the client what became of its command."""
+        if self._holding is not None:
+            self._holding.acknowledge(number, outcome)
+
+    async def close(self) -> None:
+        """Close every socket and connection; idempotent."""
+        udp, self._udp = self._udp, []
+        tcp, self._tcp = self._tcp, None
+        for endpoint in udp:
+            endpoint.close()
+        if tcp is not None:
+            await tcp.close()
+
+    def _take_odometry(self, written: WrittenOdometry) -> None:
+        t_rx = self._clock.now()
+        if written.restarted:
+            self._continuity.restart()
+        x, y, yaw = self._continuity.follow(written.x, written.y, written.yaw)
+        self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_rx - written.age, x=x, y=y, yaw=yaw))

@@ -1,0 +1,132 @@
+"""Pose datagrams to configured receivers. Nothing here waits: what the kernel does not take at once is dropped."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from daemon.publish import registers
+from daemon.publish.snapshot import Snapshot
+from hal import inet
+from hal.errors import DeviceMissing, DeviceRefused
+
+RETRY_S: Final = 5.0  # a name that could not be looked up (the network often comes up after the robot's programs)
+REFRESH_S: Final = 300.0  # a name's address may move to another computer
+_MAX_PORT: Final = 65_535
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Receiver:
+    """One configured receiver and what became of its datagrams.
+
+    Attributes:
+        name: as configured. sent, dropped: datagrams; dropped ones were not taken by the kernel, or the receiver's
+            name was not known. address: None while the name is not known.
+    """
+
+    name: str
+    host: str
+    port: int
+    address: inet.Address | None = None
+    sent: int = 0
+    dropped: int = 0
+    reachable: bool = True
+
+
+def parse_receiver(text: str) -> Receiver:
+    """A receiver from `host:port` or `[IPv6]:port`.
+
+    Raises:
+        DeviceRefused: not of that form.
+    """
+    host, colon, port = text.rpartition(":")
+    bracketed = host.startswith("[") and host.endswith("]")
+    good = colon and host and port.isascii() and port.isdigit() and 0 < int(port) <= _MAX_PORT
+    if not good or (":" in host and not bracketed):
+        raise DeviceRefused(f"pose receiver {text!r}", "not a receiver", "write host:port, as in 192.168.0.20:15020")
+    return Receiver(text, host[1:-1] if bracketed else host, int(port))
+
+
+class PoseSender:
+    """Sends each snapshot as one datagram to every receiver.
+
+    Args:
+        receivers: `host:port` each.
+
+    Raises:
+        DeviceRefused: a receiver that is not of that form.
+    """
+
+    def __init__(self, receivers: Sequence[str]) -> None:
+        self.receivers = [parse_receiver(text) for text in receivers]
+        self._sockets: dict[socket.AddressFamily, socket.socket] = {}
+        self._lookups: list[asyncio.Task[None]] = []
+
+    async def start(self) -> None:
+        """Find the receivers' addresses: numeric ones at once, names beside the loop and again every few minutes."""
+        for receiver in self.receivers:
+            if found := inet.numeric(receiver.host, receiver.port):
+                receiver.address = found[0]
+            else:
+                self._lookups.append(asyncio.create_task(self._look_up(receiver)))
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Send to all; never waits, never raises for the network."""
+        if not self.receivers:
+            return
+        data = registers.encode_datagram(snapshot)
+        for receiver in self.receivers:
+            self._send(receiver, data)
+
+    async def close(self) -> None:
+        """Stop; idempotent."""
+        lookups, self._lookups = self._lookups, []
+        for task in lookups:
+            task.cancel()
+        await asyncio.gather(*lookups, return_exceptions=True)
+        for sock in self._sockets.values():
+            sock.close()
+        self._sockets.clear()
+
+    def _send(self, receiver: Receiver, data: bytes) -> None:
+        if receiver.address is None:
+            receiver.dropped += 1
+            return
+        family, where = receiver.address
+        sock = self._sockets.get(family)
+        try:
+            if sock is None:
+                sock = self._sockets[family] = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+            sock.sendto(data, where)
+        except BlockingIOError:
+            receiver.dropped += 1
+        except OSError as error:
+            receiver.dropped += 1
+            self._lost(receiver, error.strerror or str(error))
+        else:
+            receiver.sent += 1
+            if not receiver.reachable:
+                receiver.reachable = True
+                log.info("pose receiver %s can be reached again", receiver.name)
+
+    def _lost(self, receiver: Receiver, problem: str) -> None:
+        if receiver.reachable:
+            receiver.reachable = False
+            log.warning("pose receiver %s: %s; datagrams to it are dropped until it is back", receiver.name, problem)
+
+    async def _look_up(self, receiver: Receiver) -> None:
+        while True:
+            try:
+                receiver.address = (await inet.resolve(receiver.host, receiver.port))[0]
+                pause = REFRESH_S
+            except DeviceMissing as error:
+                if receiver.address is None:
+                    self._lost(receiver, error.problem)
+                pause = RETRY_S
+            await asyncio.sleep(pause)

@@ -1,0 +1,168 @@
+"""Fault orders as data: one TOML schedule of what goes wrong, where, when and for how long.
+
+::
+
+    [[fault]]
+    what = "bit_flip"     # a word of the device's vocabulary
+    where = "lidar"       # which device; may be left out while there is only one
+    when = 2.0            # seconds after the schedule starts (after the order, when ordered live)
+    for = 1.5             # seconds; without `for` and `count` it lasts until it is cleared
+    count = 3             # or: how many times it strikes
+    every = 10            # strikes at every tenth opportunity only
+    share = 0.1           # strikes with this probability
+    part = "data"         # the word's own parameters
+
+Nothing here knows a device: each brings its own vocabulary, so that the orders for a lidar, an ADC and an odometry
+sender stand in one file. An unknown word, a wrong key or a value out of range is refused with its path.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Value = float | int | str | bool
+
+
+class FaultError(ValueError):
+    """An order that cannot be understood. ``path`` names the place (``fault[2].part``)."""
+
+    def __init__(self, path: str, problem: str) -> None:
+        super().__init__(f"{path}: {problem}")
+        self.path = path
+        self.problem = problem
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of a word: its kind is that of its default; numbers lie in [``low``, ``high``]."""
+
+    default: Value
+    low: float = float("-inf")
+    high: float = float("inf")
+    choices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """One kind of fault.
+
+    Attributes:
+        help: what it does, in one clause.
+        kind: ``strikes`` hits single frames or replies (takes ``for count every share``), ``lasts`` is a condition
+            (takes ``for``), ``once`` is an event.
+        parameters: its own parameters, by name.
+        share: probability of a strike where the order names none.
+    """
+
+    help: str
+    kind: Literal["strikes", "lasts", "once"]
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    share: float = 1.0
+
+
+Vocabulary = Mapping[str, Word]
+
+TIMES = {"when": Parameter(0.0, 0.0)}
+LASTING = TIMES | {"for": Parameter(0.0, 0.0)}
+STRIKING = LASTING | {"count": Parameter(0, 1), "every": Parameter(1, 1), "share": Parameter(1.0, 0.0, 1.0)}
+COMMON = {"once": TIMES, "lasts": LASTING, "strikes": STRIKING}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fault:
+    """One order. ``lasts`` in seconds, 0: no end of its own; ``count`` strikes, 0: no limit. Compared by identity."""
+
+    what: str
+    where: str
+    when: float = 0.0
+    lasts: float = 0.0
+    count: int = 0
+    every: int = 1
+    share: float = 1.0
+    values: Mapping[str, Value] = field(default_factory=dict)
+
+    def number(self, name: str) -> float:
+        """A parameter that is a number."""
+        return float(self.values[name])
+
+    def text(self, name: str) -> str:
+        """A parameter that is a text."""
+        return str(self.values[name])
+
+    def __str__(self) -> str:
+        shown = {"for": self.lasts, "count": self.count} | dict(self.values)
+        return " ".join([f"{self.where}:{self.what}", *(f"{k}={v}" for k, v in shown.items() if v not in (0, ""))])
+
+
+def _check(path: str, value: Any, rule: Parameter) -> Value:
+    kind = type(rule.default)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        raise FaultError(path, f"expected a {kind.__name__}, got {value!r}")
+    if rule.choices and value not in rule.choices:
+        raise FaultError(path, f"{value!r} is none of {', '.join(rule.choices)}")
+    if isinstance(value, (int, float)) and not rule.low <= value <= rule.high:
+        raise FaultError(path, f"{value!r} is outside {rule.low:g}...{rule.high:g}")
+    checked: Value = kind(value)
+    return checked
+
+
+def read_fault(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocabulary]) -> Fault:
+    """Check one order against the vocabulary of the device it names.
+
+    Raises:
+        FaultError: unknown device, word or key, or a value of the wrong kind or out of range.
+    """
+    only = next(iter(vocabularies)) if len(vocabularies) == 1 else None
+    where = table.get("where", only)
+    if where not in vocabularies:
+        raise FaultError(f"{path}.where", f"{where!r} is no device here; there are: {', '.join(sorted(vocabularies))}")
+    what = table.get("what")
+    word = vocabularies[where].get(what) if isinstance(what, str) else None
+    if word is None:
+        known = ", ".join(sorted(vocabularies[where]))
+        raise FaultError(f"{path}.what", f"{what!r} is no fault of {where!r}; known: {known}")
+    common = COMMON[word.kind]
+    rules = {**common, **word.parameters}
+    unknown = sorted(set(table) - set(rules) - {"what", "where"})
+    if unknown:
+        raise FaultError(f"{path}.{unknown[0]}", f"{what!r} takes: what, where, {', '.join(rules)}")
+    given = {key: _check(f"{path}.{key}", value, rules[key]) for key, value in table.items() if key in rules}
+    values = {key: given.get(key, rule.default) for key, rule in word.parameters.items()}
+    return Fault(
+        what=str(what),
+        where=str(where),
+        when=float(given.get("when", 0.0)),
+        lasts=float(given.get("for", 0.0)),
+        count=int(given.get("count", 0)),
+        every=int(given.get("every", 1)),
+        share=float(given.get("share", word.share)),
+        values=values,
+    )
+
+
+def read_schedule(text: str, vocabularies: Mapping[str, Vocabulary]) -> list[Fault]:
+    """Read a TOML schedule.
+
+    Args:
+        text: the file's text.
+        vocabularies: by device name.
+
+    Raises:
+        FaultError: the text is no TOML, or an order in it is wrong; the message begins with the path of the place.
+    """
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FaultError("schedule", f"not TOML: {error}") from error
+    unknown = sorted(set(tree) - {"fault"})
+    if unknown:
+        raise FaultError(unknown[0], "a schedule holds [[fault]] tables and nothing else")
+    tables = tree.get("fault", [])
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise FaultError("fault", "expected [[fault]] tables")
+    return [read_fault(table, f"fault[{i}]", vocabularies) for i, table in enumerate(tables)]

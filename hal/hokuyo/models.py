@@ -1,0 +1,199 @@
+"""What each HOKUYO model may be asked, what its odd values mean, and how late its data are.
+
+Geometry is never taken from here: a sensor states it in ``PP``. These are the facts it does not state. Sources: SCIP
+specifications C-42-03320B, C-42-04076, C-42-03907; field reports named at the entries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from hal.errors import DeviceRefused
+from hal.hokuyo.payload import ScanRequest
+from hal.lidar import LidarGeometry
+
+_CORE: Final = frozenset(["VV", "PP", "II", "BM", "QT", "RS", "TM", "SS", "MD", "MS", "GD", "GS"])
+_INTENSITY: Final = _CORE | {"ME", "GE", "RT"}
+_MULTI_ECHO: Final = _INTENSITY | {"ND", "NE", "HD", "HE", "RB"}
+
+_URG_CODES: Final = {
+    0: "no return, perhaps far beyond range",
+    1: "reflected light too weak",
+    2: "reflected light too weak",
+    3: "reflected light too weak",
+    4: "reflected light too weak",
+    5: "reflected light too weak",
+    6: "other",
+    7: "neighbouring steps also in error",
+    8: "intensity differs too much from the neighbours",
+    9: "same step failed in the last two scans",
+    16: "at the 4096 mm limit",
+    18: "reflection too strong",
+    19: "not measurable",
+}
+_UTM_CODES: Final = {
+    0: "no return",
+    1: "no object in range",
+    2: "too near, or reflection inside the window",
+    3: "interference or measurement error",
+    4: "out of range at the near end",
+    5: "other",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ModelFacts:
+    """Facts of a family of sensors.
+
+    Attributes:
+        family: name for people and for the status.
+        commands: two-letter commands that are safe to send; old firmware wedges on others until a power cycle
+            (ros-drivers/urg_c PR 4, ros-drivers/urg_node issue 23).
+        codes: meaning of values below DMIN.
+        no_return_from: values from here on are no distance even if DMAX allows them; 0: DMAX alone decides.
+        processing_s: from the end of a revolution's measurement to its first byte, undelayed.
+        intensity_swath_deg: widest safe field of view with intensity at cluster 1, by firmware; "" is any other
+            firmware. Empty: no limit.
+    """
+
+    family: str
+    commands: frozenset[str]
+    codes: dict[int, str] = field(default_factory=dict)
+    no_return_from: int = 0
+    processing_s: float = 5e-4
+    intensity_swath_deg: dict[str, float] = field(default_factory=dict)
+
+    def may(self, command: str) -> bool:
+        """True where ``command`` (two letters) is safe to send."""
+        return command[:2] in self.commands
+
+
+_FAMILIES: Final[tuple[tuple[str, ModelFacts], ...]] = (
+    # a fragment of PROD (of VV) or MODL (of PP); the first that fits
+    ("URG-04LX", ModelFacts("URG-04LX", _CORE, _URG_CODES)),
+    ("UBG-04LX", ModelFacts("UBG-04LX", _CORE, _URG_CODES)),
+    ("UHG-08LX", ModelFacts("UHG-08LX", _CORE, _URG_CODES)),
+    ("UTM-30LX-EW", ModelFacts("UTM-30LX-EW", _MULTI_ECHO, _UTM_CODES)),
+    (
+        "UTM-30LX",
+        # hokuyo_node and PR2/pr2_robot issue 137: a wider request gives wrong data or a crash that needs a power cycle
+        ModelFacts("UTM-30LX", _INTENSITY, _UTM_CODES, intensity_swath_deg={"": 95.0, "1.16.01(16/Nov./2009)": 190.0}),
+    ),
+    ("UST-", ModelFacts("UST", _INTENSITY | {"RB"}, _UTM_CODES, no_return_from=65533, processing_s=4e-4)),
+    ("UXM-30LX", ModelFacts("UXM-30LX", _MULTI_ECHO, _UTM_CODES)),
+)
+UNKNOWN_MODEL: Final = ModelFacts("unknown model", _INTENSITY)
+"""For models not listed; intensity is still verified by one counted scan before it is relied on."""
+
+BEFORE_KNOWN: Final = ModelFacts("not yet identified", frozenset({"VV", "PP", "QT", "RS", "TM", "SC"}))
+"""What may be sent to a sensor before it has said who it is."""
+
+
+def facts_of(product: str, model: str) -> ModelFacts:
+    """Facts by what VV calls the product and PP the model."""
+    for text in (product, model):
+        for fragment, facts in _FAMILIES:
+            if fragment in text:
+                return facts
+    return UNKNOWN_MODEL
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A sensor as it describes itself in VV and PP."""
+
+    product: str
+    protocol: str
+    geometry: LidarGeometry
+    facts: ModelFacts
+
+    def code_text(self, value: int) -> str:
+        """What a value that is no distance says, for people."""
+        if value > self.geometry.dmax:
+            return "no return"
+        return self.facts.codes.get(value, "error code without published meaning")
+
+
+_PP_NUMBERS: Final = ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
+
+
+def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
+    """Make an identity of the text lines of VV (may be empty) and PP.
+
+    Raises:
+        DeviceRefused: PP lacks a key or contradicts itself, or the firmware is of the time before SCIP 2.0.
+    """
+    numbers: dict[str, int] = {}
+    for key in _PP_NUMBERS:
+        text = pp.get(key, "")
+        if not text.isdigit():
+            raise DeviceRefused(device, f"PP says {key}={text!r}, expected a number", "is this a HOKUYO 2D lidar?")
+        numbers[key] = int(text)
+    ares, amin, amax = numbers["ARES"], numbers["AMIN"], numbers["AMAX"]
+    if not (numbers["SCAN"] > 0 and 0 <= amin < amax <= ares <= 9999 and amin <= numbers["AFRT"] <= amax):
+        raise DeviceRefused(device, f"PP contradicts itself: {pp}", "is this a HOKUYO 2D lidar?")
+    if not numbers["DMIN"] < numbers["DMAX"] <= 0x3FFFF:
+        raise DeviceRefused(device, f"PP contradicts itself: {pp}", "is this a HOKUYO 2D lidar?")
+    period_s = 60.0 / numbers["SCAN"]
+    product, firmware = vv.get("PROD", ""), vv.get("FIRM", "")
+    model = pp.get("MODL", "") or product
+    facts = facts_of(product, model)
+    if facts.family == "URG-04LX" and firmware[:2] in ("0.", "1.", "2."):
+        raise DeviceRefused(device, f"URG-04LX firmware {firmware} has no full SCIP 2.0", "update it to 3.x")
+    geometry = LidarGeometry(
+        model=model.partition("(")[0].strip(),
+        serial=vv.get("SERI", ""),
+        firmware=firmware,
+        ares=float(ares),
+        afrt=numbers["AFRT"],
+        amin=amin,
+        amax=amax,
+        dmin=numbers["DMIN"],
+        dmax=numbers["DMAX"],
+        range_unit_m=0.001,
+        period_s=period_s,
+        beam_dt_s=period_s / ares,
+    )
+    return Identity(product, vv.get("PROT", ""), geometry, facts)
+
+
+def stream_request(identity: Identity, *, intensity: bool, bytes_per_s: float) -> ScanRequest:
+    """The endless stream to ask for: all steps of all revolutions if model and line can carry it.
+
+    A slow line first gets clusters of 2 and 3 steps, then every second to tenth revolution.
+
+    Args:
+        identity: of the sensor.
+        intensity: ask for ME; clusters are formed where a model's intensity mode is unsafe over the full field of view.
+        bytes_per_s: what the line carries.
+    """
+    geometry, facts = identity.geometry, identity.facts
+    name = "ME" if intensity and facts.may("ME") else "MD"
+    least = 1
+    limits = facts.intensity_swath_deg
+    if name == "ME" and limits:
+        swath = (geometry.amax - geometry.amin) * 360.0 / geometry.ares
+        safe = limits.get(geometry.firmware, limits[""])
+        while safe * least < swath:
+            least += 1
+    request = ScanRequest(name, geometry.amin, geometry.amax, least)
+    for cluster in range(least, max(least, 3) + 1):
+        request = ScanRequest(name, geometry.amin, geometry.amax, cluster)
+        if request.frame_bytes <= bytes_per_s * geometry.period_s:
+            return request
+    for skip in range(1, 10):
+        request = ScanRequest(name, geometry.amin, geometry.amax, max(least, 3), skip)
+        if request.frame_bytes <= bytes_per_s * geometry.period_s * (skip + 1):
+            break
+    return request
+
+
+def latency_s(identity: Identity, request: ScanRequest, bytes_per_s: float) -> float:
+    """Seconds from the beam at step 0 to the arrival of a frame's last byte when nothing delays it.
+
+    Data leave the sensor after the last measurable step (C-42-03320B); then its processing, then the line.
+    """
+    geometry = identity.geometry
+    line = request.frame_bytes / bytes_per_s if bytes_per_s > 0 else 0.0
+    return geometry.amax * geometry.beam_dt_s + identity.facts.processing_s + line

@@ -1,0 +1,116 @@
+"""A listener that never speaks: scans from received bytes alone, for recorded captures.
+
+It runs the same splitter, codec and clock code as the live driver.
+"""
+
+from __future__ import annotations
+
+from hal.errors import DeviceRefused
+from hal.hokuyo.models import UNKNOWN_MODEL, Identity, facts_of, identify
+from hal.hokuyo.payload import ScanRequest
+from hal.hokuyo.scip import ACCEPTED, DATA, BadFrame, FrameSplitter, Reply, parse_reply, parse_text
+from hal.hokuyo.stream import ScanStream
+from hal.lidar import LidarGeometry, LidarStatus, RawScan
+
+_SCANS = frozenset({b"MD", b"MS", b"ME", b"ND", b"NE", b"GD", b"GS", b"GE", b"HD", b"HE"})
+
+
+class PassiveHokuyo:
+    """Decodes what a sensor sent, without having seen what it was asked.
+
+    Geometry comes from VV and PP replies in the bytes; until a PP has come, from ``geometry``; with neither, scans are
+    passed over and counted in ``status.invalid``. The stream's shape comes from the echo of each reply.
+
+    Args:
+        geometry: used until the bytes hold a PP reply.
+        bytes_per_s: speed of the line the bytes came over, 0 for one without delay.
+        device: what the source is called in errors.
+    """
+
+    def __init__(
+        self, geometry: LidarGeometry | None = None, *, bytes_per_s: float = 0.0, device: str = "capture"
+    ) -> None:
+        self._device = device
+        self._bytes_per_s = bytes_per_s
+        self._splitter = FrameSplitter()
+        self._identity = None if geometry is None else _given(geometry)
+        self._vv: dict[str, str] = {}
+        self._stream: ScanStream | None = None
+        self._seq = 0
+        self._status = LidarStatus(dialect="SCIP 2 capture")
+
+    @property
+    def geometry(self) -> LidarGeometry | None:
+        """Geometry in use, None until there is one."""
+        return None if self._identity is None else self._identity.geometry
+
+    @property
+    def status(self) -> LidarStatus:
+        """Counters: scans, missed, invalid (damaged, or no geometry yet), resyncs, clock_resets; latest error."""
+        return self._status
+
+    def restart(self) -> None:
+        """The bytes that follow belong to another connection (a gap in the recording)."""
+        self._splitter.reset()
+        self._stream = None
+
+    def feed(self, data: bytes, t_rx: float) -> list[RawScan]:
+        """Take bytes in the order received, with their arrival time; returns the scans they complete."""
+        scans: list[RawScan] = []
+        dropped = self._splitter.dropped_bytes
+        for frame in self._splitter.feed(data):
+            try:
+                reply = parse_reply(frame)
+                if reply.echo[:2] in _SCANS:
+                    scan = self._scan(reply, t_rx)
+                    if scan is not None:
+                        scans.append(scan)
+                elif reply.status == ACCEPTED:
+                    self._learn(reply)
+            except BadFrame:
+                self._status.invalid += 1
+                self._seq += 1
+            except DeviceRefused as error:
+                self._status.error = error
+        if self._splitter.dropped_bytes != dropped:
+            self._status.resyncs += 1
+        return scans
+
+    def _learn(self, reply: Reply) -> None:
+        if reply.echo == b"VV":
+            self._vv = parse_text(reply, strict=False)
+        elif reply.echo == b"PP":
+            identity = identify(self._device, self._vv, parse_text(reply))
+            if identity != self._identity:
+                self._identity, self._stream = identity, None
+
+    def _scan(self, reply: Reply, t_rx: float) -> RawScan | None:
+        single = reply.echo[:1] in b"GH"
+        if reply.status != (ACCEPTED if single else DATA):
+            return None  # acknowledgement, refusal, or the sensor checking itself
+        if self._identity is None:
+            self._seq += 1
+            self._status.invalid += 1
+            return None
+        asked = ScanRequest.of_echo(reply.echo)
+        stream = self._stream
+        if stream is None or not _same_stream(stream.request, asked):
+            stream = self._stream = ScanStream(self._identity, asked, self._status, self._bytes_per_s)
+        stream.request = asked  # a counted stream counts down in its echo
+        scan = stream.take(reply, t_rx, self._seq)
+        self._seq += 1
+        if scan is None:
+            self._status.invalid += 1
+        else:
+            self._status.scans += 1
+            self._status.error = None
+            self._status.dialect = f"SCIP 2 capture {asked.name}"
+        return scan
+
+
+def _same_stream(a: ScanRequest, b: ScanRequest) -> bool:
+    return (a.name, a.start, a.end, a.cluster, a.skip) == (b.name, b.start, b.end, b.cluster, b.skip)
+
+
+def _given(geometry: LidarGeometry) -> Identity:
+    return Identity("", "", geometry, facts_of("", geometry.model) if geometry.model else UNKNOWN_MODEL)

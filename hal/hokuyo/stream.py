@@ -1,0 +1,89 @@
+"""Data replies of one stream to `RawScan`: codes apart from ranges, stamps to ``t_mono``, losses counted."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from hal.hokuyo.models import Identity, latency_s
+from hal.hokuyo.payload import Ints, ScanReply, ScanRequest, parse_scan
+from hal.hokuyo.scip import Reply
+from hal.hokuyo.ticks import ScanTime, TickClock
+from hal.lidar import VALID, LidarStatus, RawScan
+
+_SATURATED_2CHAR: Final = 4095  # MS and GS say this for everything at least so far
+
+
+class ScanStream:
+    """Turns the data replies to one request into scans.
+
+    Args:
+        identity: of the sensor.
+        request: what was asked for.
+        status: whose counters are kept (``missed``, ``clock_resets``).
+        bytes_per_s: speed of the line, 0 for one without delay; part of the time between measurement and arrival.
+    """
+
+    def __init__(self, identity: Identity, request: ScanRequest, status: LidarStatus, bytes_per_s: float = 0.0) -> None:
+        self.identity = identity
+        self.request = request
+        self._status = status
+        self._clock = TickClock(
+            identity.geometry.period_s * (request.skip + 1), latency_s(identity, request, bytes_per_s)
+        )
+        self._resets_seen = 0
+        self._dmax = identity.geometry.dmax
+        if identity.facts.no_return_from:
+            self._dmax = min(self._dmax, identity.facts.no_return_from - 1)
+        if request.form.chars == 2:
+            self._dmax = min(self._dmax, _SATURATED_2CHAR - 1)
+
+    @property
+    def stuck(self) -> bool:
+        """The sensor repeats one stamp: it has stopped measuring."""
+        return self._clock.stuck
+
+    @property
+    def period_s(self) -> float:
+        """Learned time between two scans of the stream, host seconds."""
+        return self._clock.period_s
+
+    def take(self, reply: Reply, t_rx: float, seq: int) -> RawScan | None:
+        """Decode and time one data reply; None where its time cannot be told without guessing.
+
+        Raises:
+            BadFrame: the reply is damaged or of another request.
+        """
+        data = parse_scan(self.request, reply)
+        when = self._clock.feed(data.stamp, t_rx)
+        if self._clock.resets != self._resets_seen:
+            self._status.clock_resets += self._clock.resets - self._resets_seen
+            self._resets_seen = self._clock.resets
+        if when is None:
+            return None
+        self._status.missed += when.periods - 1
+        return self._scan(data, when, t_rx, seq)
+
+    def _scan(self, data: ScanReply, when: ScanTime, t_rx: float, seq: int) -> RawScan:
+        geometry, request = self.identity.geometry, self.request
+        valid = self._valid(data.distance)
+        beam_dt_s = self._clock.period_s / (request.skip + 1) / geometry.ares
+        echoes = data.echoes
+        return RawScan(
+            geometry=geometry,
+            seq=seq,
+            t_rx=t_rx,
+            t_mono=when.t_mono + request.start * beam_dt_s,
+            t_sigma=when.t_sigma,
+            t_tick=data.stamp,
+            first_step=request.start,
+            stride=request.stride,
+            ranges=np.where(valid, data.distance, np.int32(0)),
+            code=np.where(valid, np.int32(VALID), data.distance),
+            intensity=data.intensity,
+            echoes=None if echoes is None else np.where(self._valid(echoes), echoes, np.int32(0)),
+        )
+
+    def _valid(self, distance: Ints) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        return (distance >= self.identity.geometry.dmin) & (distance <= self._dmax)

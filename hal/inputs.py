@@ -1,0 +1,341 @@
+"""Odometry and IMU over UDP: a binary datagram codec, and a socket that turns datagrams into readings.
+
+Both datagrams are little-endian and end with the CRC-32 (zlib, IEEE 802.3) of everything before it::
+
+    0   4s   magic  "LUOD" odometry, "LUIM" IMU
+    4   u16  version, 1
+    6   u16  length of the whole datagram
+    8   u32  session: a number the sender draws when it starts
+    12  u32  seq: one more with every datagram of this kind, wraps
+    16  u32  flags: bit 0: `time` is CLOCK_MONOTONIC of the daemon's own computer
+    20  u32  0
+    24  f64  time of the reading in seconds, in the sender's clock
+    32  f64  odometry: x (m) | IMU: yaw rate (rad/s, counter-clockwise)
+    40  f64  odometry: y (m)
+    48  f64  odometry: yaw (rad, counter-clockwise, wrapped or not)
+
+An odometry datagram has 60 bytes, an IMU datagram 44. Odometry is cumulative, so a lost datagram loses nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import socket
+import struct
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from hal import inet
+from hal.clock import Clock
+from hal.errors import DataInvalid, HalError
+from hal.imu import RawImu
+from hal.odometry import RawOdometry
+
+VERSION: Final = 1
+ODOMETRY_MAGIC: Final = b"LUOD"
+IMU_MAGIC: Final = b"LUIM"
+SHARED_CLOCK: Final = 1
+
+SESSION_TIMEOUT_S: Final = 1.0  # another sender is taken when the present one has been silent for this long
+MAX_AGE_S: Final = 1.0  # an older kernel stamp or shared-clock time is not believed
+MAX_SHARED_LEAD_S: Final = 0.001  # a reading cannot be from the future
+_PER_TURN: Final = 16
+_BUFFER: Final = 256
+_HEAD: Final = struct.Struct("<4sHHIIII")
+_BODY: Final = {ODOMETRY_MAGIC: struct.Struct("<dddd"), IMU_MAGIC: struct.Struct("<dd")}
+_CRC: Final = struct.Struct("<I")
+_TIMESPEC: Final = struct.Struct("@ll")
+_SO_TIMESTAMPNS: Final = 35  # asm-generic/socket.h; the socket module has no name for it
+_DEVICE: Final = "input datagram"
+
+
+@dataclass(frozen=True, slots=True)
+class InputDatagram:
+    """One datagram: its kind by `magic`, `values` are (x, y, yaw) or (yaw rate,)."""
+
+    magic: bytes
+    session: int
+    seq: int
+    flags: int
+    time: float
+    values: tuple[float, ...]
+
+
+def encode(datagram: InputDatagram) -> bytes:
+    """Bytes of a datagram."""
+    body = _BODY[datagram.magic].pack(datagram.time, *datagram.values)
+    length = _HEAD.size + len(body) + _CRC.size
+    data = _HEAD.pack(datagram.magic, VERSION, length, datagram.session, datagram.seq, datagram.flags, 0) + body
+    return data + _CRC.pack(zlib.crc32(data))
+
+
+def decode(data: bytes) -> InputDatagram:
+    """A datagram from its bytes.
+
+    Raises:
+        DataInvalid: not such a datagram, another version, damaged, or a value that is not finite.
+    """
+    if len(data) < _HEAD.size + _CRC.size:
+        raise DataInvalid(_DEVICE, f"{len(data)} bytes are too short")
+    magic, version, length, session, seq, flags, _ = _HEAD.unpack_from(data)
+    body = _BODY.get(magic)
+    if body is None:
+        raise DataInvalid(_DEVICE, f"unknown magic {magic!r}", "expected LUOD or LUIM")
+    if version != VERSION:
+        raise DataInvalid(_DEVICE, f"version {version}", f"this daemon knows version {VERSION}")
+    if length != len(data) or length != _HEAD.size + body.size + _CRC.size:
+        raise DataInvalid(_DEVICE, f"says {length} bytes and has {len(data)}")
+    if _CRC.unpack_from(data, length - _CRC.size)[0] != zlib.crc32(data[: -_CRC.size]):
+        raise DataInvalid(_DEVICE, "CRC-32 differs")
+    t_sender, *values = body.unpack_from(data, _HEAD.size)
+    if not all(map(math.isfinite, (t_sender, *values))):
+        raise DataInvalid(_DEVICE, "a value is not finite")
+    return InputDatagram(magic, session, seq, flags, t_sender, tuple(values))
+
+
+class Continuity:
+    """Keeps a cumulative pose free of jumps when its sender restarts and counts from a new origin."""
+
+    def __init__(self) -> None:
+        self._last = (0.0, 0.0, 0.0)
+        self._anchor = (0.0, 0.0, 0.0)  # T_ours_theirs
+        self._restarted = False
+        self._begun = False
+
+    def restart(self) -> None:
+        """The next pose is from a new origin; what moved in between is not known and is left out."""
+        self._restarted = self._begun
+
+    def follow(self, x: float, y: float, yaw: float) -> tuple[float, float, float]:
+        """The sender's pose in the frame of its first origin."""
+        if self._restarted:
+            turn = self._last[2] - yaw
+            c, s = math.cos(turn), math.sin(turn)
+            self._anchor = (self._last[0] - c * x + s * y, self._last[1] - s * x - c * y, turn)
+            self._restarted = False
+        self._begun = True
+        ax, ay, turn = self._anchor
+        c, s = math.cos(turn), math.sin(turn)
+        self._last = (ax + c * x - s * y, ay + s * x + c * y, turn + yaw)
+        return self._last
+
+
+@dataclass(slots=True)
+class InputCounts:
+    """What came in on one kind of datagram."""
+
+    received: int = 0
+    lost: int = 0
+    late: int = 0  # overtaken by a newer one: dropped, a cumulative pose loses nothing
+    duplicate: int = 0
+    foreign: int = 0  # of a second sender while the first still sends
+    restarts: int = 0
+
+
+@dataclass(slots=True)
+class Sequence:
+    """Follows the numbering of one sender of one kind of datagram."""
+
+    counts: InputCounts = field(default_factory=InputCounts)
+    _session: int | None = None
+    _seq: int = 0
+    _heard: float = -math.inf
+    restarted: bool = False
+
+    def accept(self, session: int, seq: int, t_rx: float) -> bool:
+        """Whether a datagram is the next news; `restarted` says whether its sender began anew."""
+        self.restarted = False
+        if session != self._session:
+            if t_rx - self._heard <= SESSION_TIMEOUT_S:
+                self.counts.foreign += 1
+                return False
+            self.restarted = self._session is not None
+            self.counts.restarts += self.restarted
+        else:
+            ahead = (seq - self._seq) % (1 << 32)
+            if ahead == 0:
+                self.counts.duplicate += 1
+                return False
+            self.restarted = ahead >= 1 << 31 and t_rx - self._heard > SESSION_TIMEOUT_S
+            if self.restarted:  # a sender that starts anew under the same session number
+                self.counts.restarts += 1
+            elif ahead >= 1 << 31:
+                self.counts.late += 1
+                return False
+            else:
+                self.counts.lost += ahead - 1
+        self._session, self._seq, self._heard = session, seq, t_rx
+        self.counts.received += 1
+        return True
+
+
+OnOdometry = Callable[[RawOdometry], None]
+OnImu = Callable[[RawImu], None]
+
+
+class InputPort:
+    """One UDP port that takes both kinds of datagrams; `odometry` and `imu` are its two sources.
+
+    The socket is open while at least one source runs. A datagram's time of arrival is the kernel's.
+
+    Args:
+        bind: name or address of this computer; empty: all of them.
+        port: 0: any free one, told by :attr:`port` once open.
+        option: configuration key of the port, for the remedy.
+    """
+
+    def __init__(self, clock: Clock, bind: str, port: int, option: str = "odometry.port") -> None:
+        self._clock = clock
+        self._bind = bind
+        self._wanted = port
+        self._option = option
+        self._sockets: list[socket.socket] = []
+        self._users = 0
+        self._continuity = Continuity()
+        self._on_odometry: OnOdometry | None = None
+        self._on_imu: OnImu | None = None
+        self._kinds = {ODOMETRY_MAGIC: Sequence(), IMU_MAGIC: Sequence()}
+        self.invalid = 0
+        self.odometry = UdpOdometry(self)
+        self.imu = UdpImu(self)
+
+    @property
+    def port(self) -> int:
+        """Port number while open."""
+        return int(self._sockets[0].getsockname()[1]) if self._sockets else self._wanted
+
+    @property
+    def counts(self) -> dict[str, InputCounts]:
+        """Counts by kind: odometry, imu."""
+        return {"odometry": self._kinds[ODOMETRY_MAGIC].counts, "imu": self._kinds[IMU_MAGIC].counts}
+
+    async def open(self) -> None:
+        """Listen; each call is undone by one `close`.
+
+        Raises:
+            DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
+        """
+        self._users += 1
+        if self._users > 1:
+            return
+        try:
+            for address in await inet.resolve(self._bind, self._wanted, passive=True):
+                self._listen(address)
+        except (OSError, HalError) as error:
+            self.close()
+            if isinstance(error, OSError):
+                device = f"input datagrams on {self._bind or '*'}:{self._wanted}"
+                raise inet.refusal(device, self._option, self._wanted, error) from error
+            raise
+
+    def _listen(self, address: inet.Address) -> None:
+        sock = inet.listening((address[0], (address[1][0], self.port)), socket.SOCK_DGRAM)
+        self._sockets.append(sock)
+        with contextlib.suppress(OSError):  # a kernel without it: the time of reading is used
+            sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        asyncio.get_running_loop().add_reader(sock, self._read, sock)
+
+    def close(self) -> None:
+        """Undo one `open`."""
+        self._users -= 1
+        if self._users > 0:
+            return
+        loop = asyncio.get_running_loop()
+        for sock in self._sockets:
+            loop.remove_reader(sock)
+            sock.close()
+        self._sockets.clear()
+
+    def _read(self, sock: socket.socket) -> None:
+        for _ in range(_PER_TURN):
+            try:
+                data, ancillary, _, _ = sock.recvmsg(_BUFFER, socket.CMSG_SPACE(_TIMESPEC.size))
+            except OSError:  # nothing more
+                return
+            self.take(data, self._clock.now() - _kernel_age(ancillary))
+
+    def take(self, data: bytes, t_rx: float) -> None:
+        """One datagram and its time of arrival (also for replay)."""
+        try:
+            datagram = decode(data)
+        except DataInvalid:
+            self.invalid += 1
+            return
+        kind = self._kinds[datagram.magic]
+        if not kind.accept(datagram.session, datagram.seq, t_rx):
+            return
+        t_mono = _reading_time(datagram, t_rx)
+        if datagram.magic == IMU_MAGIC:
+            if self._on_imu is not None:
+                self._on_imu(RawImu(t_rx=t_rx, t_mono=t_mono, yaw_rate=datagram.values[0]))
+            return
+        if kind.restarted:
+            self._continuity.restart()
+        x, y, yaw = self._continuity.follow(*datagram.values)
+        if self._on_odometry is not None:
+            self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_mono, x=x, y=y, yaw=yaw))
+
+    def send_odometry_to(self, receiver: OnOdometry | None) -> None:
+        """Who gets odometry readings."""
+        self._on_odometry = receiver
+
+    def send_imu_to(self, receiver: OnImu | None) -> None:
+        """Who gets gyro readings."""
+        self._on_imu = receiver
+
+
+class UdpOdometry:
+    """See :class:`hal.odometry.OdometrySource`."""
+
+    def __init__(self, port: InputPort) -> None:
+        self._port = port
+
+    async def run(self, on_odometry: OnOdometry) -> None:
+        """Deliver readings until cancelled. Raises as `InputPort.open`."""
+        await self._port.open()
+        self._port.send_odometry_to(on_odometry)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self._port.send_odometry_to(None)
+            self._port.close()
+
+
+class UdpImu:
+    """See :class:`hal.imu.ImuSource`."""
+
+    def __init__(self, port: InputPort) -> None:
+        self._port = port
+
+    async def run(self, on_imu: OnImu) -> None:
+        """Deliver readings until cancelled. Raises as `InputPort.open`."""
+        await self._port.open()
+        self._port.send_imu_to(on_imu)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self._port.send_imu_to(None)
+            self._port.close()
+
+
+def _kernel_age(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """Seconds since the kernel received a datagram; 0 where it does not say, or its clock was set in between."""
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) >= _TIMESPEC.size:
+            seconds, nanoseconds = _TIMESPEC.unpack_from(data)
+            age = (time.clock_gettime_ns(time.CLOCK_REALTIME) - seconds * 1_000_000_000 - nanoseconds) * 1e-9
+            return age if 0.0 <= age <= MAX_AGE_S else 0.0
+    return 0.0
+
+
+def _reading_time(datagram: InputDatagram, t_rx: float) -> float:
+    """When the reading was true: the sender's time if it shares our clock and is plausible, else the arrival."""
+    age = t_rx - datagram.time
+    if datagram.flags & SHARED_CLOCK and -MAX_SHARED_LEAD_S <= age <= MAX_AGE_S:
+        return min(datagram.time, t_rx)
+    return t_rx

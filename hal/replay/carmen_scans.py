@@ -1,0 +1,105 @@
+"""Ranges of a CARMEN log, metres as text, to a lidar's device units with the geometry the log implies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hal.lidar import VALID, LidarGeometry
+from hal.replay.carmen_lines import LaserLine, LaserSetup
+from hal.replay.laser import beam_rule, no_return, whole_step
+from hal.replay.report import LogReport
+
+Array = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.int32]
+
+UNIT_M: Final = 0.001
+PARAM_MODEL: Final = "lumiloop_laser_model"
+PARAM_DMIN: Final = "lumiloop_laser_dmin"
+PARAM_PERIOD: Final = "lumiloop_laser_period"
+PARAM_BEAM_DT: Final = "lumiloop_laser_beam_dt"
+"""Parameters of our own that a converted log may carry: text, metres, seconds, seconds between beams."""
+
+PARAM_MAXIMUM: Final = "robot_front_laser_max"
+_FARTHEST: Final = 1_000_000
+"""One kilometre in range units; what is beyond is no distance of any indoor lidar, whatever the log says."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarmenScan:
+    """One scan in device units; `hal.lidar.RawScan` describes the fields."""
+
+    geometry: LidarGeometry
+    ranges: Whole
+    code: Whole
+    intensity: Whole | None
+
+
+def convert(lasers: list[LaserLine], parameters: dict[str, str], time: Array, report: LogReport) -> list[CarmenScan]:
+    """Metres to whole millimetres and codes, one laser setup at a time.
+
+    Args:
+        lasers: laser lines in file order.
+        parameters: the log's parameters.
+        time: monotone time of each line, for the period.
+        report: gets the counts of beams.
+    """
+    by_setup: dict[LaserSetup, list[int]] = {}
+    for index, line in enumerate(lasers):
+        by_setup.setdefault(line.setup, []).append(index)
+    period = float(np.median(np.diff(time))) if len(lasers) > 1 else 0.0
+    scans: dict[int, CarmenScan] = {}
+    for setup, indices in by_setup.items():
+        raw = _millimetres(np.array([lasers[index].ranges for index in indices]))
+        geometry = _geometry(setup, raw, parameters, period)
+        valid = (raw >= geometry.dmin) & (raw <= geometry.dmax)
+        ranges, code = np.where(valid, raw, np.int32(0)), np.where(valid, np.int32(VALID), raw)
+        report.use("beams", raw.size)
+        report.use("beams without a return", int(raw.size - np.count_nonzero(valid)))
+        for row, index in enumerate(indices):
+            scans[index] = CarmenScan(geometry, ranges[row], code[row], _intensity(lasers[index].remission))
+    return [scans[index] for index in range(len(lasers))]
+
+
+def _intensity(remission: list[float]) -> Whole | None:
+    return np.rint(np.nan_to_num(remission)).astype(np.int32) if remission else None
+
+
+def _millimetres(metres: Array) -> Whole:
+    """NaN, infinity and negative readings become 0, which is below every laser's least distance."""
+    usable = np.isfinite(metres) & (metres > 0.0)
+    return np.rint(np.where(usable, np.minimum(metres / UNIT_M, 2.0 * _FARTHEST), 0.0)).astype(np.int32)
+
+
+def _number(parameters: dict[str, str], name: str, otherwise: float) -> float:
+    try:
+        value = float(parameters[name])
+    except (KeyError, ValueError):
+        return otherwise
+    return value if math.isfinite(value) else otherwise
+
+
+def _geometry(setup: LaserSetup, raw: Whole, parameters: dict[str, str], usual_period: float) -> LidarGeometry:
+    start, step, _ = beam_rule(setup)
+    dmin = max(1, round(_number(parameters, PARAM_DMIN, UNIT_M) / UNIT_M))
+    limits = [no_return(raw, UNIT_M, math.nan), no_return(raw, UNIT_M, setup.maximum)]
+    limits.append(no_return(raw, UNIT_M, _number(parameters, PARAM_MAXIMUM, math.nan)))
+    known = [limit for limit in limits if limit is not None]
+    return LidarGeometry(
+        model=parameters.get(PARAM_MODEL, "CARMEN laser"),
+        serial="",
+        firmware="",
+        ares=2.0 * math.pi / step,
+        afrt=whole_step(start, step),
+        amin=0,
+        amax=setup.count - 1,
+        dmin=dmin,
+        dmax=min([_FARTHEST, *(limit - 1 for limit in known)]),
+        range_unit_m=UNIT_M,
+        period_s=_number(parameters, PARAM_PERIOD, usual_period),
+        beam_dt_s=_number(parameters, PARAM_BEAM_DT, 0.0),
+    )
