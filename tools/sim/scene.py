@@ -1,0 +1,161 @@
+"""A building, a robot that drives through it, its lidar and its wheels: what the fake devices are fed from.
+
+Two kinds of scene have the same face (:class:`Scene`): the simulated one here, and a recorded log's in
+:mod:`tools.sim.hybrid`. A scene knows nothing of SCIP, sockets or the daemon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import numpy as np
+
+from hal.fake.models import MODELS, LidarModel
+from hal.fake.scan import FakeScan
+from tools.sim import beams
+from tools.sim.beams import Optics, Posture, Returns, Scanner, Sweep
+from tools.sim.buildings import Building, building
+from tools.sim.odometry import Odometer, Wheels
+from tools.sim.people import Crowd
+from tools.sim.robot import Body, Drive
+from tools.sim.world import Array
+
+OPTICS: Final[dict[str, Optics]] = {
+    "URG-04LX": beams.URG_04LX, "URG-04LX-UG01": beams.URG_04LX, "UBG-04LX-F01": beams.URG_04LX,
+    "UHG-08LX": beams.URG_04LX, "UST-10LX": beams.UST_20LX, "UST-20LX": beams.UST_20LX,
+}  # fmt: skip
+"""Optics by model name; every other model measures like a UTM-30LX."""
+
+
+class Scene(Protocol):
+    """What drives the fake devices, and the ground truth to judge by. Times are ``t_mono`` of the caller's clock."""
+
+    @property
+    def model(self) -> LidarModel:
+        """The type of lidar the scans are made for."""
+        ...
+
+    def scan(self, t_mono: float) -> FakeScan | None:
+        """A :data:`hal.fake.scan.ScanSource`."""
+        ...
+
+    def odometry_after(self, t_mono: float) -> tuple[float, Array] | None:
+        """The first wheel odometry reading later than ``t_mono``: its time and pose; None: there are no more."""
+        ...
+
+    def truth(self, t_mono: Array) -> Array:
+        """(n, 3) true poses of base_link in the scene's own frame at (n,) times."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Everything that makes a simulated run repeatable.
+
+    Attributes:
+        building: name, see :data:`tools.sim.buildings.BUILDINGS`. lidar: name in :data:`hal.fake.models.MODELS`.
+        seed: of noise, people and slip. people: False empties the building.
+        dwell_s: standing still before each lap. laps: how many.
+        optics: None takes the lidar's own.
+    """
+
+    building: str = "paper_room"
+    lidar: str = "paper"
+    seed: int = 0
+    people: bool = True
+    dwell_s: float = 2.0
+    laps: float = np.inf
+    body: Body = field(default_factory=Body)
+    wheels: Wheels = field(default_factory=Wheels)
+    optics: Optics | None = None
+
+
+PAPER: Final = Scenario(laps=1)
+"""The paper's robot: 180 deg, 721 beams, 40 Hz, a 160 m drive that returns to its start."""
+
+
+class SimulatedScene:
+    """A robot on its tour through a building. Its clock starts with the first scan that is asked for.
+
+    Until then the robot stands at the start, so that a daemon that is slow to start misses nothing.
+    """
+
+    def __init__(self, scenario: Scenario, place: Building | None = None) -> None:
+        self.scenario = scenario
+        self.model = lidar_model(scenario.lidar)
+        self.building = place or building(scenario.building)
+        self.drive = Drive(self.building.route, scenario.body, scenario.dwell_s, scenario.laps)
+        self.optics = scenario.optics or OPTICS.get(scenario.lidar, beams.UTM_30LX)
+        self.t_go: float | None = None
+        self._crowd = Crowd(self.building.people if scenario.people else ())
+        self._scanner = Scanner(self.building.world, _sweep(self.model), self.optics, scenario.seed)
+        self._odometer = Odometer(self.drive, self.building.world, scenario.wheels, scenario.seed)
+
+    def scan(self, t_mono: float) -> FakeScan:
+        """See :class:`Scene`."""
+        if self.t_go is None:
+            self.t_go = t_mono
+        t = t_mono - self.t_go
+        pitch, roll = self.drive.tilt(t)
+        robot = self.drive.pose(np.array([t]))[0]
+        legs = self._crowd.legs(t + self._scanner.sweep.first_s, robot)
+        posture = Posture(self.scenario.body.height, pitch, roll)
+        return to_device(self.model, self._scanner.measure(t, self._lidar_poses, legs, posture))
+
+    def odometry_after(self, t_mono: float) -> tuple[float, Array] | None:
+        """See :class:`Scene`; readings start with the clock, before that the wheels stand still."""
+        rate = self.scenario.wheels.rate_hz
+        if self.t_go is None:
+            return t_mono + 1.0 / rate, np.zeros(3)
+        k = max(int(np.floor((t_mono - self.t_go) * rate + 1e-6)) + 1, 0)
+        return self.t_go + k / rate, self._odometer.reading(k)
+
+    def truth(self, t_mono: Array) -> Array:
+        """See :class:`Scene`."""
+        if self.t_go is None:
+            return self.drive.pose(np.zeros(len(t_mono)))
+        return self.drive.pose(np.asarray(t_mono) - self.t_go)
+
+    def _lidar_poses(self, t: Array) -> Array:
+        return compose(self.drive.pose(t), self.scenario.body.lidar)
+
+
+def lidar_model(name: str) -> LidarModel:
+    """The model of that name; raises ValueError that lists the names there are."""
+    if name not in MODELS:
+        raise ValueError(f"no lidar is called {name!r}; there are: {', '.join(MODELS)}")
+    return MODELS[name]
+
+
+def compose(poses: Array, offset: tuple[float, float, float]) -> Array:
+    """(n, 3) poses, each followed by the same planar transform."""
+    x, y, yaw = offset
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return np.column_stack([poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, poses[:, 2] + yaw])
+
+
+def _sweep(model: LidarModel) -> Sweep:
+    steps = np.arange(model.amin, model.amax + 1)
+    per_step = model.true_period_s / model.ares
+    bearing = np.asarray((steps - model.afrt) * (2 * np.pi / model.ares), dtype=np.float64)
+    return Sweep(bearing, model.amin * per_step, (model.amax - model.amin) * per_step)
+
+
+def no_return(model: LidarModel) -> int:
+    """What a model reports for a beam that met nothing: above DMAX (2.2 dialect), or an error code below DMIN."""
+    if model.profile == "2.2":
+        return max(65533, model.dmax + 1)
+    return 1 if model.dmax > 10000 else 0
+
+
+def to_device(model: LidarModel, seen: Returns) -> FakeScan:
+    """Echoes in m as the sensor's own words for steps 0 to AMAX."""
+    millimetres = np.where(seen.range_m > 0.0, np.rint(seen.range_m * 1000.0), 0.0).astype(np.int32)
+    millimetres[millimetres > model.dmax] = 0
+    ranges = np.zeros((model.steps, millimetres.shape[1]), dtype=np.int32)
+    intensity = np.zeros_like(ranges)
+    ranges[model.amin :] = millimetres
+    intensity[model.amin :] = np.where(millimetres > 0, seen.intensity, 0)
+    first = np.where(ranges[:, 0] > 0, ranges[:, 0], no_return(model)).astype(np.int32)
+    return FakeScan(first, intensity[:, 0].copy(), ranges[:, 1:].copy(), intensity[:, 1:].copy())
