@@ -52,6 +52,26 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LightEpoch:
+    """Ceiling lights decoded from one block of photodiode samples. Arrays have one element per light, strongest first.
+
+    Attributes:
+        t_begin, t_end: ``t_mono`` of the block's first and last sample (about 50 ms apart).
+        code: int64, number of the CDMA code (several lamps of a large building may share one).
+        amplitude: received modulated amplitude, as a fraction of the converter's full scale.
+        variance: of ``ln amplitude``, from noise alone (not from the optical model).
+        blemished: whether something was found wrong inside the block (stall, clipping): amplitudes are then suspect.
+    """
+
+    t_begin: float
+    t_end: float
+    code: npt.NDArray[np.int64]
+    amplitude: Array
+    variance: Array
+    blemished: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
     """Increment of the base pose over ``[t_begin, t_end]``, expressed in the base frame at ``t_begin``."""
 
