@@ -3,6 +3,10 @@
 Eq. 14 adds transforms as matrices, which leaves the group of rigid motions; here the weight is the matrix
 ``W = (L1 + L2)^-1 L1`` of the two witnesses' information (L1 of the prediction T1, L2 of the laser T2), so that a
 corridor takes its long axis from the prediction and a room takes everything from the laser.
+
+The laser's information is not allowed to flatter itself. Normals are fitted to noisy points, so a smooth wall seems to
+hold a little along itself as well; the expected part of that is known (each normal carries the variance of its
+direction) and is subtracted, and a direction in which nothing certain remains is left to the prediction.
 """
 
 from __future__ import annotations
@@ -26,17 +30,17 @@ class MatchSettings:
     Attributes:
         gate_m: farthest partner ever accepted. scale: final robust scale in units of the residual's own noise.
         temper: how many beams share one error (mixed map and sensor errors are not independent from beam to beam).
-        tolerance_m, tolerance_rad: a smaller update ends the iteration.
+        settled: an update shorter than this share of its own standard deviation ends the iteration.
         min_points, min_share: fewest pairs, and fewest pairs per beam, that make a result.
     """
 
     gate_m: float = 0.5
-    scale: float = 3.0
-    temper: float = 10.0
-    tolerance_m: float = 1e-4
-    tolerance_rad: float = 2e-5
+    scale: float = 2.5
+    temper: float = 1.0
+    settled: float = 0.1
     min_points: int = 10
     min_share: float = 0.25
+    coarse: int = 4
 
 
 @kernel("f8(f8[:, ::1], f8[::1], f8[::1])")
@@ -58,8 +62,145 @@ def solve3(A: Array, b: Array, x: Array) -> float:
     return det
 
 
+@kernel("void(f8[:, ::1], f8[:, ::1])")
+def eigen3(A: Array, V: Array) -> None:
+    """Diagonalise a symmetric 3x3 matrix in place by Jacobi rotations; the columns of ``V`` are its eigenvectors."""
+    V[:] = 0.0
+    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+    for _ in range(8):
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if A[p, q] == 0.0:
+                    continue
+                angle = 0.5 * np.arctan2(2.0 * A[p, q], A[q, q] - A[p, p])
+                c, s = np.cos(angle), np.sin(angle)
+                for k in range(3):
+                    x, y = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = A[p, k], A[q, k]
+                    A[p, k], A[q, k] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = V[k, p], V[k, q]
+                    V[k, p], V[k, q] = c * x - s * y, s * x + c * y
+
+
 @kernel(
-    "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
+    "void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[::1], Tuple((f8, f8, i8)),"
+    " f8[::1])"
+)
+def pair_up(
+    xy: Array,
+    reference: tuple[Array, Ints, Array, Array],
+    T: Array,
+    eye: Array,
+    how: tuple[float, float, int],
+    sums: Array,
+) -> None:
+    """One pass: nearest neighbours at pose ``T`` and the sums of the normal equations over the pairs.
+
+    ``reference``: the axis' rows, start and rays, and per row normal x, y and the variance of the normal's direction.
+    ``eye``: the lidar in the base frame. ``how``: robust scale, squared gate, stride through the points.
+    ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient, inliers, pairs, weights, squares.
+    """
+    rows, start, rays, lines = reference
+    scale, gate2, stride = how
+    c, s = np.cos(T[2]), np.sin(T[2])
+    ex, ey = c * eye[0] - s * eye[1] + T[0], s * eye[0] + c * eye[1] + T[1]
+    k = 1.0 / (scale * scale)
+    h00 = h01 = h02 = h11 = h12 = h22 = 0.0
+    n00 = n01 = n02 = n11 = n12 = n22 = 0.0
+    g0 = g1 = g2 = inliers = pairs = weights = squares = 0.0
+    for i in range(0, len(xy), stride):
+        ux = c * xy[i, 0] - s * xy[i, 1]
+        uy = s * xy[i, 0] + c * xy[i, 1]
+        px = ux + T[0]
+        py = uy + T[1]
+        row, _ = nearest(rows, start, rays, px, py, gate2)
+        if row < 0:
+            continue
+        nx, ny = lines[row, 0], lines[row, 1]
+        if nx * (ex - px) + ny * (ey - py) <= 0.0:
+            continue  # seen from behind: the other side of a thin wall
+        pairs += 1.0
+        e = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
+        w = 1.0 / (1.0 + k * e * e)
+        if w > 0.2:
+            inliers += 1.0
+        weights += w
+        squares += w * e * e
+        turn = ny * ux - nx * uy
+        along = nx * ux + ny * uy
+        h00 += w * nx * nx
+        h01 += w * nx * ny
+        h02 += w * nx * turn
+        h11 += w * ny * ny
+        h12 += w * ny * turn
+        h22 += w * turn * turn
+        v = w * lines[row, 2]
+        n00 += v * ny * ny
+        n01 -= v * nx * ny
+        n02 -= v * ny * along
+        n11 += v * nx * nx
+        n12 += v * nx * along
+        n22 += v * along * along
+        g0 += w * nx * e
+        g1 += w * ny * e
+        g2 += w * turn * e
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = h00, h01, h02, h11, h12, h22
+    sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = n00, n01, n02, n11, n12, n22
+    sums[12], sums[13], sums[14] = g0, g1, g2
+    sums[15], sums[16], sums[17], sums[18] = inliers, pairs, weights, squares
+
+
+@kernel("f8(f8[::1], f8, f8[:, ::1], f8[:, ::1])")
+def trusted(sums: Array, k: float, H: Array, keep: Array) -> float:
+    """The part of the information that is not the normals' noise, times ``k``, and the projector onto what it holds.
+
+    Returns the number of directions held. A direction counts when its information is more than twice the part that
+    noise alone explains; the test needs no scaling of metres against radians. Only where it fails are directions
+    separated, with yaw in units of the points' mean lever.
+    """
+    M = np.empty((3, 3))
+    at = 0
+    for i in range(3):
+        for j in range(i, 3):
+            H[i, j] = H[j, i] = k * (sums[at] - sums[6 + at])
+            M[i, j] = M[j, i] = k * (sums[at] - 2.0 * sums[6 + at])
+            keep[i, j] = keep[j, i] = 1.0 if i == j else 0.0
+            at += 1
+    minor = M[0, 0] * M[1, 1] - M[0, 1] * M[0, 1]
+    det = (
+        M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[1, 2])
+        - M[0, 1] * (M[0, 1] * M[2, 2] - M[1, 2] * M[0, 2])
+        + M[0, 2] * (M[0, 1] * M[1, 2] - M[1, 1] * M[0, 2])
+    )
+    if M[0, 0] > 0.0 and minor > 0.0 and det > 0.0:
+        return 3.0
+    lever = np.sqrt(max(sums[5] + sums[11], 1e-9) / max(sums[17], 1e-9))
+    S = np.array((1.0, 1.0, 1.0 / lever))
+    V = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            M[i, j] *= S[i] * S[j]
+    eigen3(M, V)
+    held = 0.0
+    P = np.zeros((3, 3))
+    for d in range(3):
+        if M[d, d] > 0.0:
+            held += 1.0
+            for i in range(3):
+                for j in range(3):
+                    P[i, j] += V[i, d] * V[j, d]
+    for i in range(3):
+        for j in range(3):
+            keep[i, j] = P[i, j] * S[j] / S[i]
+    H[:] = keep @ H @ keep.T
+    return held
+
+
+@kernel(
+    "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1], f8[::1],"
     " Tuple((f8[:, ::1], f8[::1])))"
 )
 def iterate(
@@ -67,102 +208,78 @@ def iterate(
     reference: tuple[Array, Ints, Array, Array],
     T: Array,
     L1: Array,
+    eye: Array,
     caps: Array,
     out: tuple[Array, Array],
 ) -> int:
     """Run the iterations; ``T`` (relative to the axis centre) is moved in place.
 
-    ``caps``: iteration cap, gate, first and last robust scale, sigma, temper, two tolerances. ``out``: the laser's
-    information (3, 3) and inliers, pairs, sum of squares, hash. Returns the iterations, negative when not converged.
+    ``caps``: iteration cap, gate, first and last robust scale, sigma, temper, settled, coarse stride. ``out``: the
+    laser's information (3, 3) and the sums of the last pass. Returns the iterations, negative when not converged.
     """
-    rows, start, rays, normals = reference
-    H, stats = out
+    H, sums = out
     T1 = T.copy()
     A = np.empty((3, 3))
     b = np.empty(3)
+    g = np.empty(3)
     step = np.empty(3)
+    keep = np.empty((3, 3))
     scale = caps[2]
     count = 0
     settled = False
+    k = 1.0 / (caps[4] * caps[4] * caps[5])
     while count < caps[0] and not settled:
         count += 1
-        c, s = np.cos(T[2]), np.sin(T[2])
-        gate2 = min(caps[1], max(6.0 * scale, 0.1)) ** 2
-        h00 = h01 = h02 = h11 = h12 = h22 = g0 = g1 = g2 = 0.0
-        inliers = pairs = 0
-        squares = 0.0
-        for i in range(len(xy)):
-            ux = c * xy[i, 0] - s * xy[i, 1]
-            uy = s * xy[i, 0] + c * xy[i, 1]
-            px = ux + T[0]
-            py = uy + T[1]
-            row, _ = nearest(rows, start, rays, px, py, gate2)
-            if row < 0:
-                continue
-            nx, ny = normals[row, 0], normals[row, 1]
-            if nx == 0.0 and ny == 0.0:
-                continue
-            pairs += 1
-            e = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
-            w = 1.0 / (1.0 + (e / scale) ** 2)
-            if abs(e) < 2.0 * scale:
-                inliers += 1
-                squares += e * e
-            jt = ny * ux - nx * uy
-            h00 += w * nx * nx
-            h01 += w * nx * ny
-            h02 += w * nx * jt
-            h11 += w * ny * ny
-            h12 += w * ny * jt
-            h22 += w * jt * jt
-            g0 += w * nx * e
-            g1 += w * ny * e
-            g2 += w * jt * e
-        k = 1.0 / (caps[4] * caps[4] * caps[5])
-        H[0, 0], H[0, 1], H[0, 2] = k * h00, k * h01, k * h02
-        H[1, 0], H[1, 1], H[1, 2] = k * h01, k * h11, k * h12
-        H[2, 0], H[2, 1], H[2, 2] = k * h02, k * h12, k * h22
-        stats[0], stats[1], stats[2] = inliers, pairs, squares
+        coarse = scale > 2.0 * caps[3]
+        stride = int(caps[7]) if coarse else 1
+        pair_up(xy, reference, T, eye, (scale, min(caps[1], max(6.0 * scale, 0.1)) ** 2, stride), sums)
+        trusted(sums, k * stride, H, keep)
+        for i in range(3):
+            g[i] = -k * stride * sums[12 + i]
         for i in range(3):
             b[i] = 0.0
             for j in range(3):
                 A[i, j] = H[i, j] + L1[i, j]
-                b[i] -= L1[i, j] * (T[j] - T1[j])
-        b[0] -= k * g0
-        b[1] -= k * g1
-        b[2] -= k * g2
+                b[i] += keep[i, j] * g[j] - L1[i, j] * (T[j] - T1[j])
         if solve3(A, b, step) == 0.0:
             break
-        T[0] += step[0]
-        T[1] += step[1]
-        T[2] += step[2]
-        small = abs(step[0]) + abs(step[1]) < caps[6] and abs(step[2]) < caps[7]
-        settled = small and scale == caps[3]
-        scale = max(caps[3], 0.5 * scale)
+        length2 = 0.0
+        for i in range(3):
+            T[i] += step[i]
+            for j in range(3):
+                length2 += step[i] * A[i, j] * step[j]
+        settled = length2 < caps[6] * caps[6] and scale == caps[3]
+        scale = max(caps[3], 0.25 * scale) if length2 < 4.0 else max(caps[3], 0.5 * scale)
     return count if settled else -count
 
 
 def match(
-    xy: Array, local: LocalMap, T_pred: Array, L1: Array, caps: tuple[int, float], settings: MatchSettings
+    points: Array,
+    eye: Array,
+    local: LocalMap,
+    T_pred: Array,
+    L1: Array,
+    caps: tuple[int, float],
+    settings: MatchSettings,
 ) -> MatchResult:
     """Match points (n, 2) in the base frame against the map, from the prediction ``T_pred`` with information ``L1``.
 
     ``caps``: iteration cap and one-sigma residual noise in metres.
     """
-    axis, normals, sigma = local.axis, local.normals, caps[1]
+    axis, sigma = local.axis, caps[1]
     H = np.zeros((3, 3))
-    stats = np.zeros(4)
+    sums = np.zeros(19)
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = T_pred - centre
     spread = float(np.sqrt(1.0 / L1[0, 0] + 1.0 / L1[1, 1])) * 2.0
     last = settings.scale * sigma
     first = min(max(last, spread), settings.gate_m / 2.0)
-    tolerances = (settings.tolerance_m, settings.tolerance_rad)
-    c = np.array((caps[0], settings.gate_m, first, last, sigma, settings.temper, *tolerances))
-    n = iterate(xy, (axis.rows, axis.start, axis.rays, normals), T, L1, c, (H, stats))
-    inliers, pairs = int(stats[0]), int(stats[1])
+    coarse = settings.coarse if len(points) > 400 else 1
+    c = np.array((caps[0], settings.gate_m, first, last, sigma, settings.temper, settings.settled, coarse))
+    n = iterate(points, (axis.rows, axis.start, axis.rays, local.lines), T, L1, np.ascontiguousarray(eye), c, (H, sums))
+    inliers, pairs = int(sums[15]), int(sums[16])
     reason = Reason.CONVERGED if n > 0 else Reason.ITERATION_CAP
-    if pairs < settings.min_points or inliers < settings.min_share * len(xy):
+    if pairs < settings.min_points or inliers < settings.min_share * len(points):
         reason = Reason.TOO_FEW_PAIRS
     T = T + centre
     T[2] = se2.wrap(T[2])
@@ -173,9 +290,9 @@ def match(
         T if ok else T_pred.copy(),
         H,
         inliers,
-        len(xy),
+        len(points),
         abs(n),
-        float(np.sqrt(stats[2] / max(inliers, 1))),
+        float(np.sqrt(sums[18] / max(sums[17], 1.0))),
         known_axes(H),
         correction,
         reason,
@@ -184,7 +301,7 @@ def match(
 
 def known_axes(H: Array) -> Array:
     """1 for each of x, y, yaw that the information fixes to 10 cm, 10 cm, 2 deg, else 0."""
-    P = np.linalg.inv(H + np.diag((1e-2, 1e-2, 1e-2)))
+    P = np.linalg.inv(H + np.diag((4.0, 4.0, 30.0)))
     return np.asarray(np.diag(P) < np.array((0.01, 0.01, 0.0012)), dtype=np.float64)
 
 

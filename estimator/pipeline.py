@@ -77,7 +77,7 @@ def match_scan(state: State, points: ScanPoints, limits: Limits) -> MatchResult:
     xy = np.ascontiguousarray(points.xy[::thin])
     caps = (limits.icp_iterations, max(points.sigma_m, 0.005))
     L1 = se2.invert(state.motion.P)
-    return icp.match(xy, state.local, T_pred, L1, caps, state.settings.matching)
+    return icp.match(xy, points.origin, state.local, T_pred, L1, caps, state.settings.matching)
 
 
 def fuse(state: State, match: MatchResult) -> None:

@@ -13,6 +13,10 @@ from estimator.records import Array, Beam, Scan
 
 HIT: int = int(Beam.HIT)
 NO_INTENSITY: Array = np.empty(0)
+MAX_SLOPE = 0.03
+FLAT = 0.03
+FEW = 2
+GAP = 0.5
 
 
 @dataclass(slots=True, eq=False)
@@ -84,29 +88,58 @@ def points_of(scan: Scan, motion: Array, far: float, quality: float) -> ScanPoin
     beams = (scan.bearing_rad, scan.range_m, scan.beam, intensity)
     kept = place_beams(beams, scan.T_base_lidar, se2.log(motion), far, quality, (xy, index))
     spacing = abs(float(scan.bearing_rad[-1] - scan.bearing_rad[0])) / (n - 1) if n > 1 else 0.0
-    return ScanPoints(xy[:kept], index[:kept], scan.T_base_lidar[:2], spacing, scan.sigma_m)
+    return ScanPoints(xy[:kept], index[:kept], np.ascontiguousarray(scan.T_base_lidar[:2]), spacing, scan.sigma_m)
 
 
-@kernel("void(f8[:, ::1], f8[::1], f8, f8, f8[:, ::1])")
-def fit_normals(xy: Array, origin: Array, spacing: float, reach: float, normals: Array) -> None:
-    """Total-least-squares line through each point's neighbours; normal towards the sensor, (0, 0) where there is none.
+@kernel("f8(f8[:, ::1], i8, i8, Tuple((f8, f8, f8, f8)))")
+def offset_on_line(xy: Array, low: int, high: int, at: tuple[float, float, float, float]) -> float:
+    """Offset along the normal, at the point ``at`` (x, y, normal), of a parabola through the points [low, high).
 
-    Neighbours along the scan lie within ``reach`` or 2.5 beam spacings of the point, whichever is more: a metric window
-    where beams are dense, a fixed count where they are sparse.
+    A parabola and not a line: a line through points of a column would lie inside it.
+    """
+    x, y, nx, ny = at
+    m1 = m2 = m3 = m4 = v0 = v1 = v2 = 0.0
+    n = float(high - low)
+    for j in range(low, high):
+        dx, dy = xy[j, 0] - x, xy[j, 1] - y
+        u, v = ny * dx - nx * dy, nx * dx + ny * dy
+        uu = u * u
+        m1 += u
+        m2 += uu
+        m3 += uu * u
+        m4 += uu * uu
+        v0 += v
+        v1 += v * u
+        v2 += v * uu
+    det = n * (m2 * m4 - m3 * m3) - m1 * (m1 * m4 - m2 * m3) + m2 * (m1 * m3 - m2 * m2)
+    if n < 5.0 or not det > 1e-9 * n * m2 * m4:
+        det = n * m2 - m1 * m1
+        return (v0 * m2 - v1 * m1) / det if det > 0.0 else v0 / n
+    return (v0 * (m2 * m4 - m3 * m3) - m1 * (v1 * m4 - m3 * v2) + m2 * (v1 * m3 - m2 * v2)) / det
+
+
+@kernel("i8(f8[:, ::1], f8[::1], f8, f8, f8[:, ::1])")
+def fit_lines(xy: Array, origin: Array, sigma: float, reach: float, lines: Array) -> int:
+    """Total-least-squares line through each point's neighbours along the scan; the number of lines found.
+
+    A row of ``lines`` is the point moved onto its line (x, y), the normal towards the sensor (x, y) and the variance of
+    the normal's direction in rad^2. Neighbours lie within ``reach`` or 2.5 beam spacings, whichever is more: a metric
+    window where beams are dense, a fixed count where they are sparse. A point whose neighbours are no line is left out.
     """
     n = len(xy)
+    found = 0
     for i in range(n):
         x, y = xy[i, 0], xy[i, 1]
-        r = np.sqrt((x - origin[0]) ** 2 + (y - origin[1]) ** 2)
-        window = max(reach, 2.5 * spacing * r)
-        limit2 = window * window
+        limit2 = reach * reach
         count = 1.0
         sx = sy = sxx = sxy = syy = 0.0
+        low = high = i
         for side in (-1, 1):
             j = i + side
             while 0 <= j < n:
                 dx, dy = xy[j, 0] - x, xy[j, 1] - y
-                if dx * dx + dy * dy > limit2:
+                d2 = dx * dx + dy * dy
+                if d2 > limit2 and (abs(j - i) > FEW or d2 > GAP * GAP):
                     break
                 count += 1.0
                 sx += dx
@@ -115,28 +148,40 @@ def fit_normals(xy: Array, origin: Array, spacing: float, reach: float, normals:
                 sxy += dx * dy
                 syy += dy * dy
                 j += side
-        normals[i, 0] = normals[i, 1] = 0.0
+            if side < 0:
+                low = j + 1
+            else:
+                high = j
         if count < 3.0:
             continue
-        cxx = sxx / count - (sx / count) ** 2
-        cxy = sxy / count - sx * sy / (count * count)
-        cyy = syy / count - (sy / count) ** 2
+        mx, my = sx / count, sy / count
+        cxx = sxx / count - mx * mx
+        cxy = sxy / count - mx * my
+        cyy = syy / count - my * my
         half = 0.5 * (cxx - cyy)
         root = np.sqrt(half * half + cxy * cxy)
         small = 0.5 * (cxx + cyy) - root
         large = 0.5 * (cxx + cyy) + root
-        if not large > 0.0 or small > 0.1 * large:
+        noise2 = max(sigma * sigma, small)
+        slope = noise2 / (count * large) if large > 0.0 else 1.0
+        if not slope < MAX_SLOPE or (small > FLAT * large and small > (3.0 * sigma) ** 2):
             continue
         angle = 0.5 * np.arctan2(2.0 * cxy, cxx - cyy)
         nx, ny = -np.sin(angle), np.cos(angle)
         if nx * (origin[0] - x) + ny * (origin[1] - y) < 0.0:
             nx, ny = -nx, -ny
-        normals[i, 0] = nx
-        normals[i, 1] = ny
+        shift = offset_on_line(xy, low, high, (x, y, nx, ny))
+        lines[found, 0] = x + shift * nx
+        lines[found, 1] = y + shift * ny
+        lines[found, 2] = nx
+        lines[found, 3] = ny
+        lines[found, 4] = slope
+        found += 1
+    return found
 
 
-def normals_of(points: ScanPoints, reach: float = 0.12) -> Array:
-    """Normals (n, 2) of a scan's points, zero where the surface is no line."""
-    normals = np.empty_like(points.xy)
-    fit_normals(points.xy, points.origin, points.spacing_rad, reach, normals)
-    return normals
+def lines_of(points: ScanPoints, reach: float = 0.12) -> Array:
+    """Line elements (n, 5) of a scan in the base frame: see :func:`fit_lines`."""
+    lines = np.empty((len(points.xy), 5))
+    found = fit_lines(points.xy, points.origin, points.sigma_m, reach, lines)
+    return lines[:found]
