@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from hal.fake import scip_encoder, texts
 from hal.fake.answers import State, answer
-from hal.fake.commands import LINE_ENDS, SINGLES, STREAMS, Refusal, Request, measure, parse
+from hal.fake.commands import LINE_ENDS, SINGLES, STREAMS, Refusal, Request, letters, measure, parse
 from hal.fake.core import Core
 from hal.fake.head import Head
 
@@ -83,14 +83,14 @@ class Console:
 
     def _reply(self, echo: bytes, status: str, body: bytes = b"") -> None:
         """Answer the command in hand and turn to the next."""
-        lost = self._core.orders.strike("no_reply", command=echo[:2].decode("ascii", errors="replace"))
+        lost = self._core.orders.strike("no_reply", command=letters(echo))
         if not lost:
             self._core.send(scip_encoder.reply(echo, status, body))
         self._done()
 
     def _obey(self, line: bytes) -> None:
         core = self._core
-        if core.orders.strike("ignore", command=line[:2].decode("ascii", errors="replace")):
+        if core.orders.strike("ignore", command=letters(line)):
             return self._done()
         if core.state is State.SCIP1:
             return self._scip1(line)

@@ -104,7 +104,7 @@ class Head:
             return
         other = self.core.orders.strike("status")
         if other:
-            self.report(other.text("code"))
+            self.report(f"{int(other.number('code')):02d}")
             return
         self._remaining -= 1 if self._wanted.count else 0
         reply = self._reply(self._echo(), "99", index, scan, request.name, self._wanted)

@@ -193,6 +193,10 @@ class FakeHokuyo:
 
     # fault orders
 
+    def in_force(self) -> list[Fault]:
+        """Faults that have not been lifted and have not spent their strikes."""
+        return self._core.orders.in_force()
+
     def check(self, fault: Fault) -> None:
         """Refuse an order that makes no sense for this sensor.
 
@@ -261,7 +265,8 @@ class FakeHokuyo:
             self._core.dark(State.SCIP1)
 
     def _fail(self, fault: Fault) -> None:
-        self._head.report(fault.text("code"))
+        code = f"{int(fault.number('code')):02d}"
+        self._head.report(code)
         self._head.halt()
         self._core.dark(State.ERROR)
-        self._core.trouble = f"Trouble!! Error No. =[00->{fault.text('code')}]"
+        self._core.trouble = f"Trouble!! Error No. =[00->{code}]"
