@@ -73,7 +73,7 @@ class UdpEndpoint:
                 frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
             except OSError:  # nothing more, or the network's complaint about an earlier answer
                 return
-            if frame_size(frame) != len(frame):
+            if not frame or frame_size(frame) != len(frame):
                 self._counts.malformed += 1
                 continue
             self._counts.requests += 1

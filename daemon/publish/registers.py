@@ -123,11 +123,11 @@ def _bits(table: tuple[Bit, ...]) -> Getter:
 
 
 def _pose(frame: str, source: str, text: str) -> tuple[Point, ...]:
-    yaw_text = "Heading, counter-clockwise from the frame's x axis, in [-pi, pi]."
+    yaw_text = "Counter-clockwise from the frame's x axis, in [-pi, pi]."
     return (
-        Point(f"{frame}_x", f"x, {text}", I32, _part(source, 0), "Forward of the frame's origin.", 10_000, "m"),
-        Point(f"{frame}_y", f"y, {text}", I32, _part(source, 1), "Left of the frame's origin.", 10_000, "m"),
-        Point(f"{frame}_yaw", f"yaw, {text}", I32, _yaw(source), yaw_text, 1_000_000, "rad"),
+        Point(f"{frame}_x", f"position x, {text}", I32, _part(source, 0), "", 10_000, "m"),
+        Point(f"{frame}_y", f"position y, {text}", I32, _part(source, 1), "", 10_000, "m"),
+        Point(f"{frame}_yaw", f"heading, {text}", I32, _yaw(source), yaw_text, 1_000_000, "rad"),
     )
 
 
