@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -99,11 +100,11 @@ class RecordedRanges:
     def __init__(self, path: Path, model: LidarModel) -> None:
         self._next = 0
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = {name: data[name] for name in ("range_mm", "intensity") if name in data}
         except FileNotFoundError as error:
             raise DeviceMissing(str(path), "no such file", "expected an .npz file of ranges") from error
-        except (ValueError, OSError, EOFError) as error:
+        except (ValueError, OSError, EOFError, BadZipFile) as error:
             raise DataInvalid(str(path), f"not an .npz file: {error}") from error
         if "range_mm" not in arrays:
             raise DataInvalid(str(path), "holds no array `range_mm`", "millimetres, one row a scan")

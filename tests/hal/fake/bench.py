@@ -56,6 +56,7 @@ class Reply:
     @property
     def payload(self) -> str:
         rows = [summed(line) for line in self.lines[1:]]
+        assert rows
         assert all(len(row) == 64 for row in rows[:-1])
         assert 0 < len(rows[-1]) <= 64
         return "".join(rows)
