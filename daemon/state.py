@@ -64,7 +64,7 @@ class Reason(IntEnum):
 
 
 REASONS: Final[dict[Reason, tuple[str, str]]] = {
-    Reason.NONE: ("nothing to report", ""),
+    Reason.NONE: ("the pose is confirmed", ""),
     Reason.WARMING_UP: ("starting up", "wait; the first start ever compiles for up to a minute"),
     Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
@@ -104,7 +104,7 @@ class Evidence:
     """What one cycle knows. Times in seconds of ``t_mono``.
 
     Attributes:
-        t_mono: now. ready: warm-up is over.
+        t_mono: now.
         silence: scan periods since the last valid scan; None before the first.
         unreachable: the driver is backing off and says why.
         match: of the scan of this cycle; None without a scan or before there is a map to match against.
@@ -117,7 +117,6 @@ class Evidence:
     """
 
     t_mono: float
-    ready: bool = True
     silence: float | None = None
     unreachable: bool = False
     match: Match | None = None
@@ -170,14 +169,10 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The table, gravest first."""
-    if not evidence.ready:
-        return State.STARTING, Reason.WARMING_UP
     if evidence.silence is None:
-        return (
-            (State.NO_LIDAR, Reason.LIDAR_UNREACHABLE)
-            if evidence.unreachable
-            else (State.STARTING, Reason.OPENING_LIDAR)
-        )
+        if evidence.unreachable:
+            return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE
+        return State.STARTING, Reason.OPENING_LIDAR
     if evidence.silence >= SILENT_PERIODS:
         return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE if evidence.unreachable else Reason.LIDAR_SILENT
     if evidence.places is not None and evidence.places != 1:
