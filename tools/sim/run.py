@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import secrets
 import signal
 import sys
 from collections.abc import Callable, Coroutine
@@ -139,7 +140,7 @@ def _feeds(options: Options, scene: Scene, stack: AsyncExitStack) -> list[Corout
     if options.odometry is not None:
         sender = UdpSender(options.odometry)
         stack.callback(sender.close)
-        feeds.append(feed_odometry(scene, sender.send))
+        feeds.append(feed_odometry(scene, sender.send, session=secrets.randbits(32)))
     if options.truth is not None:
         sink = UdpSender(options.truth) if options.truth.startswith("udp:") else TumWriter(Path(options.truth))
         stack.callback(sink.close)
