@@ -37,6 +37,7 @@ _BODY: Final = {ODOMETRY_MAGIC: struct.Struct("<dddd"), IMU_MAGIC: struct.Struct
 _CRC: Final = struct.Struct("<I")
 ODOMETRY_SIZE: Final = _HEAD.size + _BODY[ODOMETRY_MAGIC].size + _CRC.size
 IMU_SIZE: Final = _HEAD.size + _BODY[IMU_MAGIC].size + _CRC.size
+LARGEST: Final = 1e7  # m, rad, rad/s: a pose further out could not be followed to a millimetre
 _DEVICE: Final = "input datagram"
 
 
@@ -64,7 +65,7 @@ def decode(data: bytes) -> InputDatagram:
     """A datagram from its bytes.
 
     Raises:
-        DataInvalid: not such a datagram, another version, damaged, or a value that is not finite.
+        DataInvalid: not such a datagram, another version, damaged, or a value that no robot can have.
     """
     if len(data) < _HEAD.size + _CRC.size:
         raise DataInvalid(_DEVICE, f"{len(data)} bytes are too short")
@@ -79,6 +80,6 @@ def decode(data: bytes) -> InputDatagram:
     if _CRC.unpack_from(data, length - _CRC.size)[0] != zlib.crc32(data[: -_CRC.size]):
         raise DataInvalid(_DEVICE, "CRC-32 differs")
     t_sender, *values = body.unpack_from(data, _HEAD.size)
-    if not all(map(math.isfinite, (t_sender, *values))):
-        raise DataInvalid(_DEVICE, "a value is not finite")
+    if not math.isfinite(t_sender) or not all(abs(value) <= LARGEST for value in values):
+        raise DataInvalid(_DEVICE, f"a value is not finite, or beyond {LARGEST:g}")
     return InputDatagram(magic, session, seq, flags, t_sender, tuple(values))

@@ -224,7 +224,7 @@ CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
 * The time of a reading is the kernel's time of arrival. A sender on the same computer does better: it sets bit 0 of
   `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {inputs.MAX_AGE_S:g} s old is not
   believed.
-* Values that are not finite, a wrong length or a wrong CRC are dropped and counted.
+* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped and counted.
 """
 
 

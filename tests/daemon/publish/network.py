@@ -9,6 +9,7 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
+from daemon.publish import modbus
 from daemon.publish.modbus import ModbusPublisher
 from hal.clock import SystemClock
 from tests.daemon.publish.test_registers import snapshot
@@ -101,3 +102,45 @@ def taken_port() -> socket.socket:
     sock.bind(("127.0.0.1", 0))
     sock.listen()
     return sock
+
+
+class Wire(asyncio.Transport):
+    """A connection's transport without a network."""
+
+    def __init__(self, protocol: asyncio.Protocol) -> None:
+        super().__init__()
+        self._protocol = protocol
+        self.sent = bytearray()
+        self.gone = False
+        self.reading = True
+
+    def write(self, data: Any) -> None:
+        self.sent += data
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        pass
+
+    def is_reading(self) -> bool:
+        return self.reading
+
+    def pause_reading(self) -> None:
+        self.reading = False
+
+    def resume_reading(self) -> None:
+        self.reading = True
+
+    def is_closing(self) -> bool:
+        return self.gone
+
+    def close(self) -> None:
+        self.gone = True
+        asyncio.get_running_loop().call_soon(self._protocol.connection_lost, None)
+
+    abort = close
+
+
+def plugged(endpoint: modbus.TcpEndpoint) -> tuple[modbus.Connection, Wire]:
+    connection = modbus.Connection(endpoint)
+    wire = Wire(connection)
+    connection.connection_made(wire)
+    return connection, wire

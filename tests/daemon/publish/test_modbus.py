@@ -22,6 +22,7 @@ from hal.odometry import RawOdometry
 from tests.daemon.publish.network import (
     BLOCK,
     closed,
+    plugged,
     publishing,
     read_answer,
     request,
@@ -168,6 +169,27 @@ def test_pipelined_tcp_requests_however_they_are_cut(size: int) -> None:
                 assert (int.from_bytes(answer[:2], "big"), len(answer)) == (number, 137)
 
     asyncio.run(run())
+
+
+def test_small_answers_are_not_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without TCP_NODELAY the second small answer would wait for the client's delayed acknowledgement, 40 ms."""
+    delays: list[int] = []
+    made = modbus.Connection.connection_made
+
+    def connection_made(self: modbus.Connection, transport: asyncio.BaseTransport) -> None:
+        sock = transport.get_extra_info("socket")
+        delays.append(sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+        made(self, transport)
+
+    monkeypatch.setattr(modbus.Connection, "connection_made", connection_made)
+
+    async def run() -> None:
+        async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
+            writer.write(request(1, *BLOCK))
+            await read_answer(reader)
+
+    asyncio.run(run())
+    assert delays == [1]
 
 
 def test_a_client_that_ends_still_gets_what_it_asked_for() -> None:
@@ -347,48 +369,6 @@ def test_a_read_is_never_torn() -> None:
 
 
 # --- limits of a connection, in virtual time --------------------------------------------------------------------------
-
-
-class Wire(asyncio.Transport):
-    """A connection's transport without a network."""
-
-    def __init__(self, protocol: asyncio.Protocol) -> None:
-        super().__init__()
-        self._protocol = protocol
-        self.sent = bytearray()
-        self.gone = False
-        self.reading = True
-
-    def write(self, data: Any) -> None:
-        self.sent += data
-
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
-        pass
-
-    def is_reading(self) -> bool:
-        return self.reading
-
-    def pause_reading(self) -> None:
-        self.reading = False
-
-    def resume_reading(self) -> None:
-        self.reading = True
-
-    def is_closing(self) -> bool:
-        return self.gone
-
-    def close(self) -> None:
-        self.gone = True
-        asyncio.get_running_loop().call_soon(self._protocol.connection_lost, None)
-
-    abort = close
-
-
-def plugged(endpoint: modbus.TcpEndpoint) -> tuple[modbus.Connection, Wire]:
-    connection = modbus.Connection(endpoint)
-    wire = Wire(connection)
-    connection.connection_made(wire)
-    return connection, wire
 
 
 def in_virtual_time(body: Callable[[modbus.TcpEndpoint], Coroutine[Any, Any, None]]) -> None:
