@@ -79,6 +79,11 @@ class FakeHokuyo:
         return self._core.state
 
     @property
+    def laser(self) -> bool:
+        """True while the laser is on."""
+        return self._core.laser
+
+    @property
     def clock(self) -> SensorClock:
         """The sensor's own clock."""
         return self._core.clock
