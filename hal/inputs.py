@@ -18,7 +18,7 @@ from typing import Final
 
 from hal import inet
 from hal.clock import Clock
-from hal.errors import DataInvalid, HalError
+from hal.errors import DataInvalid
 from hal.imu import RawImu
 from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, decode
 from hal.odometry import RawOdometry
@@ -130,6 +130,7 @@ class InputPort:
         self._option = option
         self._sockets: list[socket.socket] = []
         self._users = 0
+        self._opening = asyncio.Lock()
         self._continuity = Continuity()
         self._on_odometry: OnOdometry | None = None
         self._on_imu: OnImu | None = None
@@ -154,18 +155,17 @@ class InputPort:
         Raises:
             DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
         """
-        self._users += 1
-        if self._users > 1:
-            return
-        try:
-            for address in await inet.resolve(self._bind, self._wanted, passive=True):
-                self._listen(address)
-        except (OSError, HalError) as error:
-            self.close()
-            if isinstance(error, OSError):
-                device = f"input datagrams on {self._bind or '*'}:{self._wanted}"
-                raise inet.refusal(device, self._option, self._wanted, error) from error
-            raise
+        async with self._opening:
+            if not self._sockets:
+                addresses = await inet.resolve(self._bind, self._wanted, passive=True)
+                try:
+                    for address in addresses:
+                        self._listen(address)
+                except OSError as error:
+                    self._hang_up()
+                    device = f"input datagrams on {self._bind or '*'}:{self._wanted}"
+                    raise inet.refusal(device, self._option, self._wanted, error) from error
+            self._users += 1
 
     def _listen(self, address: inet.Address) -> None:
         sock = inet.listening((address[0], (address[1][0], self.port)), socket.SOCK_DGRAM)
@@ -177,8 +177,10 @@ class InputPort:
     def close(self) -> None:
         """Undo one `open`."""
         self._users -= 1
-        if self._users > 0:
-            return
+        if self._users == 0:
+            self._hang_up()
+
+    def _hang_up(self) -> None:
         loop = asyncio.get_running_loop()
         for sock in self._sockets:
             loop.remove_reader(sock)

@@ -12,7 +12,7 @@ import socket
 import struct
 import sys
 import time
-from importlib import import_module
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from daemon.publish import registers
@@ -33,7 +33,6 @@ _REQUEST: Final = struct.Struct(">HHHBBHH")
 _ANSWER: Final = struct.Struct(">HHHBBB")
 _READ_INPUT: Final = 4
 _ANY_HOST: Final = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
-_TABLES: Final = {"reason": ("daemon.state", "REASONS"), "fault": ("daemon.health", "FAULTS")}
 _CLEAR: Final = "\x1b[H\x1b[2J"
 
 Reading = dict[str, Value]
@@ -217,9 +216,11 @@ def _meaning(subject: str, number: Value) -> str:
     """What a reason or fault number means and what to do; the tables are loaded only when there is one to explain."""
     if not number:
         return "none"
-    module, table = _TABLES[subject]
-    known: dict[int, tuple[str, str]] = getattr(import_module(module), table)
-    text, remedy = known.get(int(number), ("unknown to this reader", "use the daemon's own version of this command"))
+    from daemon.health import FAULTS
+    from daemon.state import REASONS
+
+    meanings: Mapping[Any, tuple[str, str]] = REASONS if subject == "reason" else FAULTS
+    text, remedy = meanings.get(int(number), ("unknown to this reader", "use the daemon's own version of this command"))
     return f"{number}: {text}" + (f" ({remedy})" if remedy else "")
 
 
@@ -274,7 +275,4 @@ def _devices(word: Value) -> str:
 def _date(t_utc: Value) -> str:
     if not t_utc:
         return "no time"
-    try:
-        return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t_utc))
-    except (OverflowError, ValueError, OSError):
-        return f"{t_utc} s"
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t_utc))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from daemon.health import FAULTS
 from daemon.publish import holding, modbus, registers, requests
 from daemon.publish.points import Layout, Point, Rule
 from daemon.publish.snapshot import State
+from daemon.state import REASONS
 from hal import input_codec, inputs
 
 _NOTICE: Final = (
@@ -74,10 +76,22 @@ def _state_rows() -> list[tuple[str, ...]]:
     return [(str(state.value), state.name, meaning[state]) for state in State]
 
 
-def _bits_and_states() -> str:
+def _meaning_rows(meanings: Mapping[Any, tuple[str, str]]) -> list[tuple[str, ...]]:
+    return [(str(int(number)), text, remedy) for number, (text, remedy) in meanings.items()]
+
+
+def _codes() -> str:
     return f"""## States
 
 {table(("number", "state", "meaning"), _state_rows())}
+
+## Reasons
+
+{table(("number", "reason", "what to do"), _meaning_rows(REASONS))}
+
+## Faults
+
+{table(("number", "fault", "what to do"), _meaning_rows(FAULTS))}
 
 ## Bits of `flags`
 
@@ -120,6 +134,7 @@ unless `bind` does. Read **{registers.BLOCK_WORDS} input registers from address 
 * Any unit identifier is answered. Over UDP, one datagram is one request; repeat it when no answer comes.
 * A register map never changes under the same `version`. Check `magic` and `version` once.
 * In two requests you may see two snapshots: compare `seq` with `seq_end`.
+* Modbus has no password: keep the port on a network you trust.
 * Watch `heartbeat`: if it stands still, the daemon's cycle does. Use the pose only in a `state` your machine accepts.
 
 {_NOT_KNOWN}
@@ -128,7 +143,7 @@ unless `bind` does. Read **{registers.BLOCK_WORDS} input registers from address 
 
 {table(("address", "name", "type", "step", "not known", "meaning"), block)}
 
-{_bits_and_states()}
+{_codes()}
 ## Float mirror: input registers {first} to {last + 1}
 
 The scaled values again as IEEE 754 float32 in SI units, and the full covariance of the map pose. NaN: not known.
@@ -151,7 +166,7 @@ def _writing() -> str:
     return f"""## Writing: holding registers
 
 Only with `modbus.write = true`; otherwise every write is answered with exception 1. Functions 6 and 16; function 3
-reads back. Anyone who can reach the port can write: keep it on a network you trust.
+reads back. Anyone who can reach the port can write.
 
 ### Command block, {holding.COMMAND_ADDRESS} to {holding.COMMAND_ADDRESS + holding.COMMAND.words - 1}
 
@@ -209,7 +224,8 @@ reader in C is `tools/clients/listen_pose.c`.
 
 {table(("byte", "name", "type", "step", "not known", "meaning"), rows)}
 
-{_bits_and_states()}
+States, reasons, faults and the bits of `flags` and `devices` are those of [Modbus](modbus.md).
+
 ## Odometry and IMU datagrams
 
 With `odometry.port` set, the daemon takes wheel odometry and gyro readings as datagrams on that port. Little-endian,

@@ -285,6 +285,7 @@ class ModbusPublisher:
         Raises:
             DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
         """
+        self.port = 0
         addresses = await inet.resolve(bind, port, passive=True)
         self._tcp = TcpEndpoint(self._responder, self.counts)
         try:

@@ -141,8 +141,8 @@ BODY: Final = Layout(
         Point("seq", "snapshot number", U32, attrgetter("seq"), "One more with every snapshot.", rule=Rule.WRAP,
               can_be_unknown=False),
         Point("state", "state", U16, attrgetter("state"), f"{_STATES}.", can_be_unknown=False),
-        Point("reason", "reason for the state", U16, attrgetter("reason"), "0: none.", can_be_unknown=False),
-        Point("fault", "gravest present fault", U16, attrgetter("fault"), "0: none.", can_be_unknown=False),
+        Point("reason", "reason for the state", U16, attrgetter("reason"), "See below; 0: none.", can_be_unknown=False),
+        Point("fault", "gravest present fault", U16, attrgetter("fault"), "See below; 0: none.", can_be_unknown=False),
         Point("flags", "flags", U16, _bits(FLAGS), "Bits, see below.", can_be_unknown=False),
         Point("heartbeat", "heartbeat", U16, _heartbeat, "Ten per second of the daemon's clock; stands still when the "
               "cycle does.", rule=Rule.WRAP, can_be_unknown=False),

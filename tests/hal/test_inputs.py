@@ -259,6 +259,28 @@ def test_sources_share_one_port_and_stamp_with_the_kernels_time() -> None:
         assert before - 0.02 <= reading.t_rx <= after + 0.02
 
 
+def test_two_sources_that_cannot_listen_both_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second asks while the first still looks the name up; when that fails, it must not believe it is listening."""
+    from hal import inet
+
+    async def slow(host: str, port: int, *, passive: bool = False) -> list[inet.Address]:
+        await asyncio.sleep(0.01)
+        return [(socket.AF_INET, ("127.0.0.1", port))]
+
+    monkeypatch.setattr(inet, "resolve", slow)
+
+    async def run(number: int) -> None:
+        port = InputPort(SystemClock(), "robot.local", number)
+        ends = await asyncio.wait_for(
+            asyncio.gather(port.odometry.run(lambda _: None), port.imu.run(lambda _: None), return_exceptions=True), 5.0
+        )
+        assert [type(end) for end in ends] == [DeviceRefused, DeviceRefused]
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        asyncio.run(run(taken.getsockname()[1]))
+
+
 def test_a_kernel_stamp_from_before_a_clock_step_is_not_believed() -> None:
     from hal.inputs import _SO_TIMESTAMPNS, _kernel_age
 

@@ -75,6 +75,20 @@ def test_what_is_not_known_reads_so(capsys: pytest.CaptureFixture[str]) -> None:
     assert "None" not in shown
 
 
+def test_reasons_and_faults_come_with_a_remedy(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=4, fault=101), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "reason     4: no valid scan for three scan periods (check the lidar's power and cable)\n" in shown
+    assert "fault      101: the lidar is not there (" in shown
+
+
+def test_numbers_of_a_newer_daemon_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=60_000, fault=60_001), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "reason     60000: unknown to this reader" in shown
+    assert "fault      60001: unknown to this reader" in shown
+
+
 def test_a_program_reads_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=0, fault=0), json=True) == 0
     reading = json.loads(capsys.readouterr().out)
@@ -203,6 +217,41 @@ def test_modbus_switched_off(capsys: pytest.CaptureFixture[str]) -> None:
 def test_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert status("no-such-host.invalid") == 1
     assert "check the address" in capsys.readouterr().err
+
+
+def test_watching_shows_when_the_daemon_is_away(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    naps = iter(range(2))
+
+    def nap(_: float) -> None:
+        if next(naps, None) is None:
+            raise KeyboardInterrupt
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port = sock.getsockname()[1]
+    monkeypatch.setattr("daemon.publish.client.time.sleep", nap)
+    with pytest.raises(KeyboardInterrupt):
+        status(f"127.0.0.1:{port}", watch=True)
+    assert capsys.readouterr().err.count("nothing serves Modbus there") == 3
+
+
+def test_on_a_terminal_watching_repaints(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def nap(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("daemon.publish.client.time.sleep", nap)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
+        status(address, watch=True)
+    assert capsys.readouterr().out.startswith("\x1b[H\x1b[2Jstate      TRACKING\n")
+
+
+def test_a_time_that_is_none_is_not_made_up() -> None:
+    reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0)))
+    assert "no time" in client.as_table(reading | {"t_utc": None}, stalled=False)
+    assert client.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
 
 
 def test_a_state_of_a_newer_daemon_is_shown_by_number() -> None:

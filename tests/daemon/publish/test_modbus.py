@@ -310,6 +310,27 @@ def test_clients_that_vanish_leave_nothing_behind() -> None:
     asyncio.run(run())
 
 
+def test_an_answer_that_the_kernel_does_not_take_is_dropped() -> None:
+    class Full(socket.socket):
+        def sendto(self, *_: Any) -> int:
+            raise BlockingIOError(errno.EAGAIN, "no buffer space")
+
+    async def run() -> None:
+        publisher = ModbusPublisher(SystemClock())
+        sock = Full(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        sock.bind(("127.0.0.1", 0))
+        endpoint = modbus.UdpEndpoint(sock, publisher._responder, publisher.counts)
+        async with udp_client(sock.getsockname()[1]) as (transport, datagrams):
+            transport.sendto(request(1, *BLOCK))
+            transport.sendto(request(2, *BLOCK))
+            await until(lambda: publisher.counts.unsent == 2)
+            assert datagrams.answers == []
+        endpoint.close()
+
+    asyncio.run(run())
+
+
 def test_closing_drops_clients_and_frees_the_port() -> None:
     async def run() -> None:
         async with publishing() as publisher:
@@ -319,6 +340,8 @@ def test_closing_drops_clients_and_frees_the_port() -> None:
                 await publisher.close()
                 await publisher.close()
                 assert await closed(reader) == b""
+            await publisher.start("127.0.0.1", 0)
+            assert publisher.port != port, "a new start asks for what it is told, not for the old port"
             again = ModbusPublisher(SystemClock())
             await again.start("127.0.0.1", port)
             await again.close()
