@@ -30,7 +30,6 @@ from hal.fake.faults import FaultError
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import MODELS, Unit
 from hal.fake.pty_server import PtyServer
-from hal.fake.rotor import Rotor
 from hal.fake.schedule import FaultSchedule
 from hal.fake.tcp_server import TcpServer
 from tools.sim.buildings import BUILDINGS
@@ -83,8 +82,8 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def make_scene(options: Options, t_mono: float) -> tuple[Scene, Rotor | None]:
-    """The scene, and the motor's timetable where a log dictates one."""
+def make_scene(options: Options, t_mono: float) -> Scene:
+    """A building or a log; a log starts a little after ``t_mono``, its clock cannot wait for a reader."""
     if options.log is None:
         scenario = Scenario(
             options.building,
@@ -94,19 +93,19 @@ def make_scene(options: Options, t_mono: float) -> tuple[Scene, Rotor | None]:
             dwell_s=options.dwell,
             laps=options.laps,
         )
-        return SimulatedScene(scenario), None
+        return SimulatedScene(scenario)
     from hal.replay.carmen import read_carmen
 
-    scene = HybridScene(read_carmen(options.log).events(t_mono + LOG_LEAD_S))
-    return scene, scene.rotor()
+    log = read_carmen(options.log)
+    return HybridScene(log.events(t_mono + LOG_LEAD_S), mount=log.mount)
 
 
 async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None:
     """Run until told to stop. ``say`` gets one object when the devices are there and one at the end."""
     loop = asyncio.get_running_loop()
-    scene, rotor = make_scene(options, loop.time())
+    scene = make_scene(options, loop.time())
     unit = Unit(serial=f"SIM{options.seed:05d}", clock_gain=options.clock_ppm * 1e-6, seed=options.seed)
-    device = FakeHokuyo(scene.model, scene.scan, unit=unit, rotor=rotor)
+    device = FakeHokuyo(scene.model, scene.scan, unit=unit, rotor=scene.rotor())
     async with AsyncExitStack() as stack:
         stack.callback(device.close)
         if options.faults is not None:
