@@ -17,14 +17,13 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from daemon import configfile
 from daemon.bridge import ScanBridge
 from daemon.budget import Budget, MeasuredBudget
 from daemon.config import Config, LidarConfig
-from daemon.cycle import Cycle, CycleRecord, Pacemaker, Parts, Sink, Step
+from daemon.cycle import Cycle, Pacemaker, Parts, Sink, Step
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.network import Feeds, Network
@@ -38,10 +37,11 @@ from estimator.records import Limits, Record
 from estimator.result import StepResult
 from hal.clock import Clock, SystemClock
 from hal.errors import HalError
-from hal.imu import RawImu
-from hal.lidar import Lidar, RawScan
-from hal.odometry import RawOdometry
+from hal.lidar import Lidar
 from hal.port import PortOpener, open_port
+
+if TYPE_CHECKING:
+    from daemon.record import Recorder
 
 log = logging.getLogger(__name__)
 
@@ -52,39 +52,6 @@ EXTEND_US: Final = 30_000_000
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
 
 
-class Recording(Protocol):
-    """What the daemon wants of a recorder (`daemon.record.Recorder`); loaded only when something is recorded."""
-
-    @property
-    def error(self) -> str:
-        """Why nothing is being written at the moment; empty while all is well."""
-        ...
-
-    def tap(self, opener: PortOpener) -> PortOpener:
-        """A port opener whose ports keep what passes through them."""
-        ...
-
-    def on_scan(self, then: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
-        """A callback that keeps and passes on."""
-        ...
-
-    def on_odometry(self, then: Callable[[RawOdometry], None]) -> Callable[[RawOdometry], None]:
-        """A callback that keeps and passes on."""
-        ...
-
-    def on_imu(self, then: Callable[[RawImu], None]) -> Callable[[RawImu], None]:
-        """A callback that keeps and passes on."""
-        ...
-
-    def on_cycle(self, record: CycleRecord) -> None:
-        """Keep a cycle's decisions."""
-        ...
-
-    def close(self) -> None:
-        """Write what is left."""
-        ...
-
-
 class LidarMaker(Protocol):
     """Makes a lidar driver from its configuration."""
 
@@ -93,17 +60,17 @@ class LidarMaker(Protocol):
         ...
 
 
-def make_hokuyo(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
-    """The HOKUYO driver."""
-    from hal.hokuyo.driver import HokuyoDriver
+def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
+    """The driver that the device string names; HOKUYO's where it names none.
 
-    return HokuyoDriver(
-        config.device,
-        clock=clock,
-        opener=opener,
-        serial=config.serial,
-        baud=config.baud,
-        intensity=config.intensity,
+    Raises:
+        DeviceRefused: there is no such driver.
+    """
+    from hal.registry import lidar_factory, split
+
+    name, device = split(config.device)
+    return lidar_factory(name)(
+        device, clock=clock, opener=opener, serial=config.serial, baud=config.baud, intensity=config.intensity
     )
 
 
@@ -118,7 +85,7 @@ class World:
 
     clock: Clock
     opener: PortOpener = open_port
-    make_lidar: LidarMaker = make_hokuyo
+    make_lidar: LidarMaker = make_lidar
     make_worker: Callable[[], Worker] = ThreadWorker
     make_budget: Callable[[], Budget] = MeasuredBudget
     stopwatch: Callable[[], float] | None = time.perf_counter
@@ -130,7 +97,7 @@ class World:
 class Daemon:
     """One run of the daemon: everything is built here, nothing is opened before :meth:`run`."""
 
-    def __init__(self, settings: Config, world: World, recorder: Recording | None = None) -> None:
+    def __init__(self, settings: Config, world: World, recorder: Recorder | None = None) -> None:
         self.supervisor = Supervisor()
         self._world = world
         self._recorder = recorder
@@ -260,10 +227,12 @@ def main(args: argparse.Namespace) -> int:
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
-    recorder: Recording | None = None
+    recorder = None
     try:
         if args.record is not None:
-            recorder = import_module("daemon.record").Recorder(args.record, settings, SystemClock())
+            from daemon.record import Recorder
+
+            recorder = Recorder(args.record, settings, SystemClock())
         asyncio.run(_run_until_signal(settings, recorder))
     except HalError as error:
         log.error("%s", error)
@@ -271,7 +240,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-async def _run_until_signal(settings: Config, recorder: Recording | None) -> None:
+async def _run_until_signal(settings: Config, recorder: Recorder | None) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

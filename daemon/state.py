@@ -77,7 +77,10 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "wheel slip; if it lasts, check odometry scale and lidar mount",
     ),
     Reason.ODOMETRY_SILENT: ("odometry is configured and does not arrive", "check its sender and `odometry.port`"),
-    Reason.UNCERTAIN: ("the pose has become too uncertain", "drive to where the lidar sees walls"),
+    Reason.UNCERTAIN: (
+        "the robot may have moved further than anything has witnessed",
+        "set the pose, or drive to where it was known; wheel odometry bridges such gaps",
+    ),
     Reason.NO_WITNESS: ("nothing has confirmed the pose for too long", "set the pose, or drive to where it was known"),
     Reason.SEVERAL_PLACES: ("several places fit", "drive on until one is left"),
     Reason.SEARCHING: ("looking for the place in the map", "wait"),
@@ -109,7 +112,7 @@ class Evidence:
         unreachable: the driver is backing off and says why.
         match: of the scan of this cycle; None without a scan or before there is a map to match against.
         mapped: there is something to match against.
-        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained since a match last fixed every axis.
+        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained by motion that nothing has witnessed.
         odometry: whether it is arriving; None where none is configured.
         agree: whether wheels and laser told the same motion lately; None where that cannot be said.
         places: how many places fit while the place is looked for (0: none yet); None: not looking.
