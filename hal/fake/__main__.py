@@ -123,18 +123,23 @@ async def _until_told(seconds: float) -> None:
     await stop.wait()
 
 
+def _is_address(text: str) -> bool:
+    host, _, port = text.rpartition(":")
+    return host != "" and port.isascii() and port.isdigit() and int(port) < 1 << 16
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run until interrupted; 2 when something in the arguments is wrong."""
     options = _Options(**vars(_parser().parse_args(arguments)))
     if options.pty is not None and options.tcp is not None:
         sys.stderr.write("one sensor has one line: give --pty or --tcp\n")
         return 2
-    if options.tcp is not None and not options.tcp.rpartition(":")[2].isdigit():
-        sys.stderr.write(f"--tcp {options.tcp}: expected HOST:PORT\n")
+    if options.tcp is not None and not _is_address(options.tcp):
+        sys.stderr.write(f"--tcp {options.tcp}: expected HOST:PORT, as 127.0.0.1:10940\n")
         return 2
     try:
         asyncio.run(_serve(options))
-    except (HalError, FaultError, OSError) as error:
+    except (HalError, FaultError, OSError, UnicodeDecodeError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     return 0

@@ -13,6 +13,7 @@ The last line of an answer is ``ok`` or ``refused: why``.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import shlex
 import stat
 import tomllib
@@ -93,9 +94,9 @@ async def serve_control(control: Control, path: Path) -> asyncio.Server:
     _make_way(path)
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while line := await reader.readline():
-            writer.write(control.answer(line.decode("utf-8", errors="replace")).encode())
-            await writer.drain()
-        writer.close()
+        with contextlib.suppress(ConnectionError, ValueError), contextlib.closing(writer):  # ValueError: endless line
+            while line := await reader.readline():
+                writer.write(control.answer(line.decode("utf-8", errors="replace")).encode())
+                await writer.drain()
 
     return await asyncio.start_unix_server(talk, path)

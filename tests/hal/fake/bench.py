@@ -138,9 +138,8 @@ class Talk:
         return reply
 
     async def status(self, text: str) -> str:
-        """Status of the first reply; empty when there was none."""
-        replies = await self.ask(text)
-        return replies[0].status if replies else ""
+        """Status of the first reply to a line; empty when there was none."""
+        return next((reply.status for reply in await self.ask(text) if reply.echo == text), "")
 
     @property
     def raw(self) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from hal.fake.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel, Unit
@@ -45,6 +46,8 @@ from tests.hal.fake.bench import Talk, virtual
         ("SSabcdef", "01"),
         ("SS123456", "02"),
         ("HS0", "02"),
+        ("HS1", "00"),
+        ("HS2", "01"),
     ],
 )
 def test_refusals(command: str, status: str) -> None:
@@ -204,6 +207,35 @@ def test_host_at_another_rate_hears_noise() -> None:
     raw = virtual(scene, URG_04LX)
     assert len(raw) > 2000
     assert len(set(raw)) > 200
+
+
+def test_motor_speed() -> None:
+    async def scene(talk: Talk) -> list[str]:
+        talk.say("MD0044004400000\n")
+        await asyncio.sleep(0.5)
+        statuses = [await talk.status(line) for line in ("CR00", "CR11", "CRxx")]
+        talk.pieces.clear()
+        talk.say("CR10\n")
+        await asyncio.sleep(3.0)
+        ticks = [scan.tick for scan in talk.scans()]
+        assert np.diff(ticks[-10:]) == pytest.approx(100.2 / 0.9, abs=1.0)
+        statuses.append(await talk.status("CR10"))
+        await talk.ask("RS", 2.0)
+        await talk.ask("MD0044004400000", 3.0)
+        assert np.diff([scan.tick for scan in talk.scans()]) == pytest.approx(100.2, abs=1.0)
+        return statuses
+
+    assert virtual(scene, URG_04LX) == ["03", "02", "01", "03"]
+
+
+def test_a_flood_of_commands_does_not_fill_the_memory() -> None:
+    async def scene(talk: Talk) -> int:
+        for k in range(10000):
+            talk.say(f"TM1;{k}\n")
+        await asyncio.sleep(5.0)
+        return len(talk.replies())
+
+    assert virtual(scene) <= 40
 
 
 def test_ethernet_has_no_baud_rate() -> None:

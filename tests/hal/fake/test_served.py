@@ -369,6 +369,9 @@ def test_command_serves_takes_orders_and_ends(tmp_path: Path) -> None:
         (["--faults", "nothing.toml"], "nothing.toml"),
         (["--pty", "a", "--tcp", "127.0.0.1:0"], "give --pty or --tcp"),
         (["--tcp", "127.0.0.1"], "expected HOST:PORT"),
+        (["--tcp", "127.0.0.1:70000"], "expected HOST:PORT"),
+        (["--tcp", ":10940"], "expected HOST:PORT"),
+        (["--faults", "pyproject.toml"], "build-system: a schedule holds [[fault]] tables"),
         (["--model", "LMS"], "invalid choice: 'LMS'"),
     ],
 )
