@@ -11,78 +11,18 @@ direction) and is subtracted, and a direction in which nothing certain remains i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from estimator import se2
 from estimator.distance_region import Ints, nearest
 from estimator.kernel import kernel
-from estimator.localmap import LocalMap
+from estimator.linear3 import eigen3, positive, solve3
 from estimator.records import Array
-from estimator.result import MatchResult, Reason
 
+GRAZE = 0.2
+"""Part of the range noise that remains across a surface met at a grazing angle: footprint, roughness, bearing."""
 
-@dataclass(frozen=True, slots=True)
-class MatchSettings:
-    """Matching, in terms of the physics.
-
-    Attributes:
-        gate_m: farthest partner ever accepted. scale: final robust scale in units of the residual's own noise.
-        temper: how many beams share one error (mixed map and sensor errors are not independent from beam to beam).
-        settled: an update shorter than this share of its own standard deviation ends the iteration.
-        min_points, min_share: fewest pairs, and fewest pairs per beam, that make a result.
-    """
-
-    gate_m: float = 0.5
-    scale: float = 2.5
-    temper: float = 1.0
-    settled: float = 0.1
-    min_points: int = 10
-    min_share: float = 0.25
-    coarse: int = 4
-
-
-@kernel("f8(f8[:, ::1], f8[::1], f8[::1])")
-def solve3(A: Array, b: Array, x: Array) -> float:
-    """Solve a symmetric positive 3x3 system by Cramer's rule; returns the determinant (x is 0 where it vanishes)."""
-    c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
-    c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
-    c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
-    det: float = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
-    x[:] = 0.0
-    if not det > 0.0:
-        return 0.0
-    c11 = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
-    c12 = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
-    c22 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
-    x[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / det
-    x[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / det
-    x[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / det
-    return det
-
-
-@kernel("void(f8[:, ::1], f8[:, ::1])")
-def eigen3(A: Array, V: Array) -> None:
-    """Diagonalise a symmetric 3x3 matrix in place by Jacobi rotations; the columns of ``V`` are its eigenvectors."""
-    V[:] = 0.0
-    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
-    for _ in range(8):
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                angle = 0.5 * np.arctan2(2.0 * A[p, q], A[q, q] - A[p, p])
-                c, s = np.cos(angle), np.sin(angle)
-                for k in range(3):
-                    x, y = A[k, p], A[k, q]
-                    A[k, p], A[k, q] = c * x - s * y, s * x + c * y
-                for k in range(3):
-                    x, y = A[p, k], A[q, k]
-                    A[p, k], A[q, k] = c * x - s * y, s * x + c * y
-                for k in range(3):
-                    x, y = V[k, p], V[k, q]
-                    V[k, p], V[k, q] = c * x - s * y, s * x + c * y
+INLIERS, PAIRS, WEIGHTS, SQUARES, SETTLED, LENGTH2 = range(15, 21)
+"""Places in the sums behind the normal equations."""
 
 
 @kernel(
@@ -101,7 +41,8 @@ def pair_up(
 
     ``reference``: the axis' rows, start and rays, and per row normal x, y and the variance of the normal's direction.
     ``eye``: the lidar in the base frame. ``how``: robust scale, squared gate, stride through the points.
-    ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient, inliers, pairs, weights, squares.
+    ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient, inliers, pairs, robust weights and
+    squares (m^2, scaled to what they would be as range noise).
     """
     rows, start, rays, lines = reference
     scale, gate2, stride = how
@@ -120,15 +61,20 @@ def pair_up(
         if row < 0:
             continue
         nx, ny = lines[row, 0], lines[row, 1]
-        if nx * (ex - px) + ny * (ey - py) <= 0.0:
+        facing = nx * (ex - px) + ny * (ey - py)
+        if facing <= 0.0:
             continue  # seen from behind: the other side of a thin wall
+        cos2 = facing * facing / ((ex - px) ** 2 + (ey - py) ** 2)
+        p = 1.0 / (GRAZE + (1.0 - GRAZE) * cos2)  # precision in units of the range noise
         pairs += 1.0
         e = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
-        w = 1.0 / (1.0 + k * e * e)
+        w = 1.0 / (1.0 + p * k * e * e)
         if w > 0.2:
             inliers += 1.0
         weights += w
-        squares += w * e * e
+        p *= lines[row, 3]
+        squares += w * p * e * e
+        w *= p
         turn = ny * ux - nx * uy
         along = nx * ux + ny * uy
         h00 += w * nx * nx
@@ -169,15 +115,9 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> float:
             M[i, j] = M[j, i] = k * (sums[at] - 2.0 * sums[6 + at])
             keep[i, j] = keep[j, i] = 1.0 if i == j else 0.0
             at += 1
-    minor = M[0, 0] * M[1, 1] - M[0, 1] * M[0, 1]
-    det = (
-        M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[1, 2])
-        - M[0, 1] * (M[0, 1] * M[2, 2] - M[1, 2] * M[0, 2])
-        + M[0, 2] * (M[0, 1] * M[1, 2] - M[1, 1] * M[0, 2])
-    )
-    if M[0, 0] > 0.0 and minor > 0.0 and det > 0.0:
+    if positive(M):
         return 3.0
-    lever = np.sqrt(max(sums[5] + sums[11], 1e-9) / max(sums[17], 1e-9))
+    lever = np.sqrt(max(sums[5] + sums[11], 1e-9) / max(sums[0] + sums[3], 1e-9))
     S = np.array((1.0, 1.0, 1.0 / lever))
     V = np.empty((3, 3))
     for i in range(3):
@@ -199,8 +139,18 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> float:
     return held
 
 
+@kernel("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8, f8)")
+def first_scale(xy: Array, eye: Array, L1: Array, last: float, gate: float) -> float:
+    """Robust scale to begin with: twice what the prediction's uncertainty moves a point at the scan's mean range."""
+    square = 0.0
+    for i in range(len(xy)):
+        square += (xy[i, 0] - eye[0]) ** 2 + (xy[i, 1] - eye[1]) ** 2
+    spread = 1.0 / L1[0, 0] + 1.0 / L1[1, 1] + square / max(len(xy), 1) / L1[2, 2]
+    return float(min(max(last, 2.0 * np.sqrt(spread)), 0.5 * gate))
+
+
 @kernel(
-    "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1], f8[::1],"
+    "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
     " Tuple((f8[:, ::1], f8[::1])))"
 )
 def iterate(
@@ -208,103 +158,54 @@ def iterate(
     reference: tuple[Array, Ints, Array, Array],
     T: Array,
     L1: Array,
-    eye: Array,
-    caps: Array,
+    how: Array,
     out: tuple[Array, Array],
 ) -> int:
-    """Run the iterations; ``T`` (relative to the axis centre) is moved in place.
+    """Iterate Eq. 13-14 from ``T`` (relative to the axis centre), which is moved in place; the number of iterations.
 
-    ``caps``: iteration cap, gate, first and last robust scale, sigma, temper, settled, coarse stride. ``out``: the
-    laser's information (3, 3) and the sums of the last pass. Returns the iterations, negative when not converged.
+    The robust scale shrinks from what the prediction's uncertainty asks for to a few times the noise; until then every
+    fourth point will do. A step that turns back on the one before is halved: pairs may alternate between two sets.
+    ``how``: lidar in the base frame (x, y), iteration cap, gate, last scale, noise, least step in its own deviations,
+    stride while coarse. ``out``: the laser's information (3, 3), and the sums of the last pass with SETTLED and LENGTH2
+    (squared length of the last step in its own deviations).
     """
     H, sums = out
     T1 = T.copy()
     A = np.empty((3, 3))
     b = np.empty(3)
-    g = np.empty(3)
     step = np.empty(3)
+    before = np.zeros(3)
     keep = np.empty((3, 3))
-    scale = caps[2]
+    eye = how[:2]
+    last = how[4]
+    scale = first_scale(xy, eye, L1, last, how[3])
+    damping = 1.0
     count = 0
-    settled = False
-    k = 1.0 / (caps[4] * caps[4] * caps[5])
-    while count < caps[0] and not settled:
+    sums[SETTLED] = 0.0
+    while count < how[2] and sums[SETTLED] == 0.0:
         count += 1
-        coarse = scale > 2.0 * caps[3]
-        stride = int(caps[7]) if coarse else 1
-        pair_up(xy, reference, T, eye, (scale, min(caps[1], max(6.0 * scale, 0.1)) ** 2, stride), sums)
-        trusted(sums, k * stride, H, keep)
-        for i in range(3):
-            g[i] = -k * stride * sums[12 + i]
+        stride = int(how[7]) if scale > 2.0 * last else 1
+        k = stride / (how[5] * how[5])
+        pair_up(xy, reference, T, eye, (scale, min(how[3], max(6.0 * scale, 0.1)) ** 2, stride), sums)
+        trusted(sums, k, H, keep)
         for i in range(3):
             b[i] = 0.0
             for j in range(3):
                 A[i, j] = H[i, j] + L1[i, j]
-                b[i] += keep[i, j] * g[j] - L1[i, j] * (T[j] - T1[j])
+                b[i] -= k * keep[i, j] * sums[12 + j] + L1[i, j] * (T[j] - T1[j])
         if solve3(A, b, step) == 0.0:
             break
-        length2 = 0.0
+        length2 = turned = 0.0
         for i in range(3):
-            T[i] += step[i]
             for j in range(3):
                 length2 += step[i] * A[i, j] * step[j]
-        settled = length2 < caps[6] * caps[6] and scale == caps[3]
-        scale = max(caps[3], 0.25 * scale) if length2 < 4.0 else max(caps[3], 0.5 * scale)
-    return count if settled else -count
-
-
-def match(
-    points: Array,
-    eye: Array,
-    local: LocalMap,
-    T_pred: Array,
-    L1: Array,
-    caps: tuple[int, float],
-    settings: MatchSettings,
-) -> MatchResult:
-    """Match points (n, 2) in the base frame against the map, from the prediction ``T_pred`` with information ``L1``.
-
-    ``caps``: iteration cap and one-sigma residual noise in metres.
-    """
-    axis, sigma = local.axis, caps[1]
-    H = np.zeros((3, 3))
-    sums = np.zeros(19)
-    centre = np.array((axis.centre[0], axis.centre[1], 0.0))
-    T = T_pred - centre
-    spread = float(np.sqrt(1.0 / L1[0, 0] + 1.0 / L1[1, 1])) * 2.0
-    last = settings.scale * sigma
-    first = min(max(last, spread), settings.gate_m / 2.0)
-    coarse = settings.coarse if len(points) > 400 else 1
-    c = np.array((caps[0], settings.gate_m, first, last, sigma, settings.temper, settings.settled, coarse))
-    n = iterate(points, (axis.rows, axis.start, axis.rays, local.lines), T, L1, np.ascontiguousarray(eye), c, (H, sums))
-    inliers, pairs = int(sums[15]), int(sums[16])
-    reason = Reason.CONVERGED if n > 0 else Reason.ITERATION_CAP
-    if pairs < settings.min_points or inliers < settings.min_share * len(points):
-        reason = Reason.TOO_FEW_PAIRS
-    T = T + centre
-    T[2] = se2.wrap(T[2])
-    correction = T - T_pred
-    correction[2] = se2.wrap(correction[2])
-    ok = reason in (Reason.CONVERGED, Reason.ITERATION_CAP)
-    return MatchResult(
-        T if ok else T_pred.copy(),
-        H,
-        inliers,
-        len(points),
-        abs(n),
-        float(np.sqrt(sums[18] / max(sums[17], 1.0))),
-        known_axes(H),
-        correction,
-        reason,
-    )
-
-
-def known_axes(H: Array) -> Array:
-    """1 for each of x, y, yaw that the information fixes to 10 cm, 10 cm, 2 deg, else 0."""
-    P = np.linalg.inv(H + np.diag((4.0, 4.0, 30.0)))
-    return np.asarray(np.diag(P) < np.array((0.01, 0.01, 0.0012)), dtype=np.float64)
-
-
-def no_match(T_pred: Array, queries: int, reason: Reason) -> MatchResult:
-    """A match that did not take place, and why."""
-    return MatchResult(T_pred.copy(), np.zeros((3, 3)), 0, queries, 0, 0.0, np.zeros(3), np.zeros(3), reason)
+                turned += step[i] * A[i, j] * before[j]
+        if scale == last and turned < -0.25 * length2:
+            damping = max(0.125, 0.5 * damping)
+        for i in range(3):
+            T[i] += damping * step[i]
+            before[i] = step[i]
+        sums[LENGTH2] = length2
+        sums[SETTLED] = 1.0 if length2 < how[6] * how[6] and scale == last else 0.0
+        scale = max(last, (0.25 if length2 < 4.0 else 0.5) * scale)
+    return count

@@ -1,15 +1,51 @@
-"""The bounded recent map a scan is matched against: the last keyframes' points on one distance-region axis."""
+"""The bounded recent map a scan is matched against: line elements on one distance-region axis.
+
+A keyframe's lines are merged into those already there, so that a wall seen ten times is one row of elements with a
+tenth of the variance, and not ten rows among which the nearest one always flatters the match. What the recent
+keyframes have not seen again is dropped, and so is what they looked through (people, doors). The cost of a match thus
+depends on what is in view, not on how long the robot has driven.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from estimator import se2
-from estimator.distance_region import Axis, build_axis
+from estimator.distance_region import Axis, Ints, build_axis, nearest
+from estimator.kernel import kernel
 from estimator.records import Array, Scan
 from estimator.scanpoints import ScanPoints, lines_of
+
+X, Y, NX, NY, SLOPE, WEIGHT, SEEN, STRIKES = range(8)
+"""Columns of an element: place, normal towards the sensor, variance of the normal's direction (rad^2), scans averaged,
+number of the update that saw it last, how often it was looked through since."""
+
+WIDTH = 8
+MARGIN = 0.1
+"""Metres, beyond five times the range noise, by which a beam must differ to speak for or against an element."""
+
+ALIKE = 0.94
+"""Least cosine between the normals of elements that are merged: 20 deg."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapSettings:
+    """The local map.
+
+    Attributes:
+        spacing_m: elements closer than this, or than half the beam spacing at their range, are one.
+        age: updates an element survives unseen. weight: scans it averages at most.
+        capacity: most elements; the oldest go first. strikes: times looked through until it is dropped.
+    """
+
+    spacing_m: float = 0.025
+    age: int = 10
+    weight: float = 10.0
+    capacity: int = 6000
+    strikes: float = 2.0
 
 
 @dataclass(slots=True, eq=False)
@@ -30,10 +66,13 @@ class Keyframe:
 
 @dataclass(slots=True, eq=False)
 class LocalMap:
-    """Line elements of the recent keyframes, indexed; ``lines`` (normal x, y, variance) in the order of the rows."""
+    """Elements (n, WIDTH) in the odom frame, and their axis; ``lines`` (normal x, y, slope, weight) follow its rows."""
 
+    elements: Array
     axis: Axis
     lines: Array
+    updates: int = 0
+    newest: Keyframe | None = None
 
 
 def keyframe_of(key: int, T_map: Array, T_odom: Array, points: ScanPoints, scan: Scan) -> Keyframe:
@@ -41,10 +80,169 @@ def keyframe_of(key: int, T_map: Array, T_odom: Array, points: ScanPoints, scan:
     return Keyframe(key, T_map, T_odom, lines_of(points), scan)
 
 
-def build(keyframes: list[Keyframe], origin: Array) -> LocalMap:
-    """Index the given keyframes around ``origin`` (the lidar's place in the odom frame)."""
-    xy = np.concatenate([se2.apply(k.T_odom_keyframe, k.lines[:, :2]) for k in keyframes])
-    turned = [k.lines[:, 2:4] @ se2.rotation(k.T_odom_keyframe[2])[:2, :2].T for k in keyframes]
-    slope = np.concatenate([k.lines[:, 4] for k in keyframes])
-    axis = build_axis(xy, origin)
-    return LocalMap(axis, np.column_stack((np.concatenate(turned), slope))[axis.label])
+@kernel(
+    "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], i8[::1], f8[:, ::1])), f8[::1], f8[:, ::1],"
+    " Tuple((f8, f8, f8, f8, f8)), i8)"
+)
+def absorb(
+    elements: Array,
+    axis: tuple[Array, Ints, Ints, Array],
+    pose: Array,
+    fresh: Array,
+    how: tuple[float, float, float, float, float],
+    count: int,
+) -> int:
+    """Merge lines (base frame) into the elements [0, count), append what is new; the new count.
+
+    ``axis``: rows, label, start, rays of the elements. ``pose``: T_odom_base (3), axis centre (2), lidar in the base
+    frame (2). ``how``: update number, spacing, half a beam spacing in rad, residual noise, largest weight.
+    """
+    rows, label, start, rays = axis
+    number, spacing, half_beam, sigma, most = how
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    last_x = last_y = np.inf
+    for i in range(len(fresh)):
+        x = pose[0] + c * fresh[i, 0] - s * fresh[i, 1]
+        y = pose[1] + s * fresh[i, 0] + c * fresh[i, 1]
+        nx = c * fresh[i, 2] - s * fresh[i, 3]
+        ny = s * fresh[i, 2] + c * fresh[i, 3]
+        r = np.sqrt((fresh[i, 0] - pose[5]) ** 2 + (fresh[i, 1] - pose[6]) ** 2)
+        near = max(spacing, half_beam * r)
+        row, _ = nearest(rows, start, rays, x - pose[3], y - pose[4], near * near)
+        if row >= 0:
+            j = label[row]
+            e = elements[j, NX] * (x - elements[j, X]) + elements[j, NY] * (y - elements[j, Y])
+            if elements[j, NX] * nx + elements[j, NY] * ny > ALIKE and abs(e) < 4.0 * sigma:
+                if elements[j, SEEN] < number:
+                    a = 1.0 / (elements[j, WEIGHT] + 1.0)
+                    elements[j, X] += a * e * elements[j, NX]
+                    elements[j, Y] += a * e * elements[j, NY]
+                    b = elements[j, SLOPE] / (elements[j, SLOPE] + fresh[i, 4])
+                    mx, my = (1.0 - b) * elements[j, NX] + b * nx, (1.0 - b) * elements[j, NY] + b * ny
+                    length = np.sqrt(mx * mx + my * my)
+                    elements[j, NX], elements[j, NY] = mx / length, my / length
+                    elements[j, SLOPE] = max(fresh[i, 4] / most, elements[j, SLOPE] * (1.0 - b))
+                    elements[j, WEIGHT] = min(most, elements[j, WEIGHT] + 1.0)
+                    elements[j, SEEN] = number
+                    elements[j, STRIKES] = 0.0
+                continue
+        if count == len(elements) or (x - last_x) ** 2 + (y - last_y) ** 2 < near * near:
+            continue
+        last_x, last_y = x, y
+        elements[count, X], elements[count, Y] = x, y
+        elements[count, NX], elements[count, NY] = nx, ny
+        elements[count, SLOPE], elements[count, WEIGHT] = fresh[i, 4], 1.0
+        elements[count, SEEN], elements[count, STRIKES] = number, 0.0
+        count += 1
+    return count
+
+
+@kernel("void(f8[:, ::1], f8[::1], Tuple((f8[::1], f8[::1], u1[::1])), f8, i8, i1[::1])")
+def look_at(
+    elements: Array,
+    eye: Array,
+    beams: tuple[Array, Array, npt.NDArray[np.uint8]],
+    margin: float,
+    stride: int,
+    said: npt.NDArray[np.int8],
+) -> None:
+    """What a scan from ``eye`` (x, y, yaw) says of every ``stride``-th element: 1 there, -1 looked through, 0 nothing.
+
+    An element is looked through when the beam at its bearing and both neighbours go beyond it; it is there when one of
+    them ends on it. What stands before it, lies outside the view or is met at a grazing angle is not judged.
+    """
+    bearing, distance, kind = beams
+    n = len(bearing)
+    said[:] = 0
+    if n < 3 or bearing[n - 1] == bearing[0]:
+        return
+    per_beam = (bearing[n - 1] - bearing[0]) / (n - 1)
+    turn = abs(2.0 * np.pi / per_beam)
+    for i in range(0, len(elements), stride):
+        dx, dy = elements[i, X] - eye[0], elements[i, Y] - eye[1]
+        r = np.sqrt(dx * dx + dy * dy)
+        facing = -(elements[i, NX] * dx + elements[i, NY] * dy)
+        if elements[i, NX] == 0.0 and elements[i, NY] == 0.0:
+            facing = r
+        if facing < 0.3 * r:
+            continue
+        at = (np.arctan2(dy, dx) - eye[2] - bearing[0]) / per_beam
+        at -= turn * np.floor((at - 0.5 * (n - 1)) / turn + 0.5)
+        k = int(np.floor(at + 0.5))
+        if k < 1 or k > n - 2:
+            continue
+        near = margin * r / facing
+        beyond = 0
+        for j in range(k - 1, k + 2):
+            if kind[j] == 1 and abs(distance[j] - r) <= near:
+                said[i] = 1
+            elif kind[j] != 0 and distance[j] > r + near:
+                beyond += 1
+        if beyond == 3:
+            said[i] = -1
+
+
+def empty(origin: Array) -> LocalMap:
+    """A map with nothing in it."""
+    return LocalMap(np.empty((0, WIDTH)), build_axis(np.empty((0, 2)), origin), np.empty((0, 4)))
+
+
+def update(local: LocalMap, frame: Keyframe, settings: MapSettings, sigma: float) -> LocalMap:
+    """The map after a keyframe: merged, aged, and indexed around the place of its lidar."""
+    scan, T = frame.scan, frame.T_odom_keyframe
+    number = local.updates + 1
+    count = len(local.elements)
+    elements = np.empty((count + len(frame.lines), WIDTH))
+    elements[:count] = local.elements
+    axis = local.axis
+    beams = len(scan.bearing_rad)
+    step = abs(scan.bearing_rad[-1] - scan.bearing_rad[0]) / (beams - 1) if beams > 1 else 0.0
+    pose = np.concatenate((T, axis.centre, scan.T_base_lidar[:2]))
+    how = (float(number), settings.spacing_m, 0.5 * step, sigma, settings.weight)
+    count = absorb(elements, (axis.rows, axis.label, axis.start, axis.rays), pose, frame.lines, how, count)
+    elements = elements[:count]
+    eye = se2.compose(T, scan.T_base_lidar)
+    said = np.empty(count, np.int8)
+    look_at(elements, eye, (scan.bearing_rad, scan.range_m, scan.beam), MARGIN + 5.0 * sigma, 1, said)
+    elements[said < 0, STRIKES] += 1.0
+    alive = (elements[:, SEEN] > number - settings.age) & (elements[:, STRIKES] < settings.strikes)
+    local = index(elements[alive][-settings.capacity :], eye[:2], number)
+    local.newest = frame
+    return local
+
+
+def index(elements: Array, origin: Array, number: int) -> LocalMap:
+    """Order elements on the axis around ``origin``."""
+    axis = build_axis(elements[:, :2], origin)
+    lines = elements[axis.label, NX : WEIGHT + 1]
+    weight = lines[:, 3]
+    lines[:, 3] = weight / (weight + 1.0)
+    return LocalMap(elements, axis, lines, number)
+
+
+def contradicted(local: LocalMap, T_odom_lidar: Array, scan: Scan, sigma: float) -> float:
+    """Share of the evidence that speaks against a scan being from this pose, of about 400 + 400 samples.
+
+    Evidence is of two kinds: elements in view that the scan looks through, and points of the scan that hang in space
+    which the newest keyframe has looked through.
+    """
+    margin = MARGIN + 5.0 * sigma
+    said = np.empty(len(local.elements), np.int8)
+    beams = (scan.bearing_rad, scan.range_m, scan.beam)
+    look_at(local.elements, T_odom_lidar, beams, margin, max(1, len(said) // 400), said)
+    there, through = int((said > 0).sum()), int((said < 0).sum())
+    frame = local.newest
+    if frame is None:
+        return 0.0
+    hit = np.flatnonzero(scan.beam == 1)
+    hit = hit[:: max(1, len(hit) // 400)]
+    angle = scan.bearing_rad[hit] + T_odom_lidar[2]
+    points = np.zeros((len(hit), 4))
+    points[:, 0] = T_odom_lidar[0] + scan.range_m[hit] * np.cos(angle)
+    points[:, 1] = T_odom_lidar[1] + scan.range_m[hit] * np.sin(angle)
+    eye = se2.compose(frame.T_odom_keyframe, frame.scan.T_base_lidar)
+    beams = (frame.scan.bearing_rad, frame.scan.range_m, frame.scan.beam)
+    said = np.empty(len(points), np.int8)
+    look_at(points, eye, beams, margin, 1, said)
+    agree, hang = int((said > 0).sum()), int((said < 0).sum())
+    return (through + hang) / max(1, there + through + agree + hang)

@@ -14,6 +14,7 @@ import numpy as np
 from estimator import se2
 from estimator.records import Array, Imu, Odometry
 
+DOUBT_LEARNING, SURPRISE_CAP, DOUBT_CAP = 0.03, 10.0, 100.0
 LONGEST_CARRY_S = 0.5
 """Beyond this a velocity says nothing any more; the pose is held and the uncertainty grows instead."""
 
@@ -55,6 +56,7 @@ class Motion:
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     ahead: Array = field(default_factory=se2.identity)
     odometry: bool = False
+    doubt: float = 1.0
 
 
 def move(motion: Motion, delta: Array, Q: Array) -> None:
@@ -62,7 +64,7 @@ def move(motion: Motion, delta: Array, Q: Array) -> None:
     T = motion.T_odom_base
     motion.P = se2.carry(T, delta, motion.P)
     R = se2.rotation(T[2] + 0.5 * delta[2])
-    motion.P += R @ Q @ R.T
+    motion.P += motion.doubt * (R @ Q @ R.T)
     motion.T_odom_base = se2.compose(T, delta)
 
 
@@ -91,6 +93,19 @@ def on_imu(motion: Motion, record: Imu) -> None:
     dt = record.t_end - record.t_begin
     if dt > 0.0 and np.isfinite(record.dyaw):
         motion.velocity = np.array((motion.velocity[0], motion.velocity[1], record.dyaw / dt))
+
+
+def learn(motion: Motion, correction: Array, known: bool) -> float:
+    """Learn from a match how far the prediction can be trusted; returns the factor by which this one's was too sure.
+
+    Noise figures are those of a good robot. Where wheels slip or stamps jitter, matches keep correcting the prediction
+    by more than its deviation says, and ``doubt`` scales the noise of the predictions to come.
+    """
+    surprise = float(correction @ se2.invert(motion.P) @ correction) / 3.0
+    if known:
+        seen = motion.doubt * min(surprise, SURPRISE_CAP)
+        motion.doubt = min(max(1.0, motion.doubt + DOUBT_LEARNING * (seen - motion.doubt)), DOUBT_CAP)
+    return max(1.0, surprise / 3.0)
 
 
 def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:

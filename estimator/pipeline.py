@@ -6,8 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import grid, icp, localmap, motion, se2
+from estimator import grid, localmap, matching, motion, se2
 from estimator.grid import Grid
+from estimator.matching import Prior, View
 from estimator.records import Array, Command, Imu, Limits, Odometry, Order, Record, Scan
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, points_of
@@ -17,6 +18,8 @@ __all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_map", "st
 
 JUMP_M, JUMP_RAD = 0.05, np.radians(1.0)
 TINY = 1e-9 * np.eye(3)
+LEAST_NOISE_M = 0.004
+LEARNING, CAUCHY = 0.02, 0.807
 
 
 def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
@@ -30,7 +33,7 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
         predict(state, record)
         if isinstance(record, Scan):
             points = virtual_frame(state, record)
-            match = match_scan(state, points, limits)
+            match = match_scan(state, record, points, limits)
             fuse(state, match)
             if limits.update_map and keyframe_due(state, points):
                 keyframe = lay_keyframe(state, record, points)
@@ -66,30 +69,46 @@ def virtual_frame(state: State, scan: Scan) -> ScanPoints:
     return points_of(scan, moved, state.settings.far_m, state.settings.quality)
 
 
-def match_scan(state: State, points: ScanPoints, limits: Limits) -> MatchResult:
+def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> MatchResult:
     """Eq. 12-14: nearest neighbours on the distance axis, point-to-line, the prediction weighted in."""
     T_pred, count = state.motion.T_odom_base, len(points.xy)
     if state.local is None:
-        return icp.no_match(T_pred, count, Reason.NO_MAP)
+        return matching.no_match(T_pred, count, Reason.NO_MAP)
     if count < state.settings.matching.min_points:
-        return icp.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
+        return matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
     thin = max(1, -(-count // max(1, limits.points)))
     xy = np.ascontiguousarray(points.xy[::thin])
-    caps = (limits.icp_iterations, max(points.sigma_m, 0.005))
+    view = View(xy, scan, noise_of(state, scan))
     L1 = se2.invert(state.motion.P)
-    return icp.match(xy, points.origin, state.local, T_pred, L1, caps, state.settings.matching)
+    return matching.match(view, state.local, Prior(T_pred, L1), limits.icp_iterations, state.settings.matching)
 
 
 def fuse(state: State, match: MatchResult) -> None:
     """Take the matched pose and add its information; without odometry it also tells the velocity."""
     moving = state.motion
     if match.ok:
+        learn_noise(state, match)
         moving.T_odom_base = match.T_odom_base
-        moving.P = se2.invert(se2.invert(moving.P) + match.information)
+        P = moving.P * motion.learn(moving, match.correction, bool(match.known_axes.all()))
+        moving.P = se2.invert(se2.invert(P) + match.information)
         dt = moving.t_mono - state.t_scan
         if not moving.odometry and 1e-3 < dt < motion.LONGEST_CARRY_S:
             moving.velocity = se2.log(se2.between(state.T_odom_scan, moving.T_odom_base)) / dt
     state.t_scan, state.T_odom_scan = moving.t_mono, moving.T_odom_base
+
+
+def noise_of(state: State, scan: Scan) -> float:
+    """Range noise to reckon with: what residuals have shown, within a factor of three of the device's own figure."""
+    stated = max(scan.sigma_m, LEAST_NOISE_M)
+    return min(max(state.noise_m or stated, stated / 3.0, LEAST_NOISE_M), 3.0 * stated)
+
+
+def learn_noise(state: State, match: MatchResult) -> None:
+    """Follow the residuals; ``CAUCHY`` is what the robust weights leave of a Gaussian's variance."""
+    square = match.residual_m**2 / CAUCHY
+    state.noise_m = (
+        float(np.sqrt((1.0 - LEARNING) * state.noise_m**2 + LEARNING * square)) if state.noise_m else match.residual_m
+    )
 
 
 def keyframe_due(state: State, points: ScanPoints) -> bool:
@@ -110,23 +129,22 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
     state.P_anchor = covariance(state)
     moving.P = TINY.copy()
     state.keyframes[key] = frame
-    state.recent = [*state.recent, frame][-state.settings.recent :]
     state.anchor, state.T_odom_anchor, state.next_key = key, T, key + 1
     return key
 
 
 def update_map(state: State) -> None:
-    """Index the recent keyframes around the place where the newest was laid."""
-    newest = state.recent[-1]
-    origin = se2.compose(newest.T_odom_keyframe, newest.scan.T_base_lidar)[:2]
-    state.local = localmap.build(state.recent, origin)
+    """Merge the newest keyframe into the local map, and index it around the place where it was laid."""
+    newest = state.keyframes[state.anchor]
+    local = state.local or localmap.empty(newest.T_odom_keyframe[:2])
+    state.local = localmap.update(local, newest, state.settings.map, noise_of(state, newest.scan))
 
 
 def obey(state: State, command: Command) -> None:
     """SET_POSE moves the whole map so that the robot stands there; RESET forgets the map and starts at the origin."""
     T_map_base = command.T_map_base
     if command.order is Order.RESET:
-        state.keyframes, state.recent, state.local = {}, [], None
+        state.keyframes, state.local = {}, None
         state.P_anchor = state.motion.P = TINY.copy()
         state.anchor, state.T_odom_anchor = 0, state.motion.T_odom_base
         T_map_base = se2.identity() if T_map_base is None else T_map_base

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimator import se2
-from estimator.icp import MatchSettings
-from estimator.localmap import Keyframe, LocalMap
+from estimator.localmap import Keyframe, LocalMap, MapSettings
+from estimator.matching import MatchSettings
 from estimator.motion import Motion, MotionNoise
 from estimator.records import Array
 
@@ -21,7 +21,6 @@ class Settings:
         far_m: L of the paper's quality filter; ranges beyond it are not used.
         quality: Q of the filter; a beam whose intensity is lower is not used (only where a scan has intensities).
         keyframe_m, keyframe_rad: a keyframe is laid after this much motion.
-        recent: keyframes in the local map.
         history: keep the pose of keyframes whose scan has been dropped; for replay, which needs them once at the end.
     """
 
@@ -29,8 +28,8 @@ class Settings:
     quality: float = 0.0
     keyframe_m: float = 0.25
     keyframe_rad: float = 0.26
-    recent: int = 5
     history: bool = False
+    map: MapSettings = field(default_factory=MapSettings)
     matching: MatchSettings = field(default_factory=MatchSettings)
     noise: MotionNoise = field(default_factory=MotionNoise)
 
@@ -41,7 +40,7 @@ class State:
 
     Attributes:
         T_map_odom: absolute correction. T_map_start: keyframe 0, where the robot was switched on.
-        keyframes: by ID, with their scans. recent: those in ``local``, oldest first.
+        keyframes: by ID, with their scans..
         anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, covariance of its place in the map.
         next_key: ID of the next keyframe. jumps: see `StepResult`.
         t_scan, T_odom_scan: instant and pose of the latest scan.
@@ -52,13 +51,13 @@ class State:
     T_map_odom: Array = field(default_factory=se2.identity)
     T_map_start: Array = field(default_factory=se2.identity)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
-    recent: list[Keyframe] = field(default_factory=list)
     local: LocalMap | None = None
     anchor: int = 0
     T_odom_anchor: Array = field(default_factory=se2.identity)
     P_anchor: Array = field(default_factory=lambda: np.zeros((3, 3)))
     next_key: int = 1
     jumps: int = 0
+    noise_m: float = 0.0
     t_scan: float = -np.inf
     T_odom_scan: Array = field(default_factory=se2.identity)
 

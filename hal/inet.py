@@ -53,9 +53,7 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
 def listening(address: Address, kind: socket.SocketKind) -> socket.socket:
     """A bound, non-blocking socket (an IPv6 one takes IPv6 only). Raises OSError, see :func:`refusal`."""
     family, where = address
-    # asyncio switches Nagle's algorithm off only on sockets that were made with their protocol's number
-    protocol = socket.IPPROTO_TCP if kind == socket.SOCK_STREAM else socket.IPPROTO_UDP
-    sock = socket.socket(family, kind, protocol)
+    sock = socket.socket(family, kind)
     try:
         sock.setblocking(False)
         if kind == socket.SOCK_STREAM:

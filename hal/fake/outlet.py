@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -80,17 +79,10 @@ class OutletCounts:
 
 
 class Outlet:
-    """A first-in-first-out line to at most one host.
+    """A first-in-first-out line to at most one host. All times are the loop's."""
 
-    Args:
-        loop: the clock of all times.
-        pacing: how bytes leave.
-        heard: what the host hears of bytes that arrive now (noise when it listens at another rate).
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, pacing: Pacing, heard: Callable[[bytes], bytes]) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, pacing: Pacing) -> None:
         self._loop = loop
-        self._heard = heard
         self.pacing = pacing
         self.counts = OutletCounts()
         self.host: HostEnd | None = None
@@ -176,7 +168,7 @@ class Outlet:
         if self.host is None:
             head.pieces.clear()
             self.counts.unheard += 1
-        elif not self.host.take(self._heard(piece)):
+        elif not self.host.take(piece):
             head.pieces.clear()
             self.counts.refused_by_host += 1
         elif not head.pieces:

@@ -1,0 +1,62 @@
+"""Symmetric 3x3 systems, small enough to be solved inside the matching kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.kernel import kernel
+from estimator.records import Array
+
+
+@kernel("f8(f8[:, ::1], f8[::1], f8[::1])")
+def solve3(A: Array, b: Array, x: Array) -> float:
+    """Solve a symmetric positive definite system by Cramer's rule; returns the determinant (x = 0 if not positive)."""
+    c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
+    c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
+    c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    det: float = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
+    x[:] = 0.0
+    if not det > 0.0:
+        return 0.0
+    c11 = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
+    c12 = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
+    c22 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+    x[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / det
+    x[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / det
+    x[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / det
+    return det
+
+
+@kernel("b1(f8[:, ::1])")
+def positive(A: Array) -> bool:
+    """Whether a symmetric matrix is positive definite (Sylvester's leading minors)."""
+    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+    det = (
+        A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2])
+        - A[0, 1] * (A[0, 1] * A[2, 2] - A[1, 2] * A[0, 2])
+        + A[0, 2] * (A[0, 1] * A[1, 2] - A[1, 1] * A[0, 2])
+    )
+    return bool(A[0, 0] > 0.0 and minor > 0.0 and det > 0.0)
+
+
+@kernel("void(f8[:, ::1], f8[:, ::1])")
+def eigen3(A: Array, V: Array) -> None:
+    """Diagonalise a symmetric matrix in place by Jacobi rotations; the columns of ``V`` are its eigenvectors."""
+    V[:] = 0.0
+    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+    for _ in range(8):
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if A[p, q] == 0.0:
+                    continue
+                angle = 0.5 * np.arctan2(2.0 * A[p, q], A[q, q] - A[p, p])
+                c, s = np.cos(angle), np.sin(angle)
+                for k in range(3):
+                    x, y = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = A[p, k], A[q, k]
+                    A[p, k], A[q, k] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = V[k, p], V[k, q]
+                    V[k, p], V[k, q] = c * x - s * y, s * x + c * y

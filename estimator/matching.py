@@ -1,0 +1,178 @@
+"""Matching one scan against the local map: the call, a second opinion where the first is in doubt, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator import icp, se2
+from estimator.localmap import LocalMap, contradicted
+from estimator.records import Array, Scan
+from estimator.result import MatchResult, Reason
+
+SURE = 0.8
+"""Share of fitting beams beyond which a good prediction needs no further evidence."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatchSettings:
+    """Matching, in terms of the physics.
+
+    Attributes:
+        gate_m: farthest partner ever accepted. scale: final robust scale in units of the noise.
+        settled: a step shorter than this share of its own standard deviation ends the iteration.
+        min_points: fewest pairs that make a result.
+        tracking, searching: least share of the beams that must fit, and largest share of the evidence that may speak
+            against it: when the prediction was good, and when it was not (a wrong place can look half right).
+        wide_m, wide_rad: deviations of the prediction beyond which it counts as not good.
+        doubt_share: where fewer beams fit, the prediction is doubted. doubt_m, doubt_rad: its deviations are then taken
+            to be at least these, and ``fan`` headings to either side are tried, ``fan_rad`` apart.
+        coarse, dense: every how many points will do while the pose is far off, in scans of how many.
+    """
+
+    gate_m: float = 0.5
+    scale: float = 2.5
+    settled: float = 0.1
+    min_points: int = 10
+    tracking: tuple[float, float] = (0.35, 0.35)
+    searching: tuple[float, float] = (0.6, 0.1)
+    wide_m: float = 0.15
+    wide_rad: float = 0.1
+    doubt_share: float = 0.6
+    doubt_m: float = 0.3
+    doubt_rad: float = 0.2
+    fan: int = 3
+    fan_rad: float = 0.14
+    coarse: int = 4
+    dense: int = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What is to be matched: points (n, 2) in the base frame, the scan they came from, the range noise."""
+
+    xy: Array
+    scan: Scan
+    noise_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """T1 of Eq. 14: the predicted pose in the odom frame and its information (3, 3)."""
+
+    T: Array
+    L: Array
+
+
+@dataclass(slots=True, eq=False)
+class Attempt:
+    """Outcome of one run of iterations from one start."""
+
+    T: Array
+    H: Array
+    sums: Array
+    iterations: int
+    points: int
+
+    @property
+    def share(self) -> float:
+        """Share of the beams that fit."""
+        return float(self.sums[icp.INLIERS]) / max(self.points, 1)
+
+
+def match(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> MatchResult:
+    """Match a scan from its prediction in at most ``cap`` iterations (a second opinion may take as many again)."""
+    best = attempt(view, local, prior, cap, settings)
+    if best.share < settings.doubt_share:
+        best = second_opinion(best, view, local, prior, settings)
+    return verdict(best, view, local, prior, settings)
+
+
+def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> Attempt:
+    """Iterate from a prediction."""
+    H, sums = np.zeros((3, 3)), np.zeros(21)
+    axis, noise = local.axis, view.noise_m
+    coarse = settings.coarse if len(view.xy) > settings.dense else 1
+    tail = (cap, settings.gate_m, settings.scale * noise, noise, settings.settled, coarse)
+    eye = view.scan.T_base_lidar
+    how = np.array((eye[0], eye[1], *tail))
+    centre = np.array((axis.centre[0], axis.centre[1], 0.0))
+    T = prior.T - centre
+    n = icp.iterate(view.xy, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums))
+    return Attempt(T + centre, H, sums, n, len(view.xy))
+
+
+def second_opinion(first: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> Attempt:
+    """Doubt the prediction: look about it for the place and heading that fit best, on a few points; finish that one."""
+    L = np.minimum(prior.L, np.diag((settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2)))
+    L[~np.eye(3, dtype=bool)] = 0.0
+    few = replace(view, xy=np.ascontiguousarray(view.xy[:: max(1, len(view.xy) // 180)]))
+    best, share = first, first.share + 0.05
+    for k in range(-settings.fan, settings.fan + 1):
+        start = Prior(prior.T + np.array((0.0, 0.0, k * settings.fan_rad)), L)
+        trial = attempt(few, local, start, 12, settings)
+        if trial.share > share:
+            best, share = trial, trial.share
+    if best is first:
+        return first
+    final = attempt(view, local, Prior(best.T, L), 30, settings)
+    return final if final.share > first.share else first
+
+
+def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> MatchResult:
+    """Judge an attempt: whether it is a result, and why not."""
+    sums, length2 = best.sums, float(best.sums[icp.LENGTH2])
+    T = np.array((best.T[0], best.T[1], se2.wrap(best.T[2])))
+    correction = T - prior.T
+    correction[2] = se2.wrap(correction[2])
+    if sums[icp.PAIRS] < settings.min_points:
+        reason = Reason.TOO_FEW_PAIRS
+    elif not plausible(best, T, correction, (view, local, prior), settings):
+        reason = Reason.REJECTED
+    elif sums[icp.SETTLED]:
+        reason = Reason.CONVERGED
+    else:
+        reason = Reason.ITERATION_CAP if length2 < 4.0 else Reason.OSCILLATING
+    ok = reason in (Reason.CONVERGED, Reason.ITERATION_CAP)
+    H = best.H / (1.0 + length2)
+    return MatchResult(
+        T_odom_base=T if ok else prior.T.copy(),
+        information=H,
+        inliers=int(sums[icp.INLIERS]),
+        queries=best.points,
+        iterations=best.iterations,
+        residual_m=float(np.sqrt(sums[icp.SQUARES] / max(sums[icp.WEIGHTS], 1e-9))),
+        known_axes=known_axes(H) if ok else np.zeros(3),
+        correction=correction,
+        reason=reason,
+    )
+
+
+def plausible(
+    best: Attempt, T: Array, correction: Array, asked: tuple[View, LocalMap, Prior], settings: MatchSettings
+) -> bool:
+    """Whether enough of the scan fits the map there, and not too much of either speaks against the place."""
+    view, local, prior = asked
+    L = prior.L
+    wide = 1.0 / L[0, 0] + 1.0 / L[1, 1] > settings.wide_m**2 or 1.0 / L[2, 2] > settings.wide_rad**2
+    x, y, yaw = correction.tolist()
+    surprise = float(correction @ L @ correction) > 25.0
+    surprise = surprise and (x * x + y * y > settings.wide_m**2 or abs(yaw) > settings.wide_rad)
+    share, against = settings.searching if wide or surprise else settings.tracking
+    if best.share < share:
+        return False
+    if best.share > SURE and not wide:
+        return True
+    return contradicted(local, se2.compose(T, view.scan.T_base_lidar), view.scan, view.noise_m) <= against
+
+
+def known_axes(H: Array) -> Array:
+    """1 for each of x, y, yaw that the information brings from 0.5 m and 10 deg to 10 cm and 2 deg, else 0."""
+    P = np.linalg.inv(H + np.diag((4.0, 4.0, 33.0)))
+    return np.asarray(np.diag(P) < np.array((0.01, 0.01, 0.0012)), dtype=np.float64)
+
+
+def no_match(T_pred: Array, queries: int, reason: Reason) -> MatchResult:
+    """A match that did not take place, and why."""
+    return MatchResult(T_pred.copy(), np.zeros((3, 3)), 0, queries, 0, 0.0, np.zeros(3), np.zeros(3), reason)
