@@ -120,36 +120,11 @@ def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bo
     return np.asarray((bearing_deg - begin + slack) % 360.0 <= (end - begin) % 360.0 + 2.0 * slack)
 
 
-class SenderClock:
-    """Maps a sender's stamps to ``t_mono``: unchanged where it shares our clock, else by the quickest arrival seen.
-
-    The transport only ever delays, so the smallest ``t_rx - stamp`` is the clock offset plus the least delay; it is
-    let rise slowly, because two free-running clocks drift apart.
-    """
-
-    SHARED_S: Final = (-0.005, 1.0)
-    """``t_rx - stamp`` of a sender on our clock: hardly in the future, hardly older than a second."""
-    DRIFT: Final = 1e-4
-    RESTART_S: Final = 1.0
-
-    def __init__(self) -> None:
-        self._offset: float | None = None
-        self._t_rx = 0.0
-
-    def t_mono(self, t_rx: float, stamp: float) -> float:
-        """The stamp on our clock, never later than its arrival."""
-        late = t_rx - stamp
-        if self._offset is None and self.SHARED_S[0] <= late <= self.SHARED_S[1]:
-            return min(stamp, t_rx)
-        if self._offset is None or abs(late - self._offset) > self.RESTART_S:
-            self._offset = late
-        self._offset = min(late, self._offset + self.DRIFT * max(0.0, t_rx - self._t_rx))
-        self._t_rx = t_rx
-        return min(stamp + self._offset, t_rx)
-
-
 class OdometryBridge:
-    """Turns cumulative odometry into increments of the base, and notices when its sender starts anew."""
+    """Turns cumulative odometry into increments of the base, and notices when its sender starts anew.
+
+    Stamps are already on our clock (`RawOdometry.t_mono`); one from the future is cut to its arrival.
+    """
 
     FASTEST_M_S: Final = 5.0
     FASTEST_RAD_S: Final = 10.0
@@ -162,7 +137,6 @@ class OdometryBridge:
     def __init__(self) -> None:
         self.jumps = 0
         self.invalid = 0
-        self._clock = SenderClock()
         self._last: tuple[float, Array] | None = None
 
     def increment(self, raw: RawOdometry) -> Odometry | None:
@@ -171,7 +145,7 @@ class OdometryBridge:
             self.invalid += 1
             return None
         pose = np.array((raw.x, raw.y, raw.yaw))
-        t_end = self._clock.t_mono(raw.t_rx, raw.t_mono)
+        t_end = min(raw.t_mono, raw.t_rx)
         if self._last is None:
             self._last = (t_end, pose)
             return None
@@ -198,7 +172,6 @@ class ImuBridge:
 
     def __init__(self) -> None:
         self.invalid = 0
-        self._clock = SenderClock()
         self._last: tuple[float, float] | None = None
 
     def turn(self, raw: RawImu) -> Imu | None:
@@ -206,7 +179,7 @@ class ImuBridge:
         if not (math.isfinite(raw.yaw_rate) and math.isfinite(raw.t_mono)):
             self.invalid += 1
             return None
-        now = self._clock.t_mono(raw.t_rx, raw.t_mono)
+        now = min(raw.t_mono, raw.t_rx)
         last, self._last = self._last, (now, raw.yaw_rate)
         if last is None or not 0.0 < now - last[0] <= self.LONGEST_S:
             return None

@@ -13,6 +13,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+BAUDS = (0, 19200, 38400, 57600, 115200, 250000, 500000, 750000)
+"""Line rates that SCIP knows (command SS, C-42-03320B), and 0."""
+
 Port = Annotated[int, Meta(ge=0, le=65535)]
 Metres = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -77,12 +80,14 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         Meta(min_length=1, description="auto (look for one), a path such as /dev/ttyACM0, or tcp://host:port"),
     ] = "auto"
     serial: Annotated[str, Meta(description="serial number to insist on where several are connected; empty: any")] = ""
-    baud: Annotated[
-        int, Meta(ge=0, le=4_000_000, description="line rate of a real serial line; 0: find it; USB and TCP ignore it")
-    ] = 0
+    baud: Annotated[int, Meta(description="line rate of a real serial line; 0: find it; USB and TCP ignore it")] = 0
     intensity: Annotated[bool, Meta(description="true to read intensities too, where the model can")] = False
     mount: Mount = Mount()
     mask: Mask = Mask()
+
+    def __post_init__(self) -> None:
+        if self.baud not in BAUDS:
+            raise ValueError(f"Expected one of {', '.join(map(str, BAUDS))} in `baud`, got {self.baud}")
 
 
 class OdometryConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):

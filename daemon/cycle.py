@@ -99,7 +99,12 @@ class Parts:
 
 
 class Cycle:
-    """One localisation cycle after the other. Devices call the ``inbox``; :meth:`run` does the rest."""
+    """One localisation cycle after the other. Devices call the ``inbox``; :meth:`run` does the rest.
+
+    Attributes:
+        cycles, overruns: so far. cycle_us: duration of the latest. failing: numbers of the sinks that raise.
+        verdict: what is said about the pose. result: of the latest step.
+    """
 
     def __init__(self, parts: Parts) -> None:
         self.parts = parts
@@ -109,13 +114,12 @@ class Cycle:
         self.imu = ImuBridge()
         self.cycles = 0
         self.overruns = 0
-        self.sinks_failed = 0
         self.verdict = Memory()
         self.result: StepResult | None = None
         self.observer = Observer(parts.clock.now(), parts.odometry)
         self._painter = Painter(parts.map_id)
-        self._cycle_us: int | None = None
-        self._failing: set[int] = set()
+        self.cycle_us: int | None = None
+        self.failing: set[int] = set()
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
@@ -150,6 +154,10 @@ class Cycle:
             )
             self.parts.tap(record)
         return snapshot
+
+    def announce(self) -> None:
+        """Publish where we stand without running a cycle: while the estimator is still being loaded."""
+        self._publish(self._painter.paint(None, self.verdict, self._facts(self.parts.clock.now())))
 
     @property
     def budget_us(self) -> float:
@@ -206,9 +214,9 @@ class Cycle:
             t_utc=parts.clock.utc(),
             period=self.period.seconds,
             scan_rate=rate,
-            missed=parts.status.missed + self.inbox.dropped,
+            missed=parts.status.missed + (self.inbox.dropped if self.cycles else 0),
             overruns=self.overruns,
-            cycle_us=self._cycle_us,
+            cycle_us=self.cycle_us,
             lidar_ok=alive,
             odometry_ok=self.observer.odometry_ok(t_mono),
             fault=parts.fault(),
@@ -220,17 +228,16 @@ class Cycle:
             try:
                 sink(snapshot)
             except Exception:
-                self.sinks_failed += 1
-                if number not in self._failing:
-                    log.exception("a publisher has failed; said once, counted from now on")
-                self._failing.add(number)
+                if number not in self.failing:
+                    log.exception("a publisher has failed; said once until it works again")
+                self.failing.add(number)
             else:
-                self._failing.discard(number)
+                self.failing.discard(number)
 
     def _account(self, stages: _Stages) -> None:
         if self.parts.stopwatch is not None:
-            self._cycle_us = sum(stages.us.values())
-            self.overruns += self._cycle_us > self.budget_us
+            self.cycle_us = sum(stages.us.values())
+            self.overruns += self.cycle_us > self.budget_us
 
 
 class _Stages:
@@ -267,6 +274,7 @@ class Pacemaker:
     async def run(self) -> None:
         """Run cycles until cancelled."""
         loop = asyncio.get_running_loop()
+        self._cycle.inbox.forget_dropped()
         while True:
             self._due = loop.create_future()
             timer = loop.call_at(loop.time() + IDLE_PERIODS * self._cycle.period.seconds, self._wake)

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from daemon.state import SILENT_PERIODS, Evidence, Match
+from daemon.state import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Match
 from daemon.witness import Witnesses
 from estimator.records import Array, Command, Odometry, Record
 from estimator.result import MatchResult, Reason, StepResult
@@ -61,7 +61,8 @@ class Observer:
             if isinstance(record, Odometry):
                 self.witnesses.on_odometry(record)
         match = self._match(result)
-        sigma_m, sigma_rad = self._sigma(match, result)
+        ordered = any(isinstance(record, Command) for record in records)
+        sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
         silence = self.silence(t_mono, period)
         late = self._t_scan is None and t_mono - self._t_start > OPENING_S
         return Evidence(
@@ -74,7 +75,7 @@ class Observer:
             sigma_rad=sigma_rad,
             odometry=self.odometry_ok(t_mono),
             agree=self.witnesses.agree(),
-            ordered=any(isinstance(record, Command) for record in records),
+            ordered=ordered,
         )
 
     def _match(self, result: StepResult | None) -> Match | None:
@@ -89,21 +90,35 @@ class Observer:
         self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(match.known))
         return match
 
-    def _sigma(self, match: Match | None, result: StepResult | None) -> tuple[float, float]:
-        """Uncertainty gained since a match last fixed every axis: larger axis in m, heading in rad.
+    def _sigma(
+        self, match: Match | None, result: StepResult | None, ordered: bool, odometry: bool | None
+    ) -> tuple[float, float]:
+        """Uncertainty gained by motion that nothing has witnessed: larger axis in m, heading in rad.
 
         Not the covariance itself: that of a pose in the map grows with the way from the start, while the place in the
-        surroundings is as good as ever.
+        surroundings is as good as ever. What grows between two complete matches is drift where odometry bridged it.
+        Without odometry it is a guess, and a guess stays one when later scans fit a map that was laid upon it: then
+        the uncertainty is only gone when the estimate itself has become certain again.
         """
         if result is None:
             return 0.0, 0.0
         P = result.covariance
-        if self._P_complete is None or not self._mapped or (match is not None and match.good and all(match.known)):
+        if self._P_complete is None or ordered or not self._mapped:
             self._P_complete = P
-        grown = P - self._P_complete
-        mean, half = 0.5 * (grown[0, 0] + grown[1, 1]), 0.5 * (grown[0, 0] - grown[1, 1])
-        largest = mean + math.hypot(half, grown[0, 1])
-        return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, float(grown[2, 2])))
+        sigma_m, sigma_rad = _growth(P, self._P_complete)
+        complete = match is not None and match.good and all(match.known)
+        if complete and (odometry or (sigma_m <= VAGUE_M and sigma_rad <= VAGUE_RAD)):
+            self._P_complete = P
+            return 0.0, 0.0
+        return sigma_m, sigma_rad
+
+
+def _growth(P: Array, before: Array) -> tuple[float, float]:
+    """One-sigma of what a 3x3 covariance has gained: larger axis in m, heading in rad."""
+    grown = P - before
+    mean, half = 0.5 * (grown[0, 0] + grown[1, 1]), 0.5 * (grown[0, 0] - grown[1, 1])
+    largest = mean + math.hypot(half, grown[0, 1])
+    return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, float(grown[2, 2])))
 
 
 def good(match: MatchResult) -> bool:

@@ -45,6 +45,11 @@ class Inbox:
         self._imu_total = 0
         self._commands: list[Command] = []
 
+    def forget_dropped(self) -> None:
+        """Cycles begin: scans that came before there was anyone to take them are no loss."""
+        self.dropped = 0
+        self._dropped = []
+
     def put_scan(self, scan: RawScan) -> None:
         """Hold a scan; one that no cycle has taken yet is dropped for it and counted."""
         if self._scan is not None:

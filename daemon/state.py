@@ -64,7 +64,7 @@ class Reason(IntEnum):
 
 
 REASONS: Final[dict[Reason, tuple[str, str]]] = {
-    Reason.NONE: ("nothing to report", ""),
+    Reason.NONE: ("the pose is confirmed", ""),
     Reason.WARMING_UP: ("starting up", "wait; the first start ever compiles for up to a minute"),
     Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
@@ -77,7 +77,10 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "wheel slip; if it lasts, check odometry scale and lidar mount",
     ),
     Reason.ODOMETRY_SILENT: ("odometry is configured and does not arrive", "check its sender and `odometry.port`"),
-    Reason.UNCERTAIN: ("the pose has become too uncertain", "drive to where the lidar sees walls"),
+    Reason.UNCERTAIN: (
+        "the robot may have moved further than anything has witnessed",
+        "set the pose, or drive to where it was known; wheel odometry bridges such gaps",
+    ),
     Reason.NO_WITNESS: ("nothing has confirmed the pose for too long", "set the pose, or drive to where it was known"),
     Reason.SEVERAL_PLACES: ("several places fit", "drive on until one is left"),
     Reason.SEARCHING: ("looking for the place in the map", "wait"),
@@ -104,12 +107,12 @@ class Evidence:
     """What one cycle knows. Times in seconds of ``t_mono``.
 
     Attributes:
-        t_mono: now. ready: warm-up is over.
+        t_mono: now.
         silence: scan periods since the last valid scan; None before the first.
         unreachable: the driver is backing off and says why.
         match: of the scan of this cycle; None without a scan or before there is a map to match against.
         mapped: there is something to match against.
-        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained since a match last fixed every axis.
+        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained by motion that nothing has witnessed.
         odometry: whether it is arriving; None where none is configured.
         agree: whether wheels and laser told the same motion lately; None where that cannot be said.
         places: how many places fit while the place is looked for (0: none yet); None: not looking.
@@ -117,7 +120,6 @@ class Evidence:
     """
 
     t_mono: float
-    ready: bool = True
     silence: float | None = None
     unreachable: bool = False
     match: Match | None = None
@@ -170,14 +172,10 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The table, gravest first."""
-    if not evidence.ready:
-        return State.STARTING, Reason.WARMING_UP
     if evidence.silence is None:
-        return (
-            (State.NO_LIDAR, Reason.LIDAR_UNREACHABLE)
-            if evidence.unreachable
-            else (State.STARTING, Reason.OPENING_LIDAR)
-        )
+        if evidence.unreachable:
+            return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE
+        return State.STARTING, Reason.OPENING_LIDAR
     if evidence.silence >= SILENT_PERIODS:
         return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE if evidence.unreachable else Reason.LIDAR_SILENT
     if evidence.places is not None and evidence.places != 1:

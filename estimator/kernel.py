@@ -83,8 +83,8 @@ _numba_config.CACHE_DIR = str(CACHE_DIR)
 
 
 def cache_is_warm() -> bool:
-    """Whether an earlier start has left compiled kernels of these sources for this directory."""
-    return any(CACHE_DIR.rglob("*.nbc"))
+    """Whether an earlier start has left compiled kernels of this room (tools keep theirs in the same directory)."""
+    return any(CACHE_DIR.glob(f"{Path(__file__).parent.name}_*/*.nbc"))
 
 
 def kernel(signature: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -53,7 +53,9 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
 def listening(address: Address, kind: socket.SocketKind) -> socket.socket:
     """A bound, non-blocking socket (an IPv6 one takes IPv6 only). Raises OSError, see :func:`refusal`."""
     family, where = address
-    sock = socket.socket(family, kind)
+    # asyncio switches Nagle's algorithm off only on sockets that were made with their protocol's number
+    protocol = socket.IPPROTO_TCP if kind == socket.SOCK_STREAM else socket.IPPROTO_UDP
+    sock = socket.socket(family, kind, protocol)
     try:
         sock.setblocking(False)
         if kind == socket.SOCK_STREAM:

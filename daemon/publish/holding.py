@@ -66,9 +66,9 @@ def _point(name: str, label: str, text: str, access: str = "RW") -> Point:
 
 def _parameters(text: str) -> tuple[Point, ...]:
     return (
-        Point("x", f"x, {text}", I32, from_client, "", 10_000, "m", access="RW"),
-        Point("y", f"y, {text}", I32, from_client, "", 10_000, "m", access="RW"),
-        Point("yaw", f"yaw, {text}", I32, from_client, "", 1_000_000, "rad", access="RW"),
+        Point("x", f"position x, {text}", I32, from_client, "", 10_000, "m", access="RW"),
+        Point("y", f"position y, {text}", I32, from_client, "", 10_000, "m", access="RW"),
+        Point("yaw", f"heading, {text}", I32, from_client, "", 1_000_000, "rad", access="RW"),
     )
 
 

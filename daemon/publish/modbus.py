@@ -73,7 +73,7 @@ class UdpEndpoint:
                 frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
             except OSError:  # nothing more, or the network's complaint about an earlier answer
                 return
-            if frame_size(frame) != len(frame):
+            if not frame or frame_size(frame) != len(frame):
                 self._counts.malformed += 1
                 continue
             self._counts.requests += 1
@@ -285,6 +285,7 @@ class ModbusPublisher:
         Raises:
             DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
         """
+        self.port = 0
         addresses = await inet.resolve(bind, port, passive=True)
         self._tcp = TcpEndpoint(self._responder, self.counts)
         try:

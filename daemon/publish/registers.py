@@ -123,11 +123,11 @@ def _bits(table: tuple[Bit, ...]) -> Getter:
 
 
 def _pose(frame: str, source: str, text: str) -> tuple[Point, ...]:
-    yaw_text = "Heading, counter-clockwise from the frame's x axis, in [-pi, pi]."
+    yaw_text = "Counter-clockwise from the frame's x axis, in [-pi, pi]."
     return (
-        Point(f"{frame}_x", f"x, {text}", I32, _part(source, 0), "Forward of the frame's origin.", 10_000, "m"),
-        Point(f"{frame}_y", f"y, {text}", I32, _part(source, 1), "Left of the frame's origin.", 10_000, "m"),
-        Point(f"{frame}_yaw", f"yaw, {text}", I32, _yaw(source), yaw_text, 1_000_000, "rad"),
+        Point(f"{frame}_x", f"position x, {text}", I32, _part(source, 0), "", 10_000, "m"),
+        Point(f"{frame}_y", f"position y, {text}", I32, _part(source, 1), "", 10_000, "m"),
+        Point(f"{frame}_yaw", f"heading, {text}", I32, _yaw(source), yaw_text, 1_000_000, "rad"),
     )
 
 
@@ -141,8 +141,8 @@ BODY: Final = Layout(
         Point("seq", "snapshot number", U32, attrgetter("seq"), "One more with every snapshot.", rule=Rule.WRAP,
               can_be_unknown=False),
         Point("state", "state", U16, attrgetter("state"), f"{_STATES}.", can_be_unknown=False),
-        Point("reason", "reason for the state", U16, attrgetter("reason"), "0: none.", can_be_unknown=False),
-        Point("fault", "gravest present fault", U16, attrgetter("fault"), "0: none.", can_be_unknown=False),
+        Point("reason", "reason for the state", U16, attrgetter("reason"), "See below; 0: none.", can_be_unknown=False),
+        Point("fault", "gravest present fault", U16, attrgetter("fault"), "See below; 0: none.", can_be_unknown=False),
         Point("flags", "flags", U16, _bits(FLAGS), "Bits, see below.", can_be_unknown=False),
         Point("heartbeat", "heartbeat", U16, _heartbeat, "Ten per second of the daemon's clock; stands still when the "
               "cycle does.", rule=Rule.WRAP, can_be_unknown=False),

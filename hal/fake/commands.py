@@ -52,6 +52,11 @@ class Measure:
     count: int
 
 
+def letters(line: bytes) -> str:
+    """The command's own characters: two, or three where they begin with ``%``."""
+    return line[: 3 if line.startswith(b"%") else 2].decode("ascii", errors="replace")
+
+
 def known(name: str, model: LidarModel) -> int | None:
     """Parameter characters of a command of this model; None: unknown to it."""
     if name in model.measures:
@@ -64,12 +69,11 @@ def known(name: str, model: LidarModel) -> int | None:
 def parse(line: bytes, model: LidarModel) -> Request | Refusal:
     """Understand a line without its end."""
     body, mark, tag = line.partition(b";")
-    letters = body[: 3 if body.startswith(b"%") else 2]
-    name = letters.decode("ascii", errors="replace")
+    name = letters(body)
     wanted = known(name, model)
     if wanted is None:
         return Refusal(line, "0E")
-    parameters = body[len(letters) :]
+    parameters = body[len(name) :]
     if len(parameters) < wanted:
         return Refusal(line, "0C")
     if len(parameters) > wanted:

@@ -7,12 +7,14 @@ from collections.abc import Callable
 
 from hal.fake import scip_encoder, texts
 from hal.fake.answers import State, answer
-from hal.fake.commands import LINE_ENDS, SINGLES, STREAMS, Refusal, Request, measure, parse
+from hal.fake.commands import LINE_ENDS, SINGLES, STREAMS, Refusal, Request, letters, measure, parse
 from hal.fake.core import Core
 from hal.fake.head import Head
 
 MAX_LINE = 256
 """Characters of a command line; what goes beyond is thrown away up to the line's end."""
+MAX_WAITING = 32
+"""Lines that wait for their turn; further ones are lost, as in a full input buffer."""
 REBOOT_PAIR_S = 1.0
 """Two RB must come within this time; the reboot follows this long after the second."""
 BAUD_CHANGE_S = 0.01
@@ -33,11 +35,12 @@ class Console:
         self._lines: deque[bytes] = deque()
         self._busy = False
         self._last_rb = float("-inf")
+        self._sensitivity = b"0"
         core.alien = lambda name: scip_encoder.reply(name.encode("ascii"), "00", self._text_body(name))
         self._handlers: dict[str, Callable[[Request], None]] = {
             "VV": self._ask, "PP": self._ask, "II": self._ask, "%ST": self._ask, "TM": self._time,
             "BM": self._laser_on, "QT": self._quit, "RS": self._reset, "RT": self._reset, "RB": self._restart,
-            "SS": self._set_baud, "CR": self._set_speed, "HS": self._set_speed, "%SL": self._sleep,
+            "SS": self._set_baud, "CR": self._set_speed, "HS": self._set_sensitivity, "%SL": self._sleep,
             **dict.fromkeys(STREAMS, self._start_stream),
             **dict.fromkeys(SINGLES, self._get_one),
         }  # fmt: skip
@@ -49,7 +52,8 @@ class Console:
         self._text += data
         *whole, rest = LINE_ENDS.split(bytes(self._text))
         self._text = bytearray(rest[: MAX_LINE + 1])
-        self._lines.extend(line[: MAX_LINE + 1] for line in whole if line)
+        lines = [line[: MAX_LINE + 1] for line in whole if line]
+        self._lines.extend(lines[: MAX_WAITING - len(self._lines)])
         self._next()
 
     def forget(self) -> None:
@@ -83,14 +87,14 @@ class Console:
 
     def _reply(self, echo: bytes, status: str, body: bytes = b"") -> None:
         """Answer the command in hand and turn to the next."""
-        lost = self._core.orders.strike("no_reply", command=echo[:2].decode("ascii", errors="replace"))
+        lost = self._core.orders.strike("no_reply", command=letters(echo))
         if not lost:
             self._core.send(scip_encoder.reply(echo, status, body))
         self._done()
 
     def _obey(self, line: bytes) -> None:
         core = self._core
-        if core.orders.strike("ignore", command=line[:2].decode("ascii", errors="replace")):
+        if core.orders.strike("ignore", command=letters(line)):
             return self._done()
         if core.state is State.SCIP1:
             return self._scip1(line)
@@ -191,6 +195,8 @@ class Console:
             core.clock.set(core.now())
             self._reply(request.echo, "00")
             if request.name == "RS":
+                self._head.turn(slower_percent=0)
+                self._sensitivity = b"0"
                 core.at("baud", core.now() + BAUD_CHANGE_S, lambda: core.use_baud(core.unit.baud))
 
         core.at("reset", core.now() + core.model.reset_s, complete)
@@ -219,10 +225,24 @@ class Console:
         return core.at("baud", core.now() + BAUD_CHANGE_S, lambda: core.use_baud(baud))
 
     def _set_speed(self, request: Request) -> None:
-        """CR and HS: only what is set already can be set, the speed of the motor is not modelled."""
-        if request.name == "CR" and not self._core.model.speeds:
+        """CR: 01 to 10 turn the motor 1 to 10 % slower, 00 and 99 as fast as it was made for."""
+        if not self._core.model.speeds:
             return self._reply(request.echo, "04")
         if not request.parameters.isdigit():
             return self._reply(request.echo, "01")
-        same = request.parameters in (b"00", b"99", b"0")
-        return self._reply(request.echo, ("03" if request.name == "CR" else "02") if same else "02")
+        code = int(request.parameters) % 99
+        if code > 10:
+            return self._reply(request.echo, "02")
+        if code == self._head.slower_percent:
+            return self._reply(request.echo, "03")
+        self._head.turn(slower_percent=code)
+        return self._reply(request.echo, "00")
+
+    def _set_sensitivity(self, request: Request) -> None:
+        """HS: kept and told apart, without effect on what is measured."""
+        if request.parameters not in (b"0", b"1"):
+            return self._reply(request.echo, "01")
+        if request.parameters == self._sensitivity:
+            return self._reply(request.echo, "02")
+        self._sensitivity = request.parameters
+        return self._reply(request.echo, "00")

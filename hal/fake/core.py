@@ -32,7 +32,7 @@ class Core:
         self.clock = SensorClock(loop.time(), unit.clock_ms, unit.clock_gain)
         self.orders = Orders(unit.seed + 1)
         self.baud = unit.baud
-        self.outlet = Outlet(loop, Pacing(rate=self.line_rate()))
+        self.outlet = Outlet(loop, Pacing(rate=self.line_rate()), self._heard)
         self.state = State.IDLE
         self.laser = False
         self.laser_since = self.ready_at = loop.time()
@@ -74,6 +74,9 @@ class Core:
         host = self.outlet.host
         return self.model.link != "rs232" or host is None or host.baud() in (0, self.baud)
 
+    def _heard(self, data: bytes) -> bytes:
+        return data if self.at_same_rate() else self.chance.randbytes(len(data))
+
     def light(self, state: State) -> None:
         """Laser on."""
         if not self.laser:
@@ -96,8 +99,6 @@ class Core:
             fault = orders.strike(what, on=on)
             if fault:
                 reply = harm(reply, fault, self.chance)
-        if not self.at_same_rate():
-            reply = self.chance.randbytes(len(reply))
         delayed = orders.on("delayed")
         after = delayed.number("by_s") if delayed else 0.0
         self.outlet.send(reply, is_scan=is_scan, delay=after)

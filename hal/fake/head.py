@@ -27,6 +27,8 @@ class Head:
         self.source = source
         self.rotor = rotor
         self.scans_sent = 0
+        self.slower_percent = 0
+        self._slow_factor = 1.0
         self._request: Request | None = None
         self._wanted = Measure(0, 0, 1, 0, 0)
         self._remaining = 0
@@ -60,6 +62,13 @@ class Head:
         """A data reply of the stream that says a status and carries no data."""
         if self._request is not None:
             self.core.send(scip_encoder.reply(self._echo(), status), is_scan=True)
+
+    def turn(self, *, slower_percent: int | None = None, slow_factor: float | None = None) -> None:
+        """Change the motor's speed: what the host asked for (CR), and what a fault makes of it."""
+        self.slower_percent = self.slower_percent if slower_percent is None else slower_percent
+        self._slow_factor = self._slow_factor if slow_factor is None else slow_factor
+        asked = self.core.model.true_period_s / (1.0 - 0.01 * self.slower_percent)
+        self.rotor.set_period(self.core.now(), asked * self._slow_factor)
 
     def once(self, request: Request, wanted: Measure, done: Callable[[], None]) -> None:
         """Send the latest complete revolution, or the first one that will be; then call ``done``."""
@@ -104,7 +113,7 @@ class Head:
             return
         other = self.core.orders.strike("status")
         if other:
-            self.report(other.text("code"))
+            self.report(f"{int(other.number('code')):02d}")
             return
         self._remaining -= 1 if self._wanted.count else 0
         reply = self._reply(self._echo(), "99", index, scan, request.name, self._wanted)

@@ -6,7 +6,7 @@ pty and in virtual time on a memory port. Two runs with the same unit, source, o
 
 What it does not model: the optics (the scan source does, or does not); a motor that speeds up and slows down
 gradually; clock drift that changes with temperature; USB frames of 1 ms and TCP segments; framing errors at a wrong
-baud rate (noise stands for them); motor speed (CR) and sensitivity (HS) beyond their replies; measuring in SCIP 1.1;
+baud rate (noise stands for them); what sensitivity (HS) does to ranges; measuring in SCIP 1.1;
 the I/O commands GF GG MF MG, DB, $IP and the microsecond stamps of HPTS firmware; ``%ST`` codes of unstable states.
 """
 
@@ -77,6 +77,11 @@ class FakeHokuyo:
     def state(self) -> State:
         """Where the sensor stands."""
         return self._core.state
+
+    @property
+    def laser(self) -> bool:
+        """True while the laser is on."""
+        return self._core.laser
 
     @property
     def clock(self) -> SensorClock:
@@ -171,6 +176,8 @@ class FakeHokuyo:
         core.clock.set(core.now())
         core.use_baud(self.unit.baud)
         core.trouble = ""
+        if self._head.slower_percent:
+            self._head.turn(slower_percent=0)
 
     def _booted(self) -> None:
         scip1 = self.unit.scip1 or self._core.orders.on("scip1")
@@ -192,6 +199,10 @@ class FakeHokuyo:
                 changed(reachable)
 
     # fault orders
+
+    def in_force(self) -> list[Fault]:
+        """Faults that have not been lifted and have not spent their strikes."""
+        return self._core.orders.in_force()
 
     def check(self, fault: Fault) -> None:
         """Refuse an order that makes no sense for this sensor.
@@ -223,7 +234,10 @@ class FakeHokuyo:
         return {
             "off": (self._turn_off, lambda _: self.power_on()),
             "hangup": (lambda _: self._set_link(self._link_up), lambda _: self._set_link(self._link_up)),
-            "slow": (lambda f: self._turn_at(f.number("factor")), lambda _: self._turn_at(1.0)),
+            "slow": (
+                lambda f: self._head.turn(slow_factor=f.number("factor")),
+                lambda _: self._head.turn(slow_factor=1.0),
+            ),
             "stall": (lambda _: core.outlet.hold(True), lambda _: core.outlet.hold(False)),
             "chunks": (self._chunk, lambda _: core.outlet.rewrap()),
             "verify": (self._verify, lambda _: self._verified()),
@@ -239,9 +253,6 @@ class FakeHokuyo:
         self._power_off()
         if self.model.link != "rs232":
             self._set_link(False)
-
-    def _turn_at(self, factor: float) -> None:
-        self._head.rotor.set_period(self._core.now(), self.model.true_period_s * factor)
 
     def _chunk(self, fault: Fault) -> None:
         split_end = bool(fault.values["split_end"])
@@ -261,7 +272,8 @@ class FakeHokuyo:
             self._core.dark(State.SCIP1)
 
     def _fail(self, fault: Fault) -> None:
-        self._head.report(fault.text("code"))
+        code = f"{int(fault.number('code')):02d}"
+        self._head.report(code)
         self._head.halt()
         self._core.dark(State.ERROR)
-        self._core.trouble = f"Trouble!! Error No. =[00->{fault.text('code')}]"
+        self._core.trouble = f"Trouble!! Error No. =[00->{code}]"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from hal.fake.commands import PARAMETERS, SINGLES, STREAMS
 from hal.fake.faults import Parameter, Vocabulary, Word
 from hal.fake.outlet import MAX_JOIN
 
 ON = {"on": Parameter("scans", choices=("scans", "replies", "all"))}
-COMMAND = Parameter("QT")
+COMMANDS = tuple(sorted({*PARAMETERS, *STREAMS, *SINGLES, "SC"}))
+"""As `hal.fake.commands.letters` tells them apart; SC is ``SCIP2.0``."""
 
 LIDAR: Vocabulary = {
     # the general words
@@ -34,7 +36,7 @@ LIDAR: Vocabulary = {
         {"command": Parameter("II", choices=("VV", "PP", "II"))},
     ),
     # what a scan says
-    "status": Word("a scan's 99 is another status, without data", "strikes", {"code": Parameter("50")}),
+    "status": Word("a scan's 99 is another status, without data", "strikes", {"code": Parameter(50, 0, 99)}),
     "frozen_stamp": Word("the stamp stands still while ranges go on", "strikes"),
     "stamp_jump": Word("stamps are off by `by_ms`", "strikes", {"by_ms": Parameter(-5000, -(1 << 24), 1 << 24)}),
     "wrong_steps": Word("`by` steps more or fewer than asked for, with correct sums", "strikes", {"by": Parameter(-1)}),
@@ -56,8 +58,12 @@ LIDAR: Vocabulary = {
     "baud": Word("an RS-232 sensor talks at another rate", "once", {"rate": Parameter(57600, 1200, 750000)}),
     "inject": Word("another program writes `text` to the sensor", "once", {"text": Parameter("AT\r")}),
     # commands
-    "ignore": Word("`command` is neither obeyed nor answered", "strikes", {"command": COMMAND}),
-    "no_reply": Word("`command` is obeyed but its acknowledgement is lost", "strikes", {"command": Parameter("MD")}),
+    "ignore": Word(
+        "`command` is neither obeyed nor answered", "strikes", {"command": Parameter("QT", choices=COMMANDS)}
+    ),
+    "no_reply": Word(
+        "`command` is obeyed but its acknowledgement is lost", "strikes", {"command": Parameter("MD", choices=COMMANDS)}
+    ),
     "text_sum": Word(
         "text lines are summed with the semicolon (`whole`) or up to `<-` (`mark`)",
         "lasts",
@@ -71,7 +77,7 @@ LIDAR: Vocabulary = {
     "boot_delay": Word("starting up takes `by_s` longer", "lasts", {"by_s": Parameter(3.0, 0.0, 3600.0)}),
     "scip1": Word("speaks SCIP 1.1 now and after every start", "lasts"),
     "set_clock": Word("the clock shows `ms`", "once", {"ms": Parameter((1 << 24) - 1216, 0, (1 << 24) - 1)}),
-    "error": Word("stops with status `code` and refuses all but RB", "once", {"code": Parameter("70")}),
+    "error": Word("stops with status `code` and refuses all but RB", "once", {"code": Parameter(70, 0, 99)}),
     "verify": Word("stops with 21 to check itself, resumes with 98 when lifted", "lasts"),
 }
 """By word. ``off stuck garbage wrong slow delayed intermittent`` mean for a lidar what they mean for any device."""

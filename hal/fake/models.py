@@ -27,8 +27,10 @@ class LidarModel:
         profile: dialect, ``2.0`` (URG, UTM) or ``2.2`` (UST). link: how it is wired by default.
         measures: measurement commands it knows; any other is unknown to it (``0E``).
         latency_s, jitter_s: time to a reply is ``latency_s + |N(0, jitter_s)|``.
-        tick_s: replies and scans leave on multiples of this on the sensor's clock; 0: at once.
+        tick_s: replies and scans leave on multiples of this on the sensor's clock; 0: at once. (UST firmware 4.0.0 to
+            4.0.2: 5 ms.)
         boot_s: power-on to ready. reset_s: time a reset command takes before its reply.
+        speeds: knows CR, by which the motor is slowed down.
         modes: texts of ``II MESM`` for idle, booting, single, streaming. stat: text of ``II STAT`` while healthy.
     """
 
@@ -50,7 +52,7 @@ class LidarModel:
     jitter_s: float = 0.4e-3
     tick_s: float = 0.0
     boot_s: float = 1.0
-    reset_s: float = 0.05
+    reset_s: float = 0.8
     speeds: bool = False
     vend: str = "Hokuyo Automatic Co.,Ltd."
     modes: tuple[str, str, str, str] = ("IDLE", "001 Booting", "SINGLE", "CLASSIC")
@@ -112,7 +114,7 @@ UST_10LX = LidarModel(
     firm="CUS0.0.1(01/Jan./2014)",  # assumed
     dmin=20, dmax=30000, ares=1440, amin=0, amax=1080, afrt=540, rpm=2400,
     true_period_s=0.02505, profile="2.2", link="ethernet", measures=ECHOES,
-    latency_s=0.4e-3, jitter_s=0.05e-3, tick_s=1e-3,
+    latency_s=0.4e-3, jitter_s=0.05e-3, tick_s=1e-3, reset_s=0.05,
     modes=("000 Idle", "001 Booting", "003 Single_scan", "004 Multi_scan"),
     stat="Stable 000 no error.",
 )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -79,10 +80,17 @@ class OutletCounts:
 
 
 class Outlet:
-    """A first-in-first-out line to at most one host. All times are the loop's."""
+    """A first-in-first-out line to at most one host.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, pacing: Pacing) -> None:
+    Args:
+        loop: the clock of all times.
+        pacing: how bytes leave.
+        heard: what the host hears of bytes that arrive now (noise when it listens at another rate).
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, pacing: Pacing, heard: Callable[[bytes], bytes]) -> None:
         self._loop = loop
+        self._heard = heard
         self.pacing = pacing
         self.counts = OutletCounts()
         self.host: HostEnd | None = None
@@ -168,7 +176,7 @@ class Outlet:
         if self.host is None:
             head.pieces.clear()
             self.counts.unheard += 1
-        elif not self.host.take(piece):
+        elif not self.host.take(self._heard(piece)):
             head.pieces.clear()
             self.counts.refused_by_host += 1
         elif not head.pieces:

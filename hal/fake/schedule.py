@@ -82,6 +82,10 @@ class Target(Protocol):
         """Refuse with `FaultError` an order that makes no sense for this device."""
         ...
 
+    def in_force(self) -> list[Fault]:
+        """Faults that have not been lifted and have not spent themselves."""
+        ...
+
     def begin(self, fault: Fault) -> None:
         """A fault comes into force now (a ``once`` fault happens now)."""
         ...
@@ -128,11 +132,8 @@ class FaultSchedule:
 
     def clear(self, what: str = "", where: str = "") -> list[Fault]:
         """Lift the faults in force and forget those to come, all or those of a word or a device; tells which."""
-        chosen = [
-            fault
-            for fault in {*self._timers, *self._in_force}
-            if what in ("", fault.what) and where in ("", fault.where)
-        ]
+        known = dict.fromkeys([*self._in_force, *self._timers])
+        chosen = [f for f in known if what in ("", f.what) and where in ("", f.where)]
         for fault in chosen:
             if fault in self._timers:
                 self._timers.pop(fault).cancel()
@@ -142,7 +143,8 @@ class FaultSchedule:
 
     def listing(self) -> Iterable[str]:
         """One line for every fault in force or to come."""
-        yield from (f"in force {fault}" for fault in self._in_force)
+        for target in self._targets.values():
+            yield from (f"in force {fault}" for fault in target.in_force())
         yield from (f"to come {fault}" for fault in self._timers if fault not in self._in_force)
 
     def close(self) -> None:

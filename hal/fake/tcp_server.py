@@ -13,7 +13,7 @@ TCP_QUEUE = 128 * 1024
 class TcpServer:
     """The device as a network sensor: one host at a time, a second one is turned away; a closed connection stops it.
 
-    An unreachable sensor (no power, cable pulled) resets whoever connects; a real one would not answer at all.
+    An unreachable sensor (no power, cable pulled) hangs up on whoever connects; a real one would not answer at all.
     """
 
     def __init__(self, device: FakeHokuyo) -> None:

@@ -7,7 +7,7 @@ specifications C-42-03320B, C-42-04076, C-42-03907; field reports named at the e
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 from hal.errors import DeviceRefused
 from hal.hokuyo.payload import ScanRequest
@@ -52,7 +52,7 @@ class ModelFacts:
             (ros-drivers/urg_c PR 4, ros-drivers/urg_node issue 23).
         codes: meaning of values below DMIN.
         no_return_from: values from here on are no distance even if DMAX allows them; 0: DMAX alone decides.
-        processing_s: from the end of a revolution's measurement to its first byte, undelayed.
+        line: how it is usually wired, where the name of the port does not tell.
         intensity_swath_deg: widest safe field of view with intensity at cluster 1, by firmware; "" is any other
             firmware. Empty: no limit.
     """
@@ -61,7 +61,7 @@ class ModelFacts:
     commands: frozenset[str]
     codes: dict[int, str] = field(default_factory=dict)
     no_return_from: int = 0
-    processing_s: float = 5e-4
+    line: Literal["usb", "ethernet"] = "usb"
     intensity_swath_deg: dict[str, float] = field(default_factory=dict)
 
     def may(self, command: str) -> bool:
@@ -74,14 +74,14 @@ _FAMILIES: Final[tuple[tuple[str, ModelFacts], ...]] = (
     ("URG-04LX", ModelFacts("URG-04LX", _CORE, _URG_CODES)),
     ("UBG-04LX", ModelFacts("UBG-04LX", _CORE, _URG_CODES)),
     ("UHG-08LX", ModelFacts("UHG-08LX", _CORE, _URG_CODES)),
-    ("UTM-30LX-EW", ModelFacts("UTM-30LX-EW", _MULTI_ECHO, _UTM_CODES)),
+    ("UTM-30LX-EW", ModelFacts("UTM-30LX-EW", _MULTI_ECHO, _UTM_CODES, line="ethernet")),
     (
         "UTM-30LX",
         # hokuyo_node and PR2/pr2_robot issue 137: a wider request gives wrong data or a crash that needs a power cycle
         ModelFacts("UTM-30LX", _INTENSITY, _UTM_CODES, intensity_swath_deg={"": 95.0, "1.16.01(16/Nov./2009)": 190.0}),
     ),
-    ("UST-", ModelFacts("UST", _INTENSITY | {"RB"}, _UTM_CODES, no_return_from=65533, processing_s=4e-4)),
-    ("UXM-30LX", ModelFacts("UXM-30LX", _MULTI_ECHO, _UTM_CODES)),
+    ("UST-", ModelFacts("UST", _INTENSITY | {"RB"}, _UTM_CODES, no_return_from=65533, line="ethernet")),
+    ("UXM-30LX", ModelFacts("UXM-30LX", _MULTI_ECHO, _UTM_CODES, line="ethernet")),
 )
 UNKNOWN_MODEL: Final = ModelFacts("unknown model", _INTENSITY)
 """For models not listed; intensity is still verified by one counted scan before it is relied on."""
@@ -189,11 +189,29 @@ def stream_request(identity: Identity, *, intensity: bool, bytes_per_s: float) -
     return request
 
 
+_BYTES_PER_S: Final = {"usb": 1.0e6, "ethernet": 12.5e6}  # USB full speed in practice; 100 Mbit/s
+
+
+def line_speed(device: str, baud: int, facts: ModelFacts) -> float:
+    """Bytes per second of the line behind a port's name.
+
+    Args:
+        device: as opened; symbolic links already followed where it is a path.
+        baud: rate of an RS-232 line in bit/s, 0 where there is none.
+        facts: whose usual line is taken where the name does not tell.
+    """
+    if baud > 0:
+        return baud / 10.0
+    if device.startswith("tcp://"):
+        return _BYTES_PER_S["ethernet"]
+    return _BYTES_PER_S["usb" if "ttyACM" in device else facts.line]
+
+
 def latency_s(identity: Identity, request: ScanRequest, bytes_per_s: float) -> float:
     """Seconds from the beam at step 0 to the arrival of a frame's last byte when nothing delays it.
 
-    Data leave the sensor after the last measurable step (C-42-03320B); then its processing, then the line.
+    Data leave the sensor at once after the last measurable step (C-42-03320B; UST on the next tick of its millisecond
+    clock, which is a delay like any other), and then take their time on the line.
     """
     geometry = identity.geometry
-    line = request.frame_bytes / bytes_per_s if bytes_per_s > 0 else 0.0
-    return geometry.amax * geometry.beam_dt_s + identity.facts.processing_s + line
+    return geometry.amax * geometry.beam_dt_s + request.frame_bytes / bytes_per_s

@@ -6,7 +6,7 @@ It runs the same splitter, codec and clock code as the live driver.
 from __future__ import annotations
 
 from hal.errors import DeviceRefused
-from hal.hokuyo.models import UNKNOWN_MODEL, Identity, facts_of, identify
+from hal.hokuyo.models import UNKNOWN_MODEL, Identity, facts_of, identify, line_speed
 from hal.hokuyo.payload import ScanRequest
 from hal.hokuyo.scip import ACCEPTED, DATA, BadFrame, FrameSplitter, Reply, parse_reply, parse_text
 from hal.hokuyo.stream import ScanStream
@@ -23,15 +23,13 @@ class PassiveHokuyo:
 
     Args:
         geometry: used until the bytes hold a PP reply.
-        bytes_per_s: speed of the line the bytes came over, 0 for one without delay.
-        device: what the source is called in errors.
+        device: the port the bytes came through, as far as known (errors name it; its kind tells the line's speed).
+        baud: rate of an RS-232 line in bit/s, 0 for any other.
     """
 
-    def __init__(
-        self, geometry: LidarGeometry | None = None, *, bytes_per_s: float = 0.0, device: str = "capture"
-    ) -> None:
+    def __init__(self, geometry: LidarGeometry | None = None, *, device: str = "capture", baud: int = 0) -> None:
         self._device = device
-        self._bytes_per_s = bytes_per_s
+        self._baud = baud
         self._splitter = FrameSplitter()
         self._identity = None if geometry is None else _given(geometry)
         self._vv: dict[str, str] = {}
@@ -95,7 +93,8 @@ class PassiveHokuyo:
         asked = ScanRequest.of_echo(reply.echo)
         stream = self._stream
         if stream is None or not _same_stream(stream.request, asked):
-            stream = self._stream = ScanStream(self._identity, asked, self._status, self._bytes_per_s)
+            speed = line_speed(self._device, self._baud, self._identity.facts)
+            stream = self._stream = ScanStream(self._identity, asked, self._status, speed)
         stream.request = asked  # a counted stream counts down in its echo
         scan = stream.take(reply, t_rx, self._seq)
         self._seq += 1

@@ -39,8 +39,8 @@ TM_READ: Final = b"TM1\n"
 TM_LEAVE: Final = b"TM2\n"
 TO_SCIP2: Final = b"SCIP2.0\n"
 
-BAUD_RATES: Final = (19200, 57600, 115200, 250000, 500000, 750000)
-"""Rates every RS-232 model knows, in the order in which a sensor is looked for (factory default first)."""
+BAUD_RATES: Final = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
+"""Rates of RS-232 models, in the order in which a sensor is looked for (factory default first)."""
 
 
 class Flaw(Enum):

@@ -22,10 +22,10 @@ class ScanStream:
         identity: of the sensor.
         request: what was asked for.
         status: whose counters are kept (``missed``, ``clock_resets``).
-        bytes_per_s: speed of the line, 0 for one without delay; part of the time between measurement and arrival.
+        bytes_per_s: speed of the line; part of the time between measurement and arrival.
     """
 
-    def __init__(self, identity: Identity, request: ScanRequest, status: LidarStatus, bytes_per_s: float = 0.0) -> None:
+    def __init__(self, identity: Identity, request: ScanRequest, status: LidarStatus, bytes_per_s: float) -> None:
         self.identity = identity
         self.request = request
         self._status = status

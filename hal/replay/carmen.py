@@ -175,9 +175,9 @@ def _note_file(path: Path, number: int, torn: Torn, parsed: _Parsed, report: Log
         raise DataInvalid(
             f"{path}:{number}", "not a CARMEN log: no FLASER, ROBOTLASER1 or RAWLASER1 line up to here", _REMEDY
         )
-    report.use("laser", len(parsed.lasers))
-    report.use("odometry", len(parsed.odometry))
-    report.use("parameter", len(parsed.parameters))
+    report.use("laser lines", len(parsed.lasers))
+    report.use("separate odometry lines", len(parsed.odometry))
+    report.use("parameters", len(parsed.parameters))
 
 
 def _usable(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:

@@ -47,6 +47,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ("lidar = 3", "robot.toml:1: Expected `object`, got `int` - at `$.lidar`"),
         ("[lidar.mask]\nsectors = [[1, 2], [3]]", "Expected `array` of length 2, got 1 - at `$.lidar.mask.sectors[1]`"),
         ("[lidar.mask]\nsectors = [[1, 1]]", "robot.toml:2: Expected two different bearings in `sectors`"),
+        ("[lidar]\nbaud = 9600", "robot.toml:2: Expected one of 0, 19200, 38400"),
         ("bind = 'robot'", "robot.toml:1: Expected an IP address of this machine in `bind`, got `robot`"),
         ("[pose]\nreceivers = ['plc']", "robot.toml:2: Expected `host:port` or `[ipv6]:port`, got `plc`"),
         ("[pose]\nreceivers = ['a:1', 'plc:0']", "got `plc:0` in `receivers[1]` - at `$.pose`"),

@@ -101,9 +101,8 @@ class Scanner:
         self.optics = optics
         self._seed = seed
         self._bounds = world.bounds
-        self._world = (
-            world.shapes, world.cell_start, world.cell_items, world.frame, material_table(), world.polished
-        )  # fmt: skip
+        cell_shapes = np.ascontiguousarray(world.shapes[world.cell_items])
+        self._world = cell_shapes, world.cell_start, world.frame, material_table(), world.polished
         count = len(sweep.bearing_rad)
         self._beams = np.zeros((count, 3))
         self._beams[:, 0] = sweep.bearing_rad

@@ -41,12 +41,23 @@ class HybridScene:
     Args:
         records: scans and odometry as any player of :mod:`hal.replay` yields them, all scans of one geometry.
         reference: where the robot really was, on the records' clock; without one the truth is the log's own odometry.
+        mount: where the laser sat on the robot, (x, y, yaw) in m and rad.
+        even: pass the scans on in an even rhythm, as a motor gives it, and stretch the time of everything else with
+            them. Without it the sensor keeps the log's own stamps, and a driver will rightly distrust a sensor whose
+            turns take now half and now twice their time, as many a log has it.
 
     Raises:
         ValueError: no scans, scans of several shapes, or a geometry that whole steps cannot state.
     """
 
-    def __init__(self, records: Iterable[RawScan | RawOdometry], reference: Trajectory | None = None) -> None:
+    def __init__(
+        self,
+        records: Iterable[RawScan | RawOdometry],
+        reference: Trajectory | None = None,
+        mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        even: bool = True,
+    ) -> None:
+        self.mount = mount
         scans: list[RawScan] = []
         odometry: list[RawOdometry] = []
         for record in records:
@@ -54,16 +65,18 @@ class HybridScene:
                 scans.append(record)
             else:
                 odometry.append(record)
-        self._starts = _rising(scans)
+        stamps = _rising(scans)
+        self._starts = np.linspace(stamps[0], stamps[-1], len(stamps)) if even else stamps
         self._words = [_words(scan) for scan in scans]
         self._intensity = [scan.intensity for scan in scans]
-        self._odometry = Trajectory(
+        readings = Trajectory(
             np.array([reading.t_mono for reading in odometry]),
             np.array([(reading.x, reading.y, reading.yaw) for reading in odometry]).reshape(-1, 3),
         )
-        self._reference = reference or self._odometry
+        self._odometry = _stretched(readings, stamps, self._starts)
+        self._reference = self._odometry if reference is None else _stretched(reference, stamps, self._starts)
         self.model = fitted_model(scans[0], _turn(scans[0].geometry, self._starts))
-        self._starts -= self.model.amin * self.model.true_period_s / self.model.ares
+        self._starts = self._starts - self.model.amin * self.model.true_period_s / self.model.ares
 
     @property
     def starts(self) -> Array:
@@ -71,7 +84,7 @@ class HybridScene:
         return self._starts
 
     def rotor(self) -> TimetableRotor:
-        """A motor that keeps the log's own uneven rhythm."""
+        """A motor that turns when the scans were measured."""
         return TimetableRotor(self._starts.tolist(), self.model.true_period_s)
 
     def scan(self, t_mono: float) -> FakeScan | None:
@@ -112,6 +125,13 @@ def _rising(scans: list[RawScan]) -> Array:
     if np.any(np.diff(starts) <= 0.0):
         raise ValueError("scan times do not rise; play the log through hal.replay, which mends its stamps")
     return starts
+
+
+def _stretched(trajectory: Trajectory, stamps: Array, starts: Array) -> Trajectory:
+    """The same poses at the times to which the scans around them have moved."""
+    t = trajectory.t_mono
+    inside = np.interp(t, stamps, starts)
+    return Trajectory(np.where(t < stamps[0], t, np.where(t > stamps[-1], t, inside)), trajectory.poses)
 
 
 def _turn(geometry: LidarGeometry, starts: Array) -> float:

@@ -27,8 +27,11 @@ GLINT_GAIN: Final = 6.0
 FLOOR_ALBEDO: Final = 0.30
 FLOOR_MIRROR: Final = 0.04
 
-WORLD: Final = "Tuple((f8[:,::1], i4[::1], i4[::1], f8[::1], f8[:,::1], f8[:,::1]))"
-"""shapes, cell_start, cell_items, frame, material table, polished floors: see :class:`tools.sim.world.World`."""
+WORLD: Final = "Tuple((f8[:,::1], i4[::1], f8[::1], f8[:,::1], f8[:,::1]))"
+"""cell_shapes, cell_start, frame, material table, polished floors: see :class:`tools.sim.world.World`.
+
+Taken apart only where that happens once per ray or less: numba counts a reference for every part it takes.
+"""
 
 WORK: Final = "Tuple((f8[:,::1], f8[::1], f8[::1], f8[:,::1]))"
 """Scratch, so that nothing is allocated per ray: branches, hit, surface, echoes (last row: their count)."""
@@ -75,10 +78,9 @@ def note_normal(ray: Any, shapes: Any, n: Any, hit: Any) -> None:
     hit[3] = shapes[n, 5]
 
 
-@kernel(f"void(f8[::1], {WORLD}, f8[::1])")
-def meet_static(ray: Any, world: Any, hit: Any) -> None:
+@kernel("void(f8[::1], f8[:,::1], i4[::1], f8[::1], f8[::1])")
+def meet_static(ray: Any, shapes: Any, start: Any, frame: Any, hit: Any) -> None:
     """Nearest standing surface by walking the cells along the ray (Amanatides and Woo, 1987)."""
-    shapes, start, items, frame, _, _ = world
     cell = frame[2]
     nx, ny = int(frame[3]), int(frame[4])
     ix, iy = int((ray[0] - frame[0]) / cell), int((ray[1] - frame[1]) / cell)
@@ -91,8 +93,7 @@ def meet_static(ray: Any, world: Any, hit: Any) -> None:
     best, nearest = hit[0], -1
     while 0 <= ix < nx and 0 <= iy < ny:
         flat = iy * nx + ix
-        for k in range(start[flat], start[flat + 1]):
-            n = items[k]
+        for n in range(start[flat], start[flat + 1]):
             if shapes[n, 0] == 0.0:
                 distance = meet_segment(ray, shapes, n)
             else:
@@ -113,15 +114,12 @@ def meet_static(ray: Any, world: Any, hit: Any) -> None:
         note_normal(ray, shapes, nearest, hit)
 
 
-@kernel(f"void(f8[::1], {WORLD}, f8[:,::1], f8[::1])")
-def meet(ray: Any, world: Any, movers: Any, hit: Any) -> None:
-    """Nearest surface of all.
+@kernel("void(f8[::1], f8[:,::1], f8[::1])")
+def meet_movers(ray: Any, movers: Any, hit: Any) -> None:
+    """Nearer surface among the moving circles, where they are at the ray's instant.
 
-    ``ray``: ox, oy, dx, dy, limit, seconds since the scan began. ``movers`` rows: ``1, x, y, r, material, vx, vy`` true
-    at the scan's begin. ``hit``: distance (inf: nothing), normal x, normal y, material.
+    ``ray[5]``: seconds since the scan began. Rows of ``movers``: ``1, x, y, r, material, vx, vy``, true at that begin.
     """
-    hit[0] = inf
-    meet_static(ray, world, hit)
     for k in range(movers.shape[0]):
         cx = movers[k, 1] + ray[5] * movers[k, 5]
         cy = movers[k, 2] + ray[5] * movers[k, 6]
@@ -179,11 +177,11 @@ def branch(stack: Any, top: Any, ray: Any, hit: Any, surface: Any) -> Any:
     return top
 
 
-@kernel(f"void(f8[::1], {WORLD}, f8[::1], f8[:,::1])")
-def meet_floor(ray: Any, world: Any, surface: Any, echoes: Any) -> None:
+@kernel("void(f8[::1], f8[:,::1], f8[::1], f8[:,::1])")
+def meet_floor(ray: Any, floors: Any, surface: Any, echoes: Any) -> None:
     """The scan plane dips into the floor: a matt floor ends the ray, a polished one passes most of it on."""
     ahead = ray[9] - ray[6]
-    polished = on_rectangles(ray[0] + ahead * ray[2], ray[1] + ahead * ray[3], world[5])
+    polished = on_rectangles(ray[0] + ahead * ray[2], ray[1] + ahead * ray[3], floors)
     share = mirrored(FLOOR_MIRROR, ray[10]) if polished else 0.0
     back = FLOOR_ALBEDO * (1.0 - share) * ray[10] / max(ray[9] * ray[9], 1e-4)
     add_echo(echoes, ray[9], ray[8] * ray[7] * back)
@@ -197,6 +195,7 @@ def follow(ray: Any, world: Any, movers: Any, work: Any) -> None:
 
     ``ray``: ox, oy, dx, dy, limit, time, travelled, gain, weight, floor distance (inf: never), sine of the elevation.
     """
+    shapes, start, frame, table, floors = world
     stack, hit, surface, echoes = work
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = ray[0], ray[1], ray[2], ray[3]
     stack[0, 4], stack[0, 5], stack[0, 6] = 0.0, 1.0, 0.0
@@ -207,20 +206,23 @@ def follow(ray: Any, world: Any, movers: Any, work: Any) -> None:
         ray[0], ray[1], ray[2], ray[3] = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
         ray[6], ray[7], surface[2] = stack[top, 4], stack[top, 5], stack[top, 6]
         ray[4] = limit - ray[6]
-        meet(ray, world, movers, hit)
+        hit[0] = inf
+        meet_static(ray, shapes, start, frame, hit)
+        meet_movers(ray, movers, hit)
         if surface[2] == 0.0 and ray[9] < limit and ray[9] - ray[6] < hit[0]:
-            meet_floor(ray, world, surface, echoes)
+            meet_floor(ray, floors, surface, echoes)
         if hit[0] > ray[4] or ray[7] < MIN_GAIN:
             continue
         material = int(hit[3])
         lean = min(fabs(ray[2] * hit[1] + ray[3] * hit[2]), 1.0)
-        share = mirrored(world[4][material, 1], lean)
+        share = mirrored(table[material, 1], lean)
         reach = ray[6] + hit[0]
-        glint = GLINT_GAIN * share * exp(-2.0 * (1.0 - lean) / (GLINT_WIDTH * GLINT_WIDTH))
-        back = world[4][material, 0] * (1.0 - share) * lean + glint
+        back = table[material, 0] * (1.0 - share) * lean
+        if share > 0.0:
+            back += GLINT_GAIN * share * exp(-2.0 * (1.0 - lean) / (GLINT_WIDTH * GLINT_WIDTH))
         add_echo(echoes, reach, ray[8] * ray[7] * back / max(reach * reach, 1e-4))
         if share > 0.0:
-            surface[0], surface[1] = share, (1.0 - share) * world[4][material, 2]
+            surface[0], surface[1] = share, (1.0 - share) * table[material, 2]
             top = branch(stack, top, ray, hit, surface)
 
 
@@ -260,20 +262,27 @@ def detect(echoes: Any, threshold: Any, pulse: Any, out: Any) -> None:
             i += 1
 
 
-@kernel("void(f8[:,::1], f8[::1], f8[::1], f8, f8[::1])")
-def aim(knots: Any, beam: Any, optics: Any, offset: Any, ray: Any) -> None:
-    """Set a sub-ray's origin, direction and meeting with the floor at its beam's own instant."""
-    at = beam[1] * (knots.shape[0] - 1)
+@kernel("void(f8[:,::1], f8[:,::1], i8, f8[::1], f8[::1])")
+def aim(knots: Any, beams: Any, i: Any, optics: Any, start: Any) -> None:
+    """Where beam ``i`` starts at its own instant: x, y, angle, limit, time, floor distance, sine of elevation."""
+    at = beams[i, 1] * (knots.shape[0] - 1)
     k = min(int(at), knots.shape[0] - 2)
     part = at - k
-    ray[0] = knots[k, 0] + part * (knots[k + 1, 0] - knots[k, 0])
-    ray[1] = knots[k, 1] + part * (knots[k + 1, 1] - knots[k, 1])
-    angle = knots[k, 2] + part * (knots[k + 1, 2] - knots[k, 2]) + beam[0] + offset
-    ray[2], ray[3] = cos(angle), sin(angle)
-    ray[4], ray[5] = optics[1], beam[1] * optics[6]
-    down = optics[4] * cos(beam[0]) + optics[5] * sin(beam[0])
-    ray[9] = optics[3] / down if down > 1e-5 else inf
-    ray[10] = max(down, 0.0)
+    start[0] = knots[k, 0] + part * (knots[k + 1, 0] - knots[k, 0])
+    start[1] = knots[k, 1] + part * (knots[k + 1, 1] - knots[k, 1])
+    start[2] = knots[k, 2] + part * (knots[k + 1, 2] - knots[k, 2]) + beams[i, 0]
+    start[3], start[4] = optics[1], beams[i, 1] * optics[6]
+    down = optics[4] * cos(beams[i, 0]) + optics[5] * sin(beams[i, 0])
+    start[5] = optics[3] / down if down > 1e-5 else inf
+    start[6] = max(down, 0.0)
+
+
+@kernel("void(f8[::1], f8, f8, f8[::1])")
+def set_ray(start: Any, offset: Any, weight: Any, ray: Any) -> None:
+    """One sub-ray of an aimed beam, ``offset`` rad beside its axis."""
+    angle = start[2] + offset
+    ray[0], ray[1], ray[2], ray[3] = start[0], start[1], cos(angle), sin(angle)
+    ray[4], ray[5], ray[8], ray[9], ray[10] = start[3], start[4], weight, start[5], start[6]
 
 
 @kernel(f"void(f8[:,::1], f8[:,::1], {WORLD}, f8[:,::1], f8[::1], f8[:,:,::1])")
@@ -284,19 +293,19 @@ def cast_scan(knots: Any, beams: Any, world: Any, movers: Any, optics: Any, out:
         knots: (k >= 2, 3) lidar poses evenly spaced over the scan, yaw unwrapped.
         beams: (n, 3) bearing, share of the scan's time passed (0..1), detection threshold.
         world: see :data:`WORLD`.
-        movers: see :func:`meet`.
+        movers: see :func:`meet_movers`.
         optics: half divergence, limit of range, pulse length, lidar height, pitch and roll (positive: the beams ahead
             and to the left point down), duration of the scan.
         out: (n, 3, 3) detections, see :func:`detect`; energy 0 where there is none.
     """
     out[:] = 0.0
-    ray = np.zeros(11)
+    start, ray = np.zeros(7), np.zeros(11)
     echoes = np.zeros((ECHOES_PER_BEAM + 1, 2))
     work = (np.zeros((BRANCHES, 7)), np.zeros(4), np.zeros(3), echoes)
     for i in range(beams.shape[0]):
         echoes[-1, 0] = 0.0
+        aim(knots, beams, i, optics, start)
         for sub in range(SUB_RAYS):
-            aim(knots, beams[i], optics, SUB_OFFSET[sub] * optics[0], ray)
-            ray[8] = SUB_WEIGHT[sub]
+            set_ray(start, SUB_OFFSET[sub] * optics[0], SUB_WEIGHT[sub], ray)
             follow(ray, world, movers, work)
         detect(echoes, beams[i, 2], optics[2], out[i])

@@ -12,6 +12,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from hal.fake.models import MODELS, LidarModel
+from hal.fake.rotor import Rotor
 from hal.fake.scan import FakeScan
 from tools.sim import beams
 from tools.sim.beams import Optics, Posture, Returns, Scanner, Sweep
@@ -34,6 +35,15 @@ class Scene(Protocol):
     @property
     def model(self) -> LidarModel:
         """The type of lidar the scans are made for."""
+        ...
+
+    @property
+    def mount(self) -> tuple[float, float, float]:
+        """Where the lidar sits on the robot: (x, y, yaw) in base_link, m and rad."""
+        ...
+
+    def rotor(self) -> Rotor | None:
+        """When the sensor turns; None: as its motor does by itself."""
         ...
 
     def scan(self, t_mono: float) -> FakeScan | None:
@@ -92,6 +102,15 @@ class SimulatedScene:
         self._scanner = Scanner(self.building.world, _sweep(self.model), self.optics, scenario.seed)
         self._odometer = Odometer(self.drive, self.building.world, scenario.wheels, scenario.seed)
 
+    @property
+    def mount(self) -> tuple[float, float, float]:
+        """See :class:`Scene`."""
+        return self.scenario.body.lidar
+
+    def rotor(self) -> None:
+        """See :class:`Scene`: the model's own motor."""
+        return
+
     def scan(self, t_mono: float) -> FakeScan:
         """See :class:`Scene`."""
         if self.t_go is None:
@@ -118,7 +137,7 @@ class SimulatedScene:
         return self.drive.pose(np.asarray(t_mono) - self.t_go)
 
     def _lidar_poses(self, t: Array) -> Array:
-        return compose(self.drive.pose(t), self.scenario.body.lidar)
+        return compose(self.drive.pose(t), self.mount)
 
 
 def lidar_model(name: str) -> LidarModel:

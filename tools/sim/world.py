@@ -62,7 +62,7 @@ class World:
 
     Attributes:
         shapes: (n, 6) rows ``kind, a, b, c, d, material``: a segment's two ends, or a circle's centre and radius.
-        cell_start, cell_items: shapes by cell, compressed rows; cell ``iy * nx + ix``.
+        cell_start, cell_items: numbers of shapes by cell, compressed rows; cell ``iy * nx + ix``.
         frame: (x0, y0, cell size, nx, ny) of the cells; all rays must start inside.
         polished: (k, 4) rectangles ``x_min, y_min, x_max, y_max`` of polished floor; elsewhere the floor is matt.
     """

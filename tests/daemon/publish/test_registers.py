@@ -292,6 +292,12 @@ def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> 
         registers.decode_block(bytes(block))
 
 
+def test_a_torn_mirror_is_refused() -> None:
+    mirror = registers.encode_mirror(snapshot())
+    with pytest.raises(ValueError, match="torn mirror"):
+        registers.decode_mirror(mirror[:-1] + b"\x00")
+
+
 def test_wrong_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="64 registers, got 63"):
         registers.decode_block(bytes(126))

@@ -174,7 +174,7 @@ def test_hybrid_needs_scans_of_one_shape_in_time() -> None:
 
 
 def test_hybrid_truth_is_the_reference_or_the_odometry() -> None:
-    scene = HybridScene(recorded())
+    scene = HybridScene(recorded(), even=False)
     assert scene.truth(np.array([10.21]))[0].tolist() == pytest.approx([0.1, 0.0, 0.01])
     reference = Trajectory(np.array([0.0, 20.0]), np.array([[0.0, 0.0, 3.0], [2.0, 4.0, -3.0]]))
     pose = HybridScene(recorded(), reference).truth(np.array([10.0]))[0]
@@ -187,9 +187,19 @@ def test_hybrid_truth_is_the_reference_or_the_odometry() -> None:
 
 
 def test_hybrid_odometry_comes_in_order() -> None:
-    scene = HybridScene(recorded())
+    scene = HybridScene(recorded(), even=False)
     t, times = 0.0, []
     while (reading := scene.odometry_after(t)) is not None:
         t = reading[0]
         times.append(t)
     assert times == pytest.approx([10.0, 10.21, 10.4, 10.61, 10.8])
+
+
+def test_hybrid_keeps_the_rhythm_or_evens_it_out_for_everything() -> None:
+    """A log whose scans come after 0.19 and 0.21 s in turn: even, wheels and truth move with the scans."""
+    uneven, even = HybridScene(recorded(), even=False), HybridScene(recorded())
+    np.testing.assert_allclose(uneven.starts, [10.0, 10.21, 10.4, 10.61, 10.8])
+    np.testing.assert_allclose(even.starts, [10.0, 10.2, 10.4, 10.6, 10.8])
+    np.testing.assert_allclose(even.truth(even.starts), uneven.truth(uneven.starts), atol=1e-12)
+    rotor = even.rotor()
+    assert [rotor.start_of(k) for k in range(3)] == pytest.approx([10.0, 10.2, 10.4])

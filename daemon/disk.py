@@ -1,0 +1,197 @@
+"""The one thread that writes: ready bytes ten times a second, synced to the disk every 0.4 s.
+
+A power cut therefore costs at most half a second, and a disk that is slow, full or gone costs only what could not be
+written: it is counted, said once, noted in the recording as soon as there is room again, and never stops the daemon.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from hal.errors import DeviceRefused
+from hal.replay.recording import Kind, pack_frame, pack_head, segment_name
+
+log = logging.getLogger(__name__)
+
+WRITE_S: Final = 0.1
+SYNC_S: Final = 0.4
+RETRY_S: Final = 5.0
+SEGMENT_BYTES: Final = 64 << 20
+BACKLOG_BYTES: Final = 32 << 20
+"""Bytes that may wait for a slow disk; beyond, records are dropped and counted."""
+
+
+class SegmentWriter:
+    """Appends records to segments in a folder of its own; see `hal.replay.recording` for the format.
+
+    Attributes:
+        folder: where this recording goes.
+        records, bytes: written so far. lost: records that could not be written.
+        error: why nothing is being written at the moment; empty while all is well.
+    """
+
+    def __init__(self, parent: Path, name: str, header: dict[str, Any], segment_bytes: int = SEGMENT_BYTES) -> None:
+        """Make the folder and open the first segment.
+
+        Raises:
+            DeviceRefused: that is not possible; names the folder, why, and what to do.
+        """
+        self.records = self.bytes = self.lost = 0
+        self.error = ""
+        self._header = header
+        self._segment_bytes = segment_bytes
+        self._segment = -1
+        self._file = -1
+        self._good = 0  # bytes of the open segment that end with a whole record
+        self._ready: list[bytes] = []
+        self._waiting = 0
+        self._lock = threading.Lock()
+        self._noted = 0
+        self._t_mono = 0.0
+        self._retry_at = 0.0
+        self._synced_at = time.monotonic()
+        self._dirty = False
+        self._stop = threading.Event()
+        try:
+            self.folder = _new_folder(parent, name)
+            self._open()
+        except OSError as error:
+            problem = f"cannot be recorded into: {error.strerror or error}"
+            raise DeviceRefused(str(parent), problem, "free space, or name a folder that may be written") from error
+        self._thread = threading.Thread(target=self._work, name="lumiloop-disk", daemon=True)
+        self._thread.start()
+
+    def put(self, kind: Kind, channel: int, t_mono: float, payload: bytes) -> None:
+        """Take one record; returns at once."""
+        frame = pack_frame(kind, channel, t_mono, payload)
+        with self._lock:
+            if self._waiting + len(frame) > BACKLOG_BYTES or self._stop.is_set():
+                self.lost += 1
+                return
+            self._ready.append(frame)
+            self._waiting += len(frame)
+            self._t_mono = t_mono
+
+    def close(self) -> None:
+        """Write and sync what is left; idempotent."""
+        if not self._stop.is_set():
+            self._stop.set()
+            self._thread.join()
+
+    def _work(self) -> None:
+        while not self._stop.wait(WRITE_S):
+            self._turn()
+        self._retry_at = 0.0
+        self._turn()
+        self._close()
+
+    def _turn(self) -> None:
+        """Write what is ready; on trouble drop it, count it, and try again later in a new segment."""
+        with self._lock:
+            frames, self._ready, self._waiting = self._ready, [], 0
+        try:
+            if self._file < 0:
+                if time.monotonic() < self._retry_at:
+                    self._lose(frames)
+                    return
+                self._open()
+            self._write(frames)
+        except OSError as error:
+            self._fail(error, frames)
+
+    def _write(self, frames: list[bytes]) -> None:
+        """Append whole records; rotates first where the segment is full."""
+        if frames and self._good > self._segment_bytes:
+            self._close()
+            self._open()
+        data = self._gap() + b"".join(frames)
+        _write_all(self._file, data)
+        self._good += len(data)
+        self.bytes += len(data)
+        self.records += len(frames)
+        self._noted = self.lost
+        self._dirty |= bool(data)
+        if self._dirty and time.monotonic() - self._synced_at >= SYNC_S:
+            os.fdatasync(self._file)
+            self._synced_at, self._dirty = time.monotonic(), False
+        if self.error:
+            log.warning("recording goes on in %s; %d records were lost", self.folder, self.lost)
+            self.error = ""
+
+    def _gap(self) -> bytes:
+        """A note in the recording where records are missing."""
+        if self._noted == self.lost:
+            return b""
+        note = f"{self.lost - self._noted} records before this one were lost: {self.error or 'the disk is too slow'}"
+        return pack_frame(Kind.NOTE, 0, self._t_mono, note.encode())
+
+    def _fail(self, error: OSError, frames: list[bytes]) -> None:
+        if not self.error:
+            log.error("recording into %s has stopped: %s; it goes on when there is room", self.folder, error.strerror)
+        self.error = f"{self.folder}: {error.strerror or error}"
+        self._lose(frames)
+        self._close()
+        self._retry_at = time.monotonic() + RETRY_S
+
+    def _lose(self, frames: list[bytes]) -> None:
+        with self._lock:
+            self.lost += len(frames)
+
+    def _open(self) -> None:
+        """Start the next segment with a head of its own."""
+        self._segment += 1
+        self.folder.mkdir(parents=True, exist_ok=True)  # somebody may have cleaned up behind us
+        path = self.folder / segment_name(self._segment)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        head = pack_head({**self._header, "segment": self._segment})
+        self._good = 0
+        _write_all(self._file, head)
+        self._good = len(head)
+        _sync_folder(self.folder)
+
+    def _close(self) -> None:
+        """Cut off a record that was written in part, sync, close; a segment without a whole head is removed."""
+        if self._file < 0:
+            return
+        file, self._file = self._file, -1
+        try:
+            if self._good == 0:
+                (self.folder / segment_name(self._segment)).unlink(missing_ok=True)
+            os.ftruncate(file, self._good)
+            os.fdatasync(file)
+        except OSError as error:
+            log.warning("segment %d in %s may end within a record: %s", self._segment, self.folder, error.strerror)
+        finally:
+            os.close(file)
+
+
+def _write_all(file: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(file, view) :]
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a new file's name survive a power cut, too."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    """A folder that did not exist before: a clock that was not set yet may say the same time twice."""
+    for number in range(1, 10_000):
+        folder = parent / (name if number == 1 else f"{name}-{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return folder
+    raise FileExistsError(f"{parent / name} and all its numbered successors exist")

@@ -1,0 +1,72 @@
+"""Once a second: is the loop on time, which faults are there; the watchdog is fed only while cycles go on."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from daemon.health import WINDOW_S, Fault, Vitals, assess, describe
+from daemon.notify import notify
+
+log = logging.getLogger(__name__)
+
+BEAT_S: Final = 1.0
+STATISTICS_BEATS: Final = 300
+"""Beats between two lines of statistics in the log."""
+SAID_BY_DRIVER: Final = frozenset([Fault.LIDAR_MISSING, Fault.LIDAR_REFUSED, Fault.LIDAR_BROKEN])
+"""The driver logs these itself, with the device's name."""
+
+
+class Heartbeat:
+    """Samples the vitals and keeps the faults that follow from them.
+
+    Args:
+        vitals: takes a sample, given the loop's lateness in seconds.
+        statistics: a line for the log, now and then.
+    """
+
+    def __init__(self, vitals: Callable[[float], Vitals], statistics: Callable[[], str]) -> None:
+        self.faults: tuple[Fault, ...] = ()
+        self._vitals = vitals
+        self._statistics = statistics
+        self._samples: deque[Vitals] = deque()
+        self._beats = 0
+
+    def fault(self) -> int:
+        """Number of the gravest present fault, 0 for none."""
+        return int(self.faults[0]) if self.faults else 0
+
+    async def run(self) -> None:
+        """Beat until cancelled."""
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while True:
+            due = max(due + BEAT_S, loop.time())
+            await asyncio.sleep(due - loop.time())
+            self.beat(loop.time() - due)
+
+    def beat(self, lateness: float) -> None:
+        """One beat; ``lateness``: seconds by which the loop was late for it."""
+        now = self._vitals(lateness)
+        self._samples.append(now)
+        while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
+            self._samples.popleft()
+        self._tell(assess(now, self._samples[0]))
+        if len(self._samples) < 2 or now.cycles > self._samples[-2].cycles:
+            notify("WATCHDOG=1")
+        self._beats += 1
+        if self._beats % STATISTICS_BEATS == 0:
+            log.info("%s", self._statistics())
+
+    def _tell(self, faults: tuple[Fault, ...]) -> None:
+        """Each fault is said once when it comes and once when it has gone."""
+        for fault in faults:
+            if fault not in self.faults and fault not in SAID_BY_DRIVER:
+                log.warning("%s", describe(fault))
+        for fault in self.faults:
+            if fault not in faults and fault not in SAID_BY_DRIVER:
+                log.info("over: %s", describe(fault))
+        self.faults = faults

@@ -1,0 +1,107 @@
+"""A map with a trajectory as a picture to look at: walls dark on white, the path coloured from its start to its end."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.grid import Grid
+from estimator.records import Array
+
+Pixels = npt.NDArray[np.float64]
+
+SMALLEST_SIDE: Final = 1200
+"""Cells are drawn larger until the longer side has about this many pixels."""
+
+UNKNOWN: Final = np.array((205.0, 211.0, 220.0))
+FREE: Final = np.array((255.0, 255.0, 255.0))
+WALL: Final = np.array((28.0, 34.0, 48.0))
+PATH: Final = np.array(((37, 99, 235), (16, 185, 129), (245, 158, 11), (220, 38, 38)), dtype=np.float64)
+"""Path colours from start to end: blue, green, amber, red."""
+
+START: Final = np.array((37.0, 99.0, 235.0))
+END: Final = np.array((220.0, 38.0, 38.0))
+_LINE_PX: Final = 1.2
+_DOT_PX: Final = 7.0
+_BAR_PX: Final = 3.0
+
+
+def draw(grid: Grid, path: Array) -> npt.NDArray[np.uint8]:
+    """RGB pixels (rows, columns, 3), top row first.
+
+    Args:
+        grid: the map.
+        path: (n, 2 or more) positions in the map frame in order of time, metres; n may be 0.
+    """
+    probability = grid.probability
+    if probability.size == 0:
+        return np.broadcast_to(UNKNOWN, (16, 16, 3)).astype(np.uint8)
+    scale = max(1, round(SMALLEST_SIDE / max(probability.shape)))
+    pixels = _shade(probability[::-1].repeat(scale, axis=0).repeat(scale, axis=1))
+    places = _to_pixels(grid, path, scale, len(pixels))
+    if len(places) > 0:
+        _draw_path(pixels, places)
+    _draw_bar(pixels, scale / grid.resolution)
+    return np.rint(pixels).astype(np.uint8)
+
+
+def _shade(probability: npt.NDArray[np.float32]) -> Pixels:
+    """Unknown at one half, towards free below and towards wall above."""
+    certain = 2.0 * probability[..., None].astype(np.float64) - 1.0
+    goal = np.where(certain > 0.0, WALL, FREE)
+    return np.asarray(UNKNOWN + np.abs(certain) * (goal - UNKNOWN))
+
+
+def _to_pixels(grid: Grid, path: Array, scale: int, rows: int) -> Array:
+    """Pixel coordinates (row, column) of positions."""
+    cells = (path[:, :2] - grid.origin) / grid.resolution * scale
+    return np.stack([rows - cells[:, 1], cells[:, 0]], axis=1)
+
+
+def _draw_path(pixels: Pixels, places: Array) -> None:
+    """The line, densely stamped with soft dots, and a larger dot at either end."""
+    steps = np.hypot(*np.diff(places, axis=0).T) if len(places) > 1 else np.zeros(0)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    count = max(2, int(along[-1] * 1.5))
+    wanted = np.linspace(0.0, along[-1], count)
+    dense = np.stack([np.interp(wanted, along, places[:, axis]) for axis in (0, 1)], axis=1)
+    shades = np.linspace(0.0, len(PATH) - 1.0, count)
+    colours = np.stack([np.interp(shades, np.arange(len(PATH)), PATH[:, c]) for c in range(3)], axis=1)
+    _stamp(pixels, dense, colours, _LINE_PX)
+    _stamp(pixels, places[:1], START[None], _DOT_PX)
+    _stamp(pixels, places[-1:], END[None], _DOT_PX)
+
+
+def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> None:
+    """Blend a soft-edged disc of ``radius`` pixels at each place; a pixel takes the colour of its last disc."""
+    reach = int(np.ceil(radius)) + 1
+    centre = np.floor(places).astype(np.int64)
+    rows, columns = pixels.shape[:2]
+    cover = np.zeros((rows, columns))
+    paint = np.zeros((rows, columns, 3))
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            r, c = centre[:, 0] + down, centre[:, 1] + right
+            distance = np.hypot(r + 0.5 - places[:, 0], c + 0.5 - places[:, 1])
+            strength = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+            seen = (strength > 0.0) & (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
+            np.maximum.at(cover, (r[seen], c[seen]), strength[seen])
+            paint[r[seen], c[seen]] = colours[seen]
+    pixels += cover[..., None] * (paint - pixels)
+
+
+def _draw_bar(pixels: Pixels, pixels_per_metre: float) -> None:
+    """A scale bar in the lower left corner, the longest of 1, 5, 10, 50, 100 m that takes at most a third."""
+    rows, columns = pixels.shape[:2]
+    length = next((m for m in (100, 50, 10, 5, 1) if m * pixels_per_metre <= columns / 3), 0)
+    margin = round(4 * _BAR_PX)
+    if length == 0 or rows <= 3 * margin:
+        return
+    end = margin + round(length * pixels_per_metre)
+    bottom = rows - margin
+    pixels[bottom - round(_BAR_PX) : bottom, margin:end] = WALL
+    for tick in np.linspace(margin, end - 1, (length if length <= 10 else 10) + 1):
+        column = round(float(tick))
+        pixels[bottom - round(3 * _BAR_PX) : bottom, column : column + 1] = WALL

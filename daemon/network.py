@@ -1,0 +1,148 @@
+"""The daemon's sockets: Modbus, pose datagrams, and the port that takes odometry and gyro readings.
+
+Each is a part that the supervisor keeps running, and imported only if it is configured.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from daemon.config import Config
+from daemon.cycle import Sink
+from daemon.publish.snapshot import Snapshot
+from estimator.records import Command, Order
+from hal.clock import Clock
+from hal.imu import RawImu
+from hal.odometry import RawOdometry
+
+if TYPE_CHECKING:
+    from daemon.publish.holding import Request
+    from daemon.publish.modbus import ModbusPublisher
+
+log = logging.getLogger(__name__)
+
+SILENT_S: Final = 1.0
+"""Another sender of odometry is listened to once the present one has been silent for this long."""
+
+Run = Callable[[], Awaitable[None]]
+OnOdometry = Callable[[RawOdometry], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Feeds:
+    """Who takes what comes in."""
+
+    on_odometry: OnOdometry
+    on_imu: Callable[[RawImu], None]
+    on_command: Callable[[Command], None]
+
+
+class OneSender:
+    """Lets one sender of odometry through at a time: two cumulative poses have nothing to do with each other."""
+
+    def __init__(self, on_odometry: OnOdometry) -> None:
+        self.refused = 0
+        self._on_odometry = on_odometry
+        self._sender = ""
+        self._heard = 0.0
+
+    def take(self, sender: str, reading: RawOdometry) -> None:
+        """Pass a reading on if its sender has the floor."""
+        if sender != self._sender and self._sender and reading.t_rx - self._heard <= SILENT_S:
+            self.refused += 1
+            if self.refused == 1:
+                log.warning("odometry from %s is ignored while %s sends it too", sender, self._sender)
+            return
+        self._sender, self._heard = sender, reading.t_rx
+        self._on_odometry(reading)
+
+
+class Network:
+    """Everything that listens or sends.
+
+    Attributes:
+        sinks: take every snapshot. parts: by name, for the supervisor.
+    """
+
+    def __init__(self, settings: Config, clock: Clock, feeds: Feeds) -> None:
+        self.sinks: list[Sink] = []
+        self.parts: dict[str, Run] = {}
+        self._settings = settings
+        self._clock = clock
+        self._feeds = feeds
+        self._odometry = OneSender(feeds.on_odometry)
+        self._asked: list[int] = []
+        self.modbus: ModbusPublisher | None = None
+        if settings.modbus.port:
+            self._add_modbus()
+        if settings.pose.receivers:
+            self._add_pose()
+        if settings.odometry.port:
+            self._add_inputs()
+
+    def _add_modbus(self) -> None:
+        from daemon.publish.modbus import ModbusPublisher
+
+        modbus = ModbusPublisher(
+            self._clock,
+            write=self._settings.modbus.write,
+            on_command=self._command,
+            on_odometry=self._from("Modbus"),
+        )
+        self.modbus = modbus
+        self.sinks += [modbus.publish, self._acknowledge]
+        self.parts["modbus"] = lambda: _open(
+            lambda: modbus.start(self._settings.bind, self._settings.modbus.port), modbus.close
+        )
+
+    def _add_pose(self) -> None:
+        from daemon.publish.udp import PoseSender
+
+        sender = PoseSender(self._settings.pose.receivers)
+        self.sinks.append(sender.publish)
+        self.parts["pose"] = lambda: _open(sender.start, sender.close)
+
+    def _add_inputs(self) -> None:
+        from hal.inputs import InputPort
+
+        port = InputPort(self._clock, self._settings.bind, self._settings.odometry.port)
+        on_odometry, on_imu = self._from("UDP"), self._feeds.on_imu
+        self.parts["odometry"] = lambda: port.odometry.run(on_odometry)
+        self.parts["imu"] = lambda: port.imu.run(on_imu)
+
+    def _from(self, sender: str) -> OnOdometry:
+        """A callback for one sender's readings."""
+        return lambda reading: self._odometry.take(sender, reading)
+
+    def _command(self, request: Request) -> None:
+        """An order written over Modbus; carried out by the next cycle."""
+        order = Order[request.code.name]
+        pose = np.array(request.pose) if order is Order.SET_POSE else None
+        log.info("Modbus: %s %s", order.name, request.pose if pose is not None else "")
+        self._feeds.on_command(Command(self._clock.now(), order, pose))
+        self._asked.append(request.number)
+
+    def _acknowledge(self, snapshot: Snapshot) -> None:
+        """The cycle that took the orders has published: they are done."""
+        if not self._asked or self.modbus is None or snapshot.pose is None:
+            return
+        from daemon.publish.holding import Outcome
+
+        asked, self._asked = self._asked, []
+        for number in asked:
+            self.modbus.acknowledge(number, Outcome.DONE)
+
+
+async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:
+    """A part that works by itself between its start and its close."""
+    await start()
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await close()

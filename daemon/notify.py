@@ -1,0 +1,26 @@
+"""The service manager's notification protocol (sd_notify(3)): datagrams to ``$NOTIFY_SOCKET``, nothing without it."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+
+def notify(*words: str) -> None:
+    """Tell the service manager, e.g. ``READY=1``; silently nothing when there is none or it has gone."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock:
+        try:
+            sock.sendto("\n".join(words).encode(), address.replace("@", "\0", 1))
+        except OSError:
+            return  # it restarts, or its queue is full: the next word will do
+
+
+def watchdog_s() -> float | None:
+    """Seconds within which the service manager expects ``WATCHDOG=1``; None where it does not watch us."""
+    limit, pid = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
+    if not limit.isdigit() or (pid and pid != str(os.getpid())):
+        return None
+    return int(limit) * 1e-6

@@ -1,0 +1,278 @@
+"""`lumiloop status`: read a running daemon over Modbus UDP and show it to a person or, as JSON, to a program.
+
+Standard library only, so that it starts at once on any computer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import socket
+import struct
+import sys
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from daemon.publish import registers
+from daemon.publish.points import Value
+from daemon.publish.snapshot import State
+
+if TYPE_CHECKING:
+    from daemon.config import Config
+
+OK: Final = 0
+FAILED: Final = 1
+DEFAULT_PORT: Final = 1502
+_TRIES: Final = 3
+_TIMEOUT_S: Final = 0.5
+_STALL_S: Final = 0.4  # the slowest lidar makes a snapshot every 0.15 s
+_REFRESH_S: Final = 0.5
+_REQUEST: Final = struct.Struct(">HHHBBHH")
+_ANSWER: Final = struct.Struct(">HHHBBB")
+_READ_INPUT: Final = 4
+_ANY_HOST: Final = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
+_CLEAR: Final = "\x1b[H\x1b[2J"
+
+Reading = dict[str, Value]
+
+
+class NoAnswer(Exception):
+    """The daemon cannot be read; the text says why and what to do."""
+
+
+class Reader:
+    """Reads the published block of one daemon. Use as a context manager.
+
+    Raises:
+        NoAnswer: the host's name is not known.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._where = f"{host}:{port}"
+        self._transaction = 0
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._sock = socket.socket(family, kind)
+            self._sock.connect(address)
+        except OSError as error:
+            raise NoAnswer(f"{self._where}: {error.strerror or error}; check the address") from error
+        self._sock.settimeout(_TIMEOUT_S)
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sock.close()
+
+    def read(self) -> Reading:
+        """The latest snapshot.
+
+        Raises:
+            NoAnswer: nothing there, not a lumiloop, another version.
+        """
+        for _ in range(_TRIES):
+            try:
+                answer = self._ask()
+            except TimeoutError:
+                continue
+            except OSError as error:
+                raise NoAnswer(
+                    f"{self._where}: {error.strerror}; nothing serves Modbus there: start `lumiloop run`, or name the "
+                    "right HOST:PORT"
+                ) from error
+            return self._reading(answer)
+        raise NoAnswer(
+            f"{self._where}: no answer within {_TRIES * _TIMEOUT_S:g} s; check that the daemon runs, that its `bind` "
+            "is not the loopback address of another computer, and that no firewall drops UDP"
+        )
+
+    def _ask(self) -> bytes:
+        self._transaction = self._transaction % 0xFFFF + 1
+        self._sock.send(_REQUEST.pack(self._transaction, 0, 6, 1, _READ_INPUT, 0, registers.BLOCK_WORDS))
+        deadline = time.monotonic() + _TIMEOUT_S
+        while time.monotonic() < deadline:
+            answer = self._sock.recv(512)
+            if answer[:2] == self._transaction.to_bytes(2, "big"):
+                return answer  # an answer to an earlier, repeated request is skipped
+        raise TimeoutError
+
+    def _reading(self, answer: bytes) -> Reading:
+        if len(answer) == _ANSWER.size and answer[7] & 0x80:
+            raise NoAnswer(f"{self._where}: Modbus exception {answer[8]}; that is another kind of device")
+        try:
+            return registers.decode_block(answer[_ANSWER.size :])
+        except ValueError as error:
+            raise NoAnswer(f"{self._where}: {error}") from error
+
+
+def main(args: argparse.Namespace) -> int:
+    """Body of the command; `args` has address, json, watch, and settings (:class:`daemon.config.Config`)."""
+    try:
+        host, port = address_of(args.address, args.settings)
+        with Reader(host, port) as reader:
+            return _watch(reader, args.json) if args.watch else _once(reader, args.json)
+    except NoAnswer as error:
+        sys.stderr.write(f"lumiloop: {error}\n")
+        return FAILED
+
+
+def address_of(text: str | None, settings: Config | None) -> tuple[str, int]:
+    """Host and port to read: as named, else where the configuration says that the daemon listens.
+
+    Raises:
+        NoAnswer: not an address.
+    """
+    if not text:
+        host, port = (settings.bind, settings.modbus.port) if settings is not None else ("127.0.0.1", DEFAULT_PORT)
+        if port == 0:
+            raise NoAnswer("the configuration switches Modbus off (modbus.port is 0); name HOST:PORT")
+        return _ANY_HOST.get(host, host), port
+    host, colon, port_text = text.rpartition(":")
+    if text.startswith("[") and text.endswith("]"):
+        return text[1:-1], DEFAULT_PORT
+    if not colon or (":" in host and not host.startswith("[")):
+        return text, DEFAULT_PORT
+    if not (port_text.isascii() and port_text.isdigit() and 0 < int(port_text) < 1 << 16):
+        raise NoAnswer(f"{text}: {port_text!r} is not a port; write HOST or HOST:PORT, as in 192.168.0.10:1502")
+    return host.strip("[]") or "127.0.0.1", int(port_text)
+
+
+def _once(reader: Reader, as_json: bool) -> int:
+    first = reader.read()
+    time.sleep(_STALL_S)
+    reading = reader.read()
+    _show(reading, as_json, stalled=reading["seq"] == first["seq"])
+    return OK
+
+
+def _watch(reader: Reader, as_json: bool) -> int:
+    before: Value = None
+    while True:
+        try:
+            reading = reader.read()
+        except NoAnswer as error:
+            sys.stderr.write(f"lumiloop: {error}\n")
+            before = None
+        else:
+            if sys.stdout.isatty() and not as_json:
+                sys.stdout.write(_CLEAR)
+            _show(reading, as_json, stalled=reading["seq"] == before)
+            before = reading["seq"]
+        time.sleep(_REFRESH_S)
+
+
+def _show(reading: Reading, as_json: bool, stalled: bool) -> None:
+    text = json.dumps(as_object(reading, stalled)) if as_json else as_table(reading, stalled)
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
+    """The reading with its codes and bits spelled out."""
+    spelled = {
+        "state": _state(reading["state"]),
+        "reason_text": _meaning("reason", reading["reason"]),
+        "fault_text": _meaning("fault", reading["fault"]),
+        "flags": registers.decode_bits(registers.FLAGS, reading["flags"]),
+        "devices": registers.decode_bits(registers.DEVICES, reading["devices"]),
+        "stalled": stalled,
+    }
+    return {**reading, **spelled}
+
+
+def as_table(reading: Reading, stalled: bool) -> str:
+    """The reading for a person: one line a subject."""
+    flags = registers.decode_bits(registers.FLAGS, reading["flags"])
+    rows = [
+        ("state", _state(reading["state"]) + ("  (STANDS STILL: no new snapshot)" if stalled else "")),
+        ("reason", _meaning("reason", reading["reason"])),
+        ("fault", _meaning("fault", reading["fault"])),
+        ("map pose", _pose(reading, "map") + _unknown_axes(flags)),
+        ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
+        ("odom pose", _pose(reading, "odom")),
+        ("speed", _triple(reading, ("v_x", "v_y", "yaw_rate"), "m/s", "/s")),
+        ("age", _number(reading["age"], "s")),
+        ("map", f"id {reading['map_id']}, {reading['jumps']} jumps"),
+        ("loops", _loops(reading)),
+        ("lights", _lights(reading)),
+        ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
+        ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget"),
+        ("devices", _devices(reading["devices"])),
+        ("snapshot", f"{reading['seq']}, {_date(reading['t_utc'])}"),
+    ]
+    return "\n".join(f"{label:<10} {text}" for label, text in rows)
+
+
+def _state(number: Value) -> str:
+    try:
+        return State(int(number or 0)).name
+    except ValueError:
+        return f"unknown to this reader ({number})"
+
+
+def _meaning(subject: str, number: Value) -> str:
+    """What a reason or fault number means and what to do; the tables are loaded only when there is one to explain."""
+    if not number:
+        return "none"
+    from daemon.health import FAULTS
+    from daemon.state import REASONS
+
+    meanings: Mapping[Any, tuple[str, str]] = REASONS if subject == "reason" else FAULTS
+    text, remedy = meanings.get(int(number), ("unknown to this reader", "use the daemon's own version of this command"))
+    return f"{number}: {text}" + (f" ({remedy})" if remedy else "")
+
+
+def _number(value: Value, unit: str, digits: int = 4) -> str:
+    return "not known" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def _angle(value: Value) -> str:
+    return "not known" if value is None else f"{math.degrees(value):.2f} deg"
+
+
+def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) -> str:
+    x, y, yaw = (reading[name] for name in names)
+    if x is None and y is None and yaw is None:
+        return "not known"
+    return f"{_number(x, unit)}, {_number(y, unit)}, {_angle(yaw)}{per}"
+
+
+def _lights(reading: Reading) -> str:
+    if reading["links"] is None:
+        return "no photodiode configured"
+    return f"{reading['links']} in view" + (
+        f", strongest {light}" if (light := reading["light_id"]) is not None else ""
+    )
+
+
+def _pose(reading: Reading, frame: str) -> str:
+    if reading[f"{frame}_x"] is None:
+        return "not known"
+    x, y, yaw = (reading[f"{frame}_{axis}"] for axis in ("x", "y", "yaw"))
+    return f"x {_number(x, 'm')}, y {_number(y, 'm')}, yaw {_angle(yaw)}"
+
+
+def _unknown_axes(flags: dict[str, bool]) -> str:
+    missing = [axis for axis in ("x", "y", "yaw") if not flags[f"{axis}_known"]]
+    return f"  (not observed: {', '.join(missing)})" if flags["pose_valid"] and missing else ""
+
+
+def _loops(reading: Reading) -> str:
+    if reading["loop_new"] is None:
+        return f"{reading['loop_counter']}"
+    return f"{reading['loop_counter']}, latest: keyframe {reading['loop_new']} to {reading['loop_old']}"
+
+
+def _devices(word: Value) -> str:
+    bits = registers.decode_bits(registers.DEVICES, word)
+    names = ("lidar", "adc", "odometry")
+    fitted = [f"{name} {'ok' if bits[f'{name}_ok'] else 'NOT OK'}" for name in names if bits[f"{name}_fitted"]]
+    return ", ".join(fitted) or "none configured"
+
+
+def _date(t_utc: Value) -> str:
+    if not t_utc:
+        return "no time"
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t_utc))

@@ -1,0 +1,223 @@
+"""Recording a run: every byte from and to the devices, every input, every decision of every cycle.
+
+The loop thread only appends to a list; one thread (`daemon/disk.py`) writes what is ready. What is kept is all it takes
+to repeat the run exactly: the same bytes go through the same codec, and each cycle consumes what it consumed, under the
+same caps. The published pose is kept too, so that a replay can say whether it is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from daemon.config import Config
+from daemon.cycle import CycleRecord
+from daemon.disk import SegmentWriter
+from daemon.versions import versions
+from estimator.records import Array, Command, Limits, Order
+from hal.clock import Clock
+from hal.errors import HalError
+from hal.imu import RawImu
+from hal.lidar import RawScan
+from hal.odometry import RawOdometry
+from hal.port import OnData, OnLost, Port, PortOpener
+from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_scan
+
+LIDAR: Final = 0
+"""Channel of the lidar's bytes."""
+
+Pose = tuple[float, float, float]
+
+
+class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
+    """A command as a cycle consumed it."""
+
+    t_begin: float
+    order: str
+    pose: Pose | None
+
+
+class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
+    """A cycle as it is recorded; see `daemon.cycle.CycleRecord`. Fields are only ever added at the end.
+
+    Attributes:
+        limits: (ICP iterations, points, whether the map may be updated), None where nothing was stepped.
+        odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
+    """
+
+    cycle: int
+    scan: int | None
+    dropped: tuple[int, ...]
+    odometry: int
+    imu: int
+    commands: tuple[CommandEntry, ...]
+    limits: tuple[int, int, bool] | None
+    answers: tuple[int, ...]
+    state: int
+    odom: Pose | None = None
+    map_odom: Pose | None = None
+
+    def caps(self) -> Limits | None:
+        """The step's caps as the estimator takes them."""
+        return None if self.limits is None else Limits(*self.limits)
+
+    def orders(self) -> list[Command]:
+        """The commands as the estimator takes them."""
+        return [
+            Command(entry.t_begin, Order(entry.order), None if entry.pose is None else np.array(entry.pose))
+            for entry in self.commands
+        ]
+
+
+_encode: Final = msgspec.msgpack.Encoder().encode
+_decode: Final = msgspec.msgpack.Decoder(CycleEntry).decode
+
+
+def decode_cycle(payload: bytes) -> CycleEntry:
+    """The cycle in a CYCLE record; raises `msgspec.DecodeError` for anything else."""
+    return _decode(payload)
+
+
+def _pose(T: Array | None) -> Pose | None:
+    return None if T is None else (float(T[0]), float(T[1]), float(T[2]))
+
+
+def _entry(record: CycleRecord) -> CycleEntry:
+    limits, result = record.limits, record.result
+    return CycleEntry(
+        cycle=record.cycle,
+        scan=record.scan,
+        dropped=record.dropped,
+        odometry=record.odometry,
+        imu=record.imu,
+        commands=tuple(CommandEntry(c.t_begin, c.order.value, _pose(c.T_map_base)) for c in record.commands),
+        limits=None if limits is None else (limits.icp_iterations, limits.points, limits.update_map),
+        answers=record.answers,
+        state=int(record.snapshot.state),
+        odom=None if result is None else _pose(result.T_odom_base),
+        map_odom=None if result is None else _pose(result.T_map_odom),
+    )
+
+
+class Recorder:
+    """Taps a running daemon. Every method returns at once and never raises for what a disk can do.
+
+    Hand :meth:`tap` to the driver as its port opener, :meth:`on_scan`, :meth:`on_odometry` and :meth:`on_imu` to the
+    sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
+    """
+
+    def __init__(self, folder: Path, config: Config, clock: Clock) -> None:
+        """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
+
+        Raises:
+            DeviceRefused: the folder cannot be made or written.
+        """
+        started = datetime.fromtimestamp(clock.utc(), UTC)
+        header: dict[str, Any] = {
+            "recording": f"{started:%Y-%m-%dT%H-%M-%S.%f}",
+            "t_mono": clock.now(),
+            "t_utc": clock.utc(),
+            "versions": versions(),
+            "config": msgspec.to_builtins(config),
+        }
+        self._clock = clock
+        self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header)
+
+    @property
+    def error(self) -> str:
+        """Why nothing is being written at the moment; empty while all is well."""
+        return self.disk.error
+
+    def close(self) -> None:
+        """Write and sync what is left; idempotent."""
+        self.disk.close()
+
+    def on_cycle(self, record: CycleRecord) -> None:
+        """Keep a cycle's decisions (`daemon.cycle.Tap`)."""
+        self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
+
+    def on_scan(self, then: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
+        """A scan callback that marks the scan and passes it on."""
+
+        def mark(scan: RawScan) -> None:
+            self.disk.put(Kind.SCAN, LIDAR, scan.t_rx, pack_scan(scan))
+            then(scan)
+
+        return mark
+
+    def on_odometry(self, then: Callable[[RawOdometry], None]) -> Callable[[RawOdometry], None]:
+        """An odometry callback that keeps the reading and passes it on."""
+
+        def keep(reading: RawOdometry) -> None:
+            self.disk.put(Kind.ODOMETRY, 0, reading.t_rx, pack_odometry(reading))
+            then(reading)
+
+        return keep
+
+    def on_imu(self, then: Callable[[RawImu], None]) -> Callable[[RawImu], None]:
+        """A gyro callback that keeps the reading and passes it on."""
+
+        def keep(reading: RawImu) -> None:
+            self.disk.put(Kind.IMU, 0, reading.t_rx, pack_imu(reading))
+            then(reading)
+
+        return keep
+
+    def tap(self, opener: PortOpener, channel: int = LIDAR) -> PortOpener:
+        """A port opener whose ports keep what passes through them."""
+
+        async def open_tapped(device: str, baud: int) -> Port:
+            port = await opener(device, baud)
+            self.disk.put(Kind.OPEN, channel, self._clock.now(), f"{port.name} {baud}".encode())
+            return _TappedPort(port, self.disk, self._clock, channel)
+
+        return open_tapped
+
+
+class _TappedPort:
+    """A port that keeps everything that passes through it (`hal.port.Port`)."""
+
+    def __init__(self, port: Port, disk: SegmentWriter, clock: Clock, channel: int) -> None:
+        self._port = port
+        self._disk = disk
+        self._clock = clock
+        self._channel = channel
+
+    @property
+    def name(self) -> str:
+        """The port as the user named it."""
+        return self._port.name
+
+    def start(self, on_data: OnData, on_lost: OnLost) -> None:
+        """Begin delivering; bytes are kept before anybody else sees them."""
+        put, channel = self._disk.put, self._channel
+
+        def keep(data: bytes, t_rx: float) -> None:
+            put(Kind.RX, channel, t_rx, data)
+            on_data(data, t_rx)
+
+        def lose(error: HalError) -> None:
+            put(Kind.LOST, channel, self._clock.now(), str(error).encode())
+            on_lost(error)
+
+        self._port.start(keep, lose)
+
+    def write(self, data: bytes) -> None:
+        """Send a short command; it is kept once the port has taken it."""
+        self._port.write(data)
+        self._disk.put(Kind.TX, self._channel, self._clock.now(), data)
+
+    def set_baud(self, baud: int) -> None:
+        """Change the line rate."""
+        self._port.set_baud(baud)
+        self._disk.put(Kind.BAUD, self._channel, self._clock.now(), str(baud).encode())
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+        self._disk.put(Kind.LOST, self._channel, self._clock.now(), b"closed")

@@ -1,0 +1,247 @@
+"""`lumiloop replay LOG --out DIR`: a log through the daemon's own pipeline, as fast as it goes, results as files.
+
+Two replays of one log write identical bytes; what was measured with a watch stands apart, in ``timing.json``. Whatever
+stops a replay early, an unreadable part of the log or a person, what has been computed until then is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from daemon import cli
+from daemon.config import Config, Mount
+from daemon.ledger import Ledger
+from daemon.rerun import Rerun
+from daemon.results import Folder, OutputRefused, tum, write_map
+from daemon.sources import Source, open_log, sha256_of
+from daemon.versions import versions
+from estimator.grid import Grid
+from hal.errors import HalError
+
+PROGRESS_S: Final = 1.0
+LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a run over a log has come to; ``stopped`` says why it ended before the log did, empty otherwise."""
+
+    source: Source
+    config: Config
+    rerun: Rerun
+    seconds: dict[str, float] = field(default_factory=dict)
+    stopped: str = ""
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    return command(args, _write_all)
+
+
+def command(args: argparse.Namespace, write: Callable[[Folder, Outcome], None]) -> int:
+    """Replay ``args.log``, let ``write`` put results into ``args.out``, and say how it went; returns the exit code."""
+    try:
+        folder = Folder(args.out)
+        outcome = replay(args.log, args.settings, given=args.config is not None or bool(args.set))
+        write(folder, outcome)
+    except (HalError, OutputRefused) as error:
+        return cli.fail(str(error))
+    if outcome.stopped:
+        return cli.fail(f"{outcome.stopped}; what was computed until then is in {folder.path}", _code(outcome))
+    return _verdict(outcome)
+
+
+def replay(path: Path, config: Config, given: bool) -> Outcome:
+    """Run a log through the pipeline.
+
+    Args:
+        path: the log.
+        config: resolved configuration.
+        given: it was given by a person; otherwise a log that knows its own (lidar mount, or all of it) counts.
+
+    Raises:
+        HalError: the log cannot be opened; what goes wrong later ends the run and is said in `Outcome.stopped`.
+    """
+    begun = time.perf_counter()
+    source = open_log(path)
+    used = config_for(source, config, given)
+    outcome = Outcome(source, used, Rerun(source, used))
+    outcome.seconds["read"] = time.perf_counter() - begun
+    begun = time.perf_counter()
+    try:
+        _play(outcome.rerun, source)
+    except HalError as error:
+        outcome.stopped = str(error)
+    except KeyboardInterrupt:
+        outcome.stopped = "interrupted"
+    outcome.rerun.finish()
+    outcome.seconds["run"] = time.perf_counter() - begun
+    return outcome
+
+
+def config_for(source: Source, config: Config, given: bool) -> Config:
+    """The configuration that counts: the person's, else the recording's, with the log's mount where none was given.
+
+    Raises:
+        HalError: a recording made with keys that this version does not have.
+    """
+    if source.recorded and not given:
+        try:
+            return msgspec.convert(source.header.get("config"), Config)
+        except msgspec.ValidationError:
+            source.report.notes.append("the recording's configuration is of another version: the built-in one is used")
+    if source.mount is None or config.lidar.mount != Mount():
+        return config
+    x, y, yaw = source.mount
+    lidar = msgspec.structs.replace(config.lidar, mount=Mount(x=x, y=y, yaw=math.degrees(yaw)))
+    return msgspec.structs.replace(config, lidar=lidar)
+
+
+def _play(rerun: Rerun, source: Source) -> None:
+    begun = shown = time.perf_counter()
+    for event in source.events():
+        rerun.feed(event)
+        now = time.perf_counter()
+        if now - shown >= PROGRESS_S:
+            shown = now
+            speed = (rerun.t_mono - rerun.t_first) / (now - begun)
+            part = 100 * source.done // max(1, source.total)
+            _say(f"replay: {part} %, {len(rerun.ledger.rows)} scans, {speed:.0f} x real time")
+
+
+def _say(text: str) -> None:
+    """One line on stderr: overwritten on a terminal, one below the other elsewhere."""
+    sys.stderr.write(f"\r\x1b[K{text}" if sys.stderr.isatty() else f"{text}\n")
+    sys.stderr.flush()
+
+
+def _code(outcome: Outcome) -> int:
+    return cli.INTERRUPTED if outcome.stopped == "interrupted" else cli.FAILED
+
+
+def _verdict(outcome: Outcome) -> int:
+    """Last words on stderr, and the exit code: a replay without a pose has failed."""
+    source, rerun = outcome.source, outcome.rerun
+    if sys.stderr.isatty():
+        sys.stderr.write("\r\x1b[K")
+    for sentence in source.report.sentences():
+        sys.stderr.write(f"replay: {source.path}: {sentence}\n")
+    if not rerun.ledger.rows:
+        return cli.fail(f"{source.path}: {source.kind} without a scan that gave a pose")
+    if rerun.comparison.differ:
+        first = rerun.comparison.first
+        sys.stderr.write(f"replay: {rerun.comparison.differ} cycles differ from the recorded run; {first}\n")
+    log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
+    speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
+    sys.stderr.write(f"replay: {len(rerun.ledger.rows)} poses, {speed}\n")
+    return cli.OK
+
+
+def _write_all(folder: Folder, outcome: Outcome) -> None:
+    """Every result; each file is written whole or not at all."""
+    begun = time.perf_counter()
+    ledger = outcome.rerun.ledger
+    final = ledger.final()
+    folder.write("trajectory.tum", tum(final))
+    folder.write("online.tum", tum(ledger.online()))
+    folder.write("loops.csv", _loops(ledger))
+    grid = outcome.rerun.render()
+    write_map(folder, grid, final.poses)
+    folder.write("summary.json", _json(summary(outcome, grid)))
+    outcome.seconds["write"] = time.perf_counter() - begun
+    folder.write("timing.json", _json(timing(outcome)))
+
+
+def _loops(ledger: Ledger) -> bytes:
+    lines = [
+        f"{stamp:.6f},{loop.counter},{loop.keyframe_new},{loop.keyframe_old},{loop.residual_m:.6f}\n"
+        for stamp, loop in ledger.loops
+    ]
+    return (LOOPS_HEAD + "".join(lines)).encode()
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    return (json.dumps(content, indent=2, sort_keys=True) + "\n").encode()
+
+
+def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
+    """Everything about a replay that is the same each time."""
+    source, rerun, ledger = outcome.source, outcome.rerun, outcome.rerun.ledger
+    step_m, step_rad, step_at = ledger.largest_step()
+    driven_m, turned_rad = ledger.way()
+    rows, columns = grid.log_odds.shape
+    return {
+        "log": {
+            "name": source.path.name,
+            "kind": source.kind,
+            "sha256": sha256_of(source),
+            "seconds": rerun.t_mono - rerun.t_first if ledger.cycles else 0.0,
+            "report": source.report.as_dict(),
+            "lidar": {"missed": source.status.missed, "invalid": source.status.invalid},
+            "recorded_versions": source.header.get("versions"),
+        },
+        "complete": not outcome.stopped,
+        "stopped": outcome.stopped,
+        "counts": {
+            "scans": source.status.scans,
+            "poses": len(ledger.rows),
+            "cycles": ledger.cycles,
+            "dropped": ledger.dropped,
+            "odometry": rerun.readings,
+            "keyframes": ledger.keyframes,
+            "matched": ledger.matched,
+            "outcomes": dict(ledger.outcomes),
+            "states": dict(ledger.states),
+            "loops": len(ledger.loops),
+        },
+        "motion": {
+            "driven_m": driven_m,
+            "turned_rad": turned_rad,
+            "odometry_m": rerun.odometry_m,
+            "T_odom_base_largest_step_m": step_m,
+            "T_odom_base_largest_step_stamp": step_at,
+            "T_odom_base_largest_turn_rad": step_rad,
+            "match_largest_correction_m": ledger.corrected_m,
+            "match_largest_correction_rad": ledger.corrected_rad,
+            "T_map_odom_jumps": ledger.jumps,
+        },
+        "map": {"resolution_m": grid.resolution, "columns": columns, "rows": rows},
+        "recorded_run": _recorded(outcome),
+        "config": msgspec.to_builtins(outcome.config),
+        "versions": versions(),
+    }
+
+
+def _recorded(outcome: Outcome) -> dict[str, Any] | None:
+    """How a recording's replay compares with what was recorded; None for other logs."""
+    compared = outcome.rerun.comparison
+    if not outcome.source.recorded:
+        return None
+    return {"cycles": compared.cycles, "differ": compared.differ, "first_difference": compared.first}
+
+
+def timing(outcome: Outcome) -> dict[str, Any]:
+    """What was measured with a watch."""
+    rerun, run_s = outcome.rerun, outcome.seconds["run"]
+    cycles = sorted(rerun.timing.cycles) or [0.0]
+    log_s = rerun.t_mono - rerun.t_first if rerun.timing.cycles else 0.0
+    return {
+        "seconds": {name: round(value, 4) for name, value in outcome.seconds.items()},
+        "log_seconds": log_s,
+        "times_real_time": log_s / run_s if run_s > 0.0 else 0.0,
+        "cycle_us": {
+            str(p): round(1e6 * cycles[min(len(cycles) - 1, int(len(cycles) * p / 100))]) for p in (50, 90, 99)
+        },
+        "step_us_mean": round(1e6 * rerun.timing.steps / len(cycles)),
+        "cycle_us_mean": round(1e6 * sum(cycles) / len(cycles)),
+    }

@@ -1,0 +1,206 @@
+"""Drives the daemon's own cycle with a log's events on a virtual clock, as fast as it can, and keeps what comes out."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Final
+
+from daemon.bridge import ScanBridge
+from daemon.budget import FixedBudget
+from daemon.config import Config
+from daemon.cycle import Cycle, CycleRecord, Parts
+from daemon.ledger import Ledger
+from daemon.record import CycleEntry
+from daemon.sources import Event, Source, Turn
+from daemon.worker import CycleWorker, ScheduledWorker
+from estimator import pipeline
+from estimator.grid import Grid
+from estimator.records import UNLIMITED, Limits, Order, Record
+from estimator.result import StepResult
+from hal.lidar import RawScan
+from hal.odometry import RawOdometry
+
+RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
+"""Metres per cell of an exported map: the finest that the map's extent allows."""
+
+
+class ReplayClock:
+    """A clock that stands where the replay puts it (`hal.clock.Clock`)."""
+
+    def __init__(self) -> None:
+        self.t_mono = 0.0
+
+    def now(self) -> float:
+        """Seconds of the log's monotone time."""
+        return self.t_mono
+
+    def utc(self) -> float:
+        """The same: a replay has no calendar."""
+        return self.t_mono
+
+
+class ReplayBudget(FixedBudget):
+    """No caps for a log of others; for a recording the caps of the cycle that is being repeated."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = UNLIMITED
+
+    def limits(self, budget_us: float) -> Limits:
+        """The caps in force."""
+        return self.now
+
+
+@dataclass(slots=True)
+class Comparison:
+    """A recording's own poses against those of its replay.
+
+    Attributes:
+        cycles: compared. differ: whose pose or inputs are not the same to the last bit. first: says how the first did.
+    """
+
+    cycles: int = 0
+    differ: int = 0
+    first: str = ""
+
+    def note(self, cycle: int, how: str) -> None:
+        """Count one cycle that is not the recorded one."""
+        self.differ += 1
+        self.first = self.first or f"cycle {cycle}: {how}"
+
+
+@dataclass(slots=True)
+class Timing:
+    """Measured seconds; the only thing about a replay that is not repeatable."""
+
+    cycles: list[float] = field(default_factory=list)
+    steps: float = 0.0
+
+
+class Rerun:
+    """One log through one fresh daemon cycle: feed it every event, then ask for the results."""
+
+    def __init__(self, source: Source, config: Config) -> None:
+        self.ledger = Ledger()
+        self.comparison = Comparison()
+        self.timing = Timing()
+        self.odometry_m = 0.0
+        self.readings = 0
+        self.t_first = math.inf
+        self._source = source
+        self._clock = ReplayClock()
+        self._state = pipeline.new_state(pipeline.Settings(history=True))
+        self._caps = ReplayBudget()
+        self._answers: dict[int, tuple[int, ...]] = {}
+        self._scan: tuple[float, float] = (0.0, 0.0)
+        self._odometry: RawOdometry | None = None
+        self._kept: list[CycleRecord] = []
+        self.cycle: Final = Cycle(self._parts(config))
+
+    def _parts(self, config: Config) -> Parts:
+        recorded = self._source.recorded
+        return Parts(
+            clock=self._clock,
+            step=self._step,
+            scans=ScanBridge(config.lidar),
+            budget=self._caps,
+            worker=ScheduledWorker(self._answers) if recorded else CycleWorker(),
+            status=self._source.status,
+            odometry=config.odometry.port > 0,
+            budget_us=1e3 * config.cycle.budget_ms,
+            tap=self._keep,
+        )
+
+    @property
+    def t_mono(self) -> float:
+        """Where the log's clock stands."""
+        return self._clock.t_mono
+
+    def feed(self, event: Event) -> None:
+        """Take one event; runs a cycle where one is due."""
+        if isinstance(event, Turn):
+            self._repeat(event)
+            return
+        self._arrive(event.t_rx)
+        if isinstance(event, RawScan):
+            self._scan = (self._source.stamp(event), event.t_mono)
+            self.cycle.inbox.put_scan(event)
+            if not self._source.recorded:
+                self._run()
+        elif isinstance(event, RawOdometry):
+            self._count(event)
+            self.cycle.inbox.put_odometry(event)
+        else:
+            self.cycle.inbox.put_imu(event)
+
+    def finish(self) -> None:
+        """The log has ended: poses take the places their anchors have now."""
+        self.ledger.settle(pipeline.keyframe_poses(self._state))
+
+    def render(self) -> Grid:
+        """The map at the finest resolution of :data:`RESOLUTIONS_M` that its extent allows."""
+        for resolution in RESOLUTIONS_M[:-1]:
+            try:
+                return pipeline.render_map(self._state, resolution)
+            except ValueError:
+                continue
+        return pipeline.render_map(self._state, RESOLUTIONS_M[-1])
+
+    def _arrive(self, t_rx: float) -> None:
+        self._clock.t_mono = max(self._clock.t_mono, t_rx)
+        self.t_first = min(self.t_first, self._clock.t_mono)
+
+    def _count(self, reading: RawOdometry) -> None:
+        if self._odometry is not None:
+            way = math.hypot(reading.x - self._odometry.x, reading.y - self._odometry.y)
+            self.odometry_m += way if math.isfinite(way) else 0.0
+        self._odometry = reading
+        self.readings += 1
+
+    def _repeat(self, turn: Turn) -> None:
+        """Run a recorded cycle: at its time, with its commands, caps and answers; then compare."""
+        entry = turn.entry
+        self._clock.t_mono = turn.t_mono
+        self.t_first = min(self.t_first, turn.t_mono)
+        for command in entry.orders():
+            self.cycle.inbox.put_command(command)
+        self._caps.now = entry.caps() or UNLIMITED
+        self._answers[self.cycle.cycles + 1] = entry.answers
+        try:
+            record = self._run()
+        except LookupError as error:
+            self.comparison.note(entry.cycle, str(error))
+        else:
+            self._compare(entry, record)
+
+    def _compare(self, entry: CycleEntry, record: CycleRecord) -> None:
+        result = record.result
+        pose = None if result is None else (tuple(result.T_odom_base.tolist()), tuple(result.T_map_odom.tolist()))
+        recorded = None if entry.odom is None else (entry.odom, entry.map_odom)
+        self.comparison.cycles += 1
+        if (entry.scan, entry.dropped) != (record.scan, record.dropped):
+            self.comparison.note(entry.cycle, f"took scan {record.scan}, recorded is {entry.scan}")
+        elif entry.caps() != record.limits:
+            self.comparison.note(entry.cycle, "stepped where the recorded cycle did not, or the other way round")
+        elif pose != recorded:
+            self.comparison.note(entry.cycle, f"T_odom_base, T_map_odom are {pose}, recorded are {recorded}")
+
+    def _run(self) -> CycleRecord:
+        begun = time.perf_counter()
+        self.cycle.run()
+        self.timing.cycles.append(time.perf_counter() - begun)
+        return self._kept.pop()
+
+    def _step(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
+        if any(getattr(record, "order", None) is Order.RESET for record in records):
+            self.ledger.settle(pipeline.keyframe_poses(self._state))
+        begun = time.perf_counter()
+        result = pipeline.step(self._state, records, limits)
+        self.timing.steps += time.perf_counter() - begun
+        return result
+
+    def _keep(self, record: CycleRecord) -> None:
+        self._kept.append(record)
+        self.ledger.take(record, *self._scan)

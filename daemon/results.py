@@ -1,0 +1,126 @@
+"""Results as files that other tools read: trajectories (TUM), grid maps (map_server), a picture.
+
+Each file appears whole or not at all: it is written beside its place and moved there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from daemon.mapimage import draw
+from daemon.png import encode_png
+from estimator.grid import Grid
+from estimator.records import Array
+
+OCCUPIED: Final = 0.65
+FREE: Final = 0.196
+"""map_server's trinary thresholds; 205 reads as 0.19608, just above FREE, so that unknown stays unknown."""
+
+_PROBE: Final = ".lumiloop-probe"
+_UNKNOWN_GREY: Final = 205
+_FREE_GREY: Final = 254
+_WALL_GREY: Final = 0
+_TUM_HEAD: Final = "# timestamp x y z qx qy qz qw\n"
+
+
+class OutputRefused(Exception):
+    """A result cannot be written; the text names the file or folder, why, and what to do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Stamps in seconds (n,) and poses (x, y, yaw) (n, 3)."""
+
+    stamps: Array
+    poses: Array
+
+
+class Folder:
+    """Where results go; made and tried before any work is done for them."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the folder if it is not there.
+
+        Raises:
+            OutputRefused: it is a file, may not be written, or has no room.
+        """
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise OutputRefused(f"{path} is a file; name a folder for the results") from error
+        except OSError as error:
+            raise OutputRefused(f"cannot make {path}: {error.strerror}; name a folder that you may write") from error
+        self.write(_PROBE, b"may be written")
+        (path / _PROBE).unlink()
+
+    def write(self, name: str, data: bytes) -> None:
+        """Put one file in place.
+
+        Raises:
+            OutputRefused: no room, no permission; what was there before stays.
+        """
+        final, beside = self.path / name, self.path / f".{name}.part"
+        try:
+            beside.write_bytes(data)
+            beside.replace(final)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                beside.unlink(missing_ok=True)
+            raise OutputRefused(f"cannot write {final}: {error.strerror}; free space or name another folder") from error
+
+
+def tum(trajectory: Trajectory) -> bytes:
+    """TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp (equal stamps in their given order)."""
+    order = np.argsort(trajectory.stamps, kind="stable")
+    stamps, poses = trajectory.stamps[order].tolist(), trajectory.poses[order]
+    half = 0.5 * poses[:, 2]
+    columns = (stamps, poses[:, 0].tolist(), poses[:, 1].tolist(), np.sin(half).tolist(), np.cos(half).tolist())
+    lines = [f"{t:.6f} {x:.6f} {y:.6f} 0 0 0 {s:.9f} {c:.9f}\n" for t, x, y, s, c in zip(*columns, strict=True)]
+    return (_TUM_HEAD + "".join(lines)).encode()
+
+
+def greys(grid: Grid) -> npt.NDArray[np.uint8]:
+    """Trinary pixels of a map, top row (largest y) first: 0 occupied, 254 free, 205 unknown."""
+    probability = grid.probability[::-1]
+    pixels = np.full(probability.shape, _UNKNOWN_GREY, np.uint8)
+    pixels[probability > OCCUPIED] = _WALL_GREY
+    pixels[probability < FREE] = _FREE_GREY
+    return pixels
+
+
+def pgm(grid: Grid) -> bytes:
+    """Binary PGM of a map as map_server reads it; an empty map is one unknown cell."""
+    pixels = greys(grid)
+    if pixels.size == 0:
+        pixels = np.full((1, 1), _UNKNOWN_GREY, np.uint8)
+    rows, columns = pixels.shape
+    return f"P5\n{columns} {rows}\n255\n".encode() + pixels.tobytes()
+
+
+def map_yaml(grid: Grid, image: str) -> bytes:
+    """map_server's description: image by relative path, origin the lower left corner of the lower left pixel."""
+    x, y = (float(value) + 0.0 for value in grid.origin)
+    lines = (
+        f"image: {image}",
+        "mode: trinary",
+        f"resolution: {grid.resolution:.6g}",
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
+        "negate: 0",
+        f"occupied_thresh: {OCCUPIED}",
+        f"free_thresh: {FREE}",
+    )
+    return ("\n".join(lines) + "\n").encode()
+
+
+def write_map(folder: Folder, grid: Grid, path: Array) -> None:
+    """Write map.pgm, map.yaml and map.png (with ``path``, positions (n, 2 or more) in m); raises `OutputRefused`."""
+    folder.write("map.pgm", pgm(grid))
+    folder.write("map.yaml", map_yaml(grid, "map.pgm"))
+    folder.write("map.png", encode_png(draw(grid, path)))

@@ -1,0 +1,77 @@
+"""Keeps the daemon's parts running: a part that fails is restarted with back-off; its loss and return are said once."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from random import Random
+from typing import Final
+
+from hal.errors import HalError
+
+log = logging.getLogger(__name__)
+
+FIRST_S: Final = 0.5
+LONGEST_S: Final = 30.0
+STEADY_S: Final = 60.0
+"""A part that ran for this long is taken to be well: its next failure starts the back-off anew."""
+
+
+@dataclass(slots=True)
+class Supervisor:
+    """Runs parts; knows which are down.
+
+    Attributes:
+        failed: names of the parts that are down right now. restarts: failures so far.
+        random: of the jitter, which keeps several parts from knocking in step.
+    """
+
+    failed: set[str] = field(default_factory=set)
+    restarts: int = 0
+    random: Random = field(default_factory=Random)
+
+    async def keep(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
+        """Run a part for ever. Returns if it ends by itself (a log's end); a cancelled one is not restarted.
+
+        A device's error is one line; anything else is a defect and logged in full, and the part is restarted all the
+        same: one broken publisher must not take the pose away from the others.
+        """
+        loop = asyncio.get_running_loop()
+        pause = FIRST_S
+        while True:
+            begun = loop.time()
+            try:
+                await self._run(name, run, begun)
+            except HalError as error:
+                self._lost(name, f"{name}: {error}")
+            except Exception:
+                log.exception("%s has failed; it is restarted", name)
+                self._lost(name, "")
+            else:
+                self.failed.discard(name)
+                return
+            pause = FIRST_S if loop.time() - begun > STEADY_S else pause
+            await asyncio.sleep(pause * self.random.uniform(0.75, 1.25))
+            pause = min(LONGEST_S, 2.0 * pause)
+
+    async def _run(self, name: str, run: Callable[[], Awaitable[None]], begun: float) -> None:
+        """Run once; a part that is still running after the first back-off has returned."""
+        loop = asyncio.get_running_loop()
+        returned = loop.call_at(begun + FIRST_S, self._returned, name)
+        try:
+            await run()
+        finally:
+            returned.cancel()
+
+    def _lost(self, name: str, line: str) -> None:
+        self.restarts += 1
+        if line and name not in self.failed:
+            log.warning("%s; trying again until it works", line)
+        self.failed.add(name)
+
+    def _returned(self, name: str) -> None:
+        if name in self.failed:
+            self.failed.discard(name)
+            log.info("%s works again", name)

@@ -1,0 +1,59 @@
+"""Samples what the heartbeat judges, and says how the process itself is doing."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from daemon.cycle import Cycle
+from daemon.health import Vitals
+from daemon.publish.snapshot import State
+from daemon.state import Reason
+
+
+def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
+    """The vitals of this moment; ``failed``: names of parts that are down, ``lateness``: of the loop, seconds."""
+    parts, status, t_mono = cycle.parts, cycle.parts.status, cycle.parts.clock.now()
+    return Vitals(
+        t_mono=t_mono,
+        link=status.link,
+        error=status.error,
+        silent=cycle.verdict.state is State.NO_LIDAR and cycle.verdict.reason is Reason.LIDAR_SILENT,
+        scans=status.scans,
+        missed=status.missed + (cycle.inbox.dropped if cycle.cycles else 0),
+        invalid=status.invalid,
+        period=cycle.period.seconds,
+        odometry=cycle.observer.odometry_ok(t_mono),
+        odometry_jumps=cycle.odometry.jumps,
+        disagree=cycle.verdict.reason is Reason.WITNESSES_DISAGREE,
+        cycles=cycle.cycles,
+        overruns=cycle.overruns,
+        jobs_failed=parts.worker.failed,
+        lateness=lateness,
+        failed=frozenset(failed) | (frozenset(["publisher"]) if cycle.failing else frozenset()),
+    )
+
+
+def statistics(cycle: Cycle) -> str:
+    """One line for the log."""
+    status = cycle.parts.status
+    return (
+        f"state {cycle.verdict.state.name} cycles {cycle.cycles} overruns {cycle.overruns} scans {status.scans} "
+        f"missed {status.missed} dropped {cycle.inbox.dropped} invalid {status.invalid} resyncs {status.resyncs} "
+        f"reconnects {status.reconnects} scan period {1e3 * cycle.period.seconds:.2f} ms "
+        f"cycle {cycle.cycle_us or 0} us memory {resident_mb():.0f} MB"
+    )
+
+
+def resident_mb() -> float:
+    """Resident memory of this process, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def process_age_s() -> float:
+    """Seconds since the kernel started this process."""
+    after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    started = int(after_name[19]) / os.sysconf("SC_CLK_TCK")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - started

@@ -1,0 +1,128 @@
+"""Loads the estimator once, under a lock: the first start ever compiles its kernels, every later one loads them.
+
+Importing the estimator is what compiles. Two processes that do so at once could spoil the cache's index, hence the
+lock; and the daemon wants to go on talking to its devices meanwhile, hence the thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import gc
+import hashlib
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+log = logging.getLogger(__name__)
+
+ROOM: Final = Path(__file__).resolve().parents[1] / "estimator"
+
+REPORT_S: Final = 5.0
+"""Seconds between two progress lines."""
+
+
+@dataclass(frozen=True, slots=True)
+class Warmth:
+    """How the warm-up went: whether kernels had to be compiled, and the seconds it took."""
+
+    compiled: bool
+    seconds: float
+
+
+async def warm_up(progress: Callable[[str], None] = log.info) -> Warmth:
+    """Load the estimator in a thread; ``progress`` gets a line every few seconds while kernels are being compiled."""
+    begun = time.monotonic()
+    loading = _in_thread(load)
+    while not loading.done():
+        await asyncio.wait([loading], timeout=REPORT_S)
+        if not loading.done() and (line := _progress_line(time.monotonic() - begun)):
+            progress(line)
+    warmth = loading.result()
+    gc.collect()
+    gc.freeze()  # what exists now stays: the collector need not walk through it during a cycle
+    if warmth.compiled:
+        progress(f"kernels compiled in {warmth.seconds:.0f} s; later starts load them in less than a second")
+    return warmth
+
+
+def _in_thread(work: Callable[[], Warmth]) -> asyncio.Future[Warmth]:
+    """Run in a thread that dies with the process: a stop during the first start must not wait for the compiler."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[Warmth] = loop.create_future()
+
+    def run() -> None:
+        try:
+            outcome: Callable[[], None] = partial(_settle, done, work(), None)
+        except Exception as error:
+            log.debug("warm-up failed", exc_info=True)
+            outcome = partial(_settle, done, None, error)
+        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+            loop.call_soon_threadsafe(outcome)
+
+    threading.Thread(target=run, name="lumiloop-warm-up", daemon=True).start()
+    return done
+
+
+def _settle(done: asyncio.Future[Warmth], warmth: Warmth | None, error: Exception | None) -> None:
+    if done.cancelled():
+        return
+    if warmth is not None:
+        done.set_result(warmth)
+    elif error is not None:
+        done.set_exception(error)
+
+
+def load() -> Warmth:
+    """Import and exercise the estimator under the lock. Blocks; for a thread, or for a command that may wait."""
+    begun = time.monotonic()
+    from estimator.kernel import CACHE_DIR
+
+    with (CACHE_DIR / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        # the directory is named by the sources' content; numba also keys by the path they were loaded from
+        mark = CACHE_DIR / f"warm-{hashlib.sha256(str(ROOM).encode()).hexdigest()[:16]}"
+        cold = not mark.exists()
+        if cold:
+            log.info("first start of this version: compiling %d kernels, which takes up to a minute", kernel_count())
+        _exercise()
+        mark.touch()
+    return Warmth(cold, time.monotonic() - begun)
+
+
+def kernel_count() -> int:
+    """Kernels in the estimator's sources."""
+    return sum(path.read_text().count("\n@kernel(") for path in ROOM.glob("*.py"))
+
+
+def _exercise() -> None:
+    """Two steps with a small scan: what is imported or allocated on first use is so before the first real cycle."""
+    import numpy as np
+
+    from estimator.pipeline import new_state, step
+    from estimator.records import UNLIMITED, Scan
+
+    state = new_state()
+    bearing = np.linspace(-2.0, 2.0, 100)
+    reach = 2.0 / np.maximum(np.abs(np.cos(bearing)), np.abs(np.sin(bearing)))
+    hit = np.ones(100, dtype=np.uint8)
+    for seq in range(2):
+        step(state, [Scan(seq * 0.1, seq * 0.1 + 0.05, seq, np.zeros(3), bearing, reach, hit, 0.01)], UNLIMITED)
+
+
+def _progress_line(seconds: float) -> str:
+    """How far compiling has come after ``seconds``; empty until the compiler is loaded."""
+    kernel = sys.modules.get("estimator.kernel")
+    directory: Path | None = getattr(kernel, "CACHE_DIR", None)
+    if directory is None:
+        return ""
+    since = time.time() - seconds
+    count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
+    return f"compiling: {count} of {kernel_count()} kernels after {seconds:.0f} s"

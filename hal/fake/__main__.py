@@ -1,0 +1,149 @@
+"""A simulated HOKUYO as a device of this computer, to try the daemon without a sensor.
+
+python -m hal.fake --model UTM-30LX --pty /tmp/lidar
+python -m hal.fake --model UST-10LX --tcp 127.0.0.1:10940 --faults faults.toml --control /tmp/lidar.control
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from hal.errors import HalError
+from hal.fake.control import Control, serve_control
+from hal.fake.faults import FaultError
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import MODELS, LidarModel, Unit
+from hal.fake.pty_server import PtyServer
+from hal.fake.scan import ScanSource
+from hal.fake.schedule import FaultSchedule
+from hal.fake.tcp_server import TcpServer
+from hal.fake.world import RecordedRanges, Room
+
+
+@dataclass(slots=True)
+class _Options:
+    model: str
+    world: str
+    pty: Path | None
+    tcp: str | None
+    faults: Path | None
+    control: Path | None
+    serial: str
+    clock_ms: int
+    clock_ppm: float
+    cold: bool
+    seconds: float
+    seed: int
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m hal.fake", description="A simulated HOKUYO lidar.")
+    add = parser.add_argument
+    add("--model", default="UTM-30LX", choices=sorted(MODELS), help="type of sensor (default %(default)s)")
+    add("--world", default="box", help="box: a small room; or an .npz file with an array range_mm")
+    add("--pty", type=Path, metavar="LINK", help="serve as a serial port, found by this symbolic link")
+    add("--tcp", metavar="HOST:PORT", help="serve over TCP, port 0 chooses a free one")
+    add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
+    add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
+    add("--serial", default="H0000001", help="serial number the sensor states (default %(default)s)")
+    add("--clock-ms", type=int, default=0, help="what the sensor's 24-bit clock shows at the start")
+    add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
+    add("--cold", action="store_true", help="start with the sensor's start-up")
+    add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
+    add("--seed", type=int, default=0, help="of noise, jitter and faults left to chance")
+    return parser
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _world(options: _Options, model: LidarModel) -> ScanSource:
+    if options.world == "box":
+        return Room(model, seed=options.seed)
+    return RecordedRanges(Path(options.world), model)
+
+
+async def _serve(options: _Options) -> None:
+    model = MODELS[options.model]
+    unit = Unit(
+        serial=options.serial,
+        clock_ms=options.clock_ms,
+        clock_gain=options.clock_ppm * 1e-6,
+        booted=not options.cold,
+        seed=options.seed,
+    )
+    device = FakeHokuyo(model, _world(options, model), unit=unit)
+    schedule = FaultSchedule({"lidar": device})
+    if options.faults is not None:
+        faults = schedule.load(options.faults.read_text(encoding="utf-8"))
+        _say(f"{len(faults)} faults of {options.faults} ordered")
+    pty = tcp = control = None
+    try:
+        if options.tcp is not None:
+            host, _, port = options.tcp.rpartition(":")
+            tcp = TcpServer(device)
+            _say(f"{options.model} on tcp://{host}:{await tcp.listen(host, int(port))}")
+        if options.pty is not None or options.tcp is None:
+            pty = PtyServer(device, options.pty)
+            _say(f"{options.model} on {pty.path}")
+        if options.control is not None:
+            control = await serve_control(Control(schedule), options.control)
+            _say(f"fault orders on {options.control}")
+        await _until_told(options.seconds)
+    finally:
+        schedule.close()
+        if pty is not None:
+            pty.close()
+        if tcp is not None:
+            await tcp.close()
+        if control is not None:
+            control.close()
+        device.close()
+    counts = device.counts
+    _say(
+        f"{device.scans_sent} scans made; replies: {counts.sent} sent, {counts.unheard} unheard, "
+        f"{counts.lost_in_sensor} lost in the sensor, {counts.refused_by_host} lost at a full queue"
+    )
+
+
+async def _until_told(seconds: float) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    if seconds > 0:
+        loop.call_later(seconds, stop.set)
+    await stop.wait()
+
+
+def _is_address(text: str) -> bool:
+    host, _, port = text.rpartition(":")
+    return host != "" and port.isascii() and port.isdigit() and int(port) < 1 << 16
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run until interrupted; 2 when something in the arguments is wrong."""
+    options = _Options(**vars(_parser().parse_args(arguments)))
+    if options.pty is not None and options.tcp is not None:
+        sys.stderr.write("one sensor has one line: give --pty or --tcp\n")
+        return 2
+    if options.tcp is not None and not _is_address(options.tcp):
+        sys.stderr.write(f"--tcp {options.tcp}: expected HOST:PORT, as 127.0.0.1:10940\n")
+        return 2
+    try:
+        asyncio.run(_serve(options))
+    except (HalError, FaultError, OSError, UnicodeDecodeError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,276 @@
+"""The HOKUYO driver: finds the sensor, streams, and comes back from everything a sensor or a cable can do.
+
+What it does about trouble grows with every failure since the last valid scan: the stream is restarted (QT), the sensor
+is reset (RT or RS), the port is opened anew, the sensor is rebooted (RB, where the model has it), and again from the
+port on. Only a valid scan sets that back: a sensor that can be opened but never delivers must not look healthy
+(Hokuyo-aut/urg_node2 pull request 5). Waits grow from 0.2 to 5 s, and it never gives up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Callable
+from typing import Final
+
+from hal.clock import Clock
+from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
+from hal.hokuyo import discover
+from hal.hokuyo.follow import Follower
+from hal.hokuyo.line import Line
+from hal.hokuyo.models import Identity, line_speed, stream_request
+from hal.hokuyo.payload import ScanRequest
+from hal.hokuyo.scip import BAUD_RATES
+from hal.hokuyo.session import AbnormalState, Session
+from hal.hokuyo.stream import ScanStream
+from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
+from hal.port import PortOpener
+
+log = logging.getLogger(__name__)
+
+AUTO: Final = "auto"
+_USB_BAUD: Final = 115200  # without meaning there, but a tty has to be given one
+_PAUSE_S: Final = (0.2, 5.0)
+_RESET_FROM = 2  # failures since the last valid scan
+_REOPEN_FROM = 3
+_REBOOT_EVERY = 4
+
+
+class HokuyoDriver:
+    """A :class:`hal.lidar.Lidar` for every SCIP 2.x sensor on USB, RS-232 or Ethernet.
+
+    Args:
+        device: path, ``tcp://host:port``, or ``auto``: the first port at which a HOKUYO answers.
+        clock: gives the times of arrival; the same as the ports'.
+        opener: opens ports (:func:`hal.port.open_port`).
+        serial: the sensor's own number (``VV SERI``); with ``auto`` it is found wherever it is plugged in.
+        baud: RS-232 rate to use; 0: the lowest that carries every revolution. No meaning on USB and Ethernet.
+        intensity: ask for intensities where model and firmware can give them.
+
+    Raises:
+        ValueError: a rate SCIP does not know.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        *,
+        clock: Clock,
+        opener: PortOpener,
+        serial: str = "",
+        baud: int = 0,
+        intensity: bool = False,
+    ) -> None:
+        if baud and baud not in BAUD_RATES:
+            raise ValueError(f"baud {baud}: SCIP knows {', '.join(map(str, BAUD_RATES))}, or 0 to choose by itself")
+        self._device = device
+        self._clock = clock
+        self._opener = opener
+        self._serial = serial
+        self._baud = baud
+        self._intensity = intensity
+        self._status = LidarStatus()
+        self._geometry: LidarGeometry | None = None
+        self._faults = 0
+        self._attempts = 0
+        self._opened = False
+        self._rate_cap = max(BAUD_RATES)
+        self._rate_found = 0
+        self._told: set[str] = set()
+        self._random = random.Random(device + serial)
+
+    @property
+    def geometry(self) -> LidarGeometry | None:
+        """What the sensor last said of itself; None before the first time."""
+        return self._geometry
+
+    @property
+    def status(self) -> LidarStatus:
+        """Live state and counters."""
+        return self._status
+
+    async def run(self, on_scan: Callable[[RawScan], None]) -> None:
+        """Deliver scans until cancelled; then the laser is switched off, which takes a tenth of a second at most."""
+        try:
+            while True:
+                try:
+                    await self._connection(on_scan)
+                except HalError as error:
+                    self._note(error)
+                self._status.link = Link.WAITING
+                await asyncio.sleep(self._pause())
+        finally:
+            self._status.link = Link.CLOSED
+
+    # one connection
+
+    async def _connection(self, on_scan: Callable[[RawScan], None]) -> None:
+        """Open, stream, recover on the same port as long as that makes sense; returns or raises to have it reopened."""
+        self._status.link = Link.OPENING
+        session = await self._find()
+        if self._opened:
+            self._status.reconnects += 1
+        self._opened = True
+        try:
+            while True:
+                try:
+                    await self._stream(session, on_scan)
+                except DeviceMissing:
+                    raise
+                except HalError as error:
+                    self._note(error)
+                    if not await self._mend(session, error):
+                        return
+        except asyncio.CancelledError:
+            await session.quiet()
+            raise
+        finally:
+            session.line.close()
+
+    async def _mend(self, session: Session, error: HalError) -> bool:
+        """Make ready for another try on the same port; False: it has to be opened anew."""
+        self._status.link = Link.OPENING
+        self._status.resyncs += 1
+        if isinstance(error, AbnormalState) or self._faults % _REBOOT_EVERY == 0:
+            identity = session.identity
+            if isinstance(error, AbnormalState) or (identity is not None and identity.facts.may("RB")):
+                await session.reboot()
+            return False
+        if self._faults >= _REOPEN_FROM:
+            return False
+        await asyncio.sleep(self._pause())
+        await session.settle()
+        if self._faults >= _RESET_FROM:
+            await session.reset()
+        return True
+
+    async def _find(self) -> Session:
+        """Open the device asked for, or the first candidate that is the sensor asked for."""
+        if self._device != AUTO:
+            return await self._open(self._device)
+        problems: list[HalError] = []
+        for device in discover.candidates():
+            try:
+                return await self._open(device)
+            except HalError as error:
+                problems.append(error)
+        wanted = f"no HOKUYO {self._serial} found" if self._serial else "no HOKUYO found"
+        if not problems:
+            raise DeviceMissing(AUTO, wanted, "plug the sensor in, or name its device file")
+        kind = next((type(e) for e in problems if isinstance(e, DeviceRefused)), type(problems[0]))
+        raise kind(AUTO, f"{wanted}: {'; '.join(map(str, problems))}")
+
+    async def _open(self, device: str) -> Session:
+        """A session with a sensor that is idle, known, and the right one."""
+        rs232 = discover.is_rs232(device)
+        port = await self._opener(device, self._rate_found or self._baud or (BAUD_RATES[0] if rs232 else _USB_BAUD))
+        session = Session(Line(port))
+        try:
+            if rs232:
+                await session.find_rate(self._rate_found or self._baud)
+            await self._settle(session)
+            if self._faults >= _REOPEN_FROM:
+                await session.reset()
+            identity = await session.identify()
+            serial = identity.geometry.serial
+            if self._serial and serial != self._serial:
+                raise DeviceRefused(device, f"is sensor {serial}, not {self._serial}", f'set device = "{AUTO}"')
+            await self._suit_rate(session, identity)
+        except BaseException:
+            session.line.close()
+            raise
+        self._geometry = identity.geometry
+        self._describe(device, session, identity)
+        return session
+
+    async def _settle(self, session: Session) -> None:
+        try:
+            await session.settle()
+        except AbnormalState:
+            await session.reboot()
+            raise
+
+    async def _suit_rate(self, session: Session, identity: Identity) -> None:
+        """RS-232: go to the rate asked for, or the lowest that carries every revolution."""
+        if not session.baud:
+            return
+        everything = ScanRequest("MD", identity.geometry.amin, identity.geometry.amax)
+        needed = 10.0 * everything.frame_bytes / identity.geometry.period_s
+        rates = [rate for rate in BAUD_RATES if rate <= self._rate_cap]
+        wanted = self._baud if self._baud in rates else next((r for r in rates if r >= needed), rates[-1])
+        if wanted != session.baud and (self._baud or wanted > session.baud):
+            try:
+                await session.set_rate(wanted)
+            except DeviceFault:
+                self._rate_cap = max([rate for rate in BAUD_RATES if rate < wanted], default=BAUD_RATES[0])
+                raise
+        self._rate_found = session.baud
+
+    def _describe(self, device: str, session: Session, identity: Identity) -> None:
+        facts = {"device": device, "model": identity.geometry.model, "serial": identity.geometry.serial}
+        facts["firmware"] = identity.geometry.firmware
+        facts["state"] = session.health
+        if session.baud:
+            facts["baud"] = str(session.baud)
+        self._status.extra.update(facts)
+
+    # one stream
+
+    async def _stream(self, session: Session, on_scan: Callable[[RawScan], None]) -> None:
+        """Start the stream and follow it; raises what ended it."""
+        identity = session.identity
+        assert identity is not None
+        speed = line_speed(session.device, session.baud, identity.facts)
+        request = await self._choose(session, identity, speed)
+        stream = ScanStream(identity, request, self._status, speed)
+        follower = Follower(stream, session.line, self._clock, self._status, self._passing(on_scan))
+        dialect = f"{identity.protocol or 'SCIP 2'} {request.name}"
+        dialect += f", {request.cluster} steps together" if request.stride > 1 else ""
+        dialect += f", every {request.skip + 1}. revolution" if request.skip else ""
+        self._status.dialect = dialect
+        await session.start(request, follower.take, lambda: follower.has_scans)
+        await follower.watch()
+
+    async def _choose(self, session: Session, identity: Identity, speed: float) -> ScanRequest:
+        """The stream to ask for; a mode with intensities is proved by one scan first, and dropped if it fails."""
+        request = stream_request(identity, intensity=self._intensity, bytes_per_s=speed)
+        if not self._intensity:
+            return request
+        verdict = "the model has none"
+        if request.name == "ME":
+            verdict = "given up after failures" if self._faults >= _REOPEN_FROM else await session.prove(request)
+        self._status.extra["intensity"] = f"off: {verdict}" if verdict else "on"
+        if not verdict:
+            return request
+        await session.settle()
+        return stream_request(identity, intensity=False, bytes_per_s=speed)
+
+    def _passing(self, on_scan: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
+        def pass_on(scan: RawScan) -> None:
+            self._faults = self._attempts = 0
+            self._status.link = Link.STREAMING
+            if self._told:
+                self._told.clear()
+                log.info("%s: lidar %s delivers again", self._status.extra["device"], scan.geometry.model)
+            on_scan(scan)
+
+        return pass_on
+
+    # trouble
+
+    def _note(self, error: HalError) -> None:
+        """Keep the error for the status; log each kind of problem once until scans come again."""
+        self._status.error = error
+        self._attempts += 1
+        if not isinstance(error, (DeviceMissing, DeviceRefused)):
+            self._faults += 1
+        if error.problem not in self._told:
+            self._told.add(error.problem)
+            log.warning("lidar lost: %s", error)
+
+    def _pause(self) -> float:
+        """Seconds until the next attempt: doubling, with jitter so that several hosts do not march in step."""
+        low, high = _PAUSE_S
+        pause = min(low * 2.0 ** min(max(self._attempts - 1, 0), 10), high)
+        return pause * self._random.uniform(0.8, 1.0)

@@ -1,0 +1,294 @@
+"""Bring a sensor from whatever state it is in to streaming, and back to silence.
+
+A sensor may be idle, streaming (a serial sensor does not notice that its host has left), in time-adjust mode, still in
+SCIP 1.1, at another line rate, in the middle of a frame, booting, or in its error state. The way through all of them:
+
+    settle    QT until it is acknowledged; on the way TM2 out of time adjustment, ``SCIP2.0`` out of SCIP 1.1
+    reset     RT or RS, only where something has gone wrong before
+    identify  VV, PP, II
+    set_rate  RS-232 only
+    start     MD or ME
+    quiet     QT, a tenth of a second at most
+
+Sources: SCIP 2.0 C-42-03320B; SCIP 2.2 C-42-04076; ros-drivers/hokuyo_node and seqsense/urg_stamped issues 97, 103, 115
+(QT is sometimes ignored and has to be repeated).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from hal.errors import DataInvalid, DeviceFault, DeviceRefused, HalError
+from hal.hokuyo import scip
+from hal.hokuyo.line import Line, OnFrame, reply_or_none
+from hal.hokuyo.models import BEFORE_KNOWN, Identity, ModelFacts, identify
+from hal.hokuyo.payload import ScanRequest, parse_scan
+from hal.hokuyo.scip import BadFrame, Reply, parse_reply, parse_text
+
+QUIET_S: Final = 0.1
+FIRST_SCAN_S: Final = 6.0  # the motor takes 2 to 5 s to spin up after power-on
+_QT_S: Final = 0.3
+_QT_RS232_S: Final = 1.6  # a frame already on a slow line goes before the reply
+_LISTEN_RS232_S: Final = 0.5
+_LISTEN_19200_S: Final = 1.4
+_TEXT_S: Final = 0.7
+_ACK_S: Final = 0.5
+_RESET_S: Final = 1.5
+_AFTER_RESET_S: Final = 1.0
+_AFTER_RATE_S: Final = 0.15
+_AFTER_REBOOT_S: Final = 2.0
+_POWER_CYCLE: Final = "switch its power off and on"
+
+
+class AbnormalState(DeviceFault):
+    """The sensor answers 0L: it obeys nothing but RB."""
+
+
+class Session:
+    """One open line and what is known of the sensor behind it.
+
+    Args:
+        line: already started. baud: rate of an RS-232 line, 0 for USB and Ethernet.
+    """
+
+    def __init__(self, line: Line, baud: int = 0) -> None:
+        self.line = line
+        self.baud = baud
+        self.identity: Identity | None = None
+        self.health = ""
+
+    @property
+    def device(self) -> str:
+        """The port's name, for errors."""
+        return self.line.port.name
+
+    @property
+    def _facts(self) -> ModelFacts:
+        return BEFORE_KNOWN if self.identity is None else self.identity.facts
+
+    # from any state to idle
+
+    async def settle(self) -> None:
+        """Make the sensor idle in SCIP 2.x, whatever it is doing.
+
+        Raises:
+            DeviceFault: nothing answers, or it will not settle. AbnormalState: it reports 0L.
+        """
+        status = ""
+        for _ in range(6):
+            reply = await self._quit()
+            if reply.legacy:
+                await self._try(scip.TO_SCIP2, _TEXT_S)
+                continue
+            status = reply.status
+            if status == scip.ACCEPTED:
+                return
+            if status == scip.ABNORMAL:
+                raise AbnormalState(self.device, "in its error state (0L)", _POWER_CYCLE)
+            if status in scip.DENIED:
+                await self._try(scip.TM_LEAVE, _TEXT_S)
+        raise DeviceFault(self.device, f"does not become idle, QT answers {status or 'as SCIP 1.1'}", _POWER_CYCLE)
+
+    async def _quit(self) -> Reply:
+        for _ in range(3):
+            reply = await self._try(scip.QT, _QT_RS232_S if self.baud else _QT_S)
+            if reply is not None:
+                return reply
+        heard = "only unreadable bytes come" if self.line.dropped_bytes else "nothing answers"
+        raise DeviceFault(self.device, heard, "is it a HOKUYO, powered, at this line rate?")
+
+    async def find_rate(self, first: int = 0) -> None:
+        """Find the rate of an RS-232 line: ``first``, then every rate SCIP knows.
+
+        Raises:
+            DeviceFault: no rate gives an answer.
+        """
+        rates: Sequence[int] = [first, *scip.BAUD_RATES] if first else scip.BAUD_RATES
+        for rate in dict.fromkeys(rates):
+            self.line.port.set_baud(rate)
+            before = self.line.recognised
+            reply = await self._try(scip.QT, _LISTEN_19200_S if rate <= 19200 else _LISTEN_RS232_S)
+            if reply is not None or self.line.recognised > before:
+                self.baud = rate
+                return
+        raise DeviceFault(self.device, "nothing answers at any line rate", "is it a HOKUYO, powered, its cable right?")
+
+    async def reset(self) -> None:
+        """Default speed, clock at zero, laser off; keeps the line rate where the model allows.
+
+        Raises:
+            DeviceFault: it does not answer twice.
+        """
+        command = scip.RT if self._facts.may("RT") else scip.RS
+        for _ in range(2):
+            if await self._try(command, _RESET_S) is not None:
+                break
+        else:
+            raise DeviceFault(self.device, "does not answer a reset", _POWER_CYCLE)
+        await asyncio.sleep(_AFTER_RESET_S)
+        if self.baud and command == scip.RS:  # which sets the line rate back as well
+            await self.find_rate(scip.BAUD_RATES[0])
+        await self.settle()
+
+    async def reboot(self) -> None:
+        """RB twice within a second; the port is of no use afterwards, open it again."""
+        with contextlib.suppress(HalError):
+            for _ in range(2):
+                await self._try(scip.RB, 0.3)
+            await asyncio.sleep(_AFTER_REBOOT_S)
+
+    # who is it
+
+    async def identify(self) -> Identity:
+        """Ask VV, PP and II.
+
+        Raises:
+            DeviceFault: no readable answer. DeviceRefused: not a sensor this driver can run.
+        """
+        vv = await self._text(scip.VV)
+        pp = await self._text(scip.PP)
+        self.identity = identify(self.device, vv, pp)
+        with contextlib.suppress(DeviceFault, DataInvalid):  # diagnostics only; some firmware has no II
+            self.health = (await self._text(scip.II, tries=1)).get("STAT", "")
+        return self.identity
+
+    async def _text(self, command: bytes, tries: int = 4) -> dict[str, str]:
+        name = command[:2].decode()
+        seen = b""
+        problem = "no answer"
+        for _ in range(tries):
+            frame = await self._try_frame(command, _TEXT_S)
+            if frame is None:
+                continue
+            try:
+                reply = parse_reply(frame)
+                if reply.status == scip.ACCEPTED:
+                    return parse_text(reply, strict=frame != seen)  # twice the same: the firmware sums differently
+                problem = f"answer {reply.status}"
+                await self.settle()
+            except BadFrame as error:
+                problem, seen = str(error), frame
+        raise DeviceFault(self.device, f"{name}: {problem}", _POWER_CYCLE)
+
+    # streaming
+
+    async def set_rate(self, baud: int) -> None:
+        """Raise or lower the rate of an RS-232 line; a sensor that refuses stays where it is.
+
+        Raises:
+            DeviceFault: it accepted and is not to be found at the new rate.
+        """
+        reply = await self._try(scip.baud_command(baud), _TEXT_S)
+        if reply is None or reply.status != scip.ACCEPTED:
+            return
+        self.line.port.set_baud(baud)
+        await asyncio.sleep(_AFTER_RATE_S)
+        for _ in range(2):
+            if await self._try(scip.VV, _TEXT_S) is not None:
+                self.baud = baud
+                return
+        raise DeviceFault(self.device, f"lost after changing to {baud} bit/s", "set lidar.baud to a lower rate")
+
+    async def prove(self, request: ScanRequest) -> str:
+        """Ask for a single scan of a mode that not every firmware can do; "" if it came whole, else what was wrong."""
+        once = ScanRequest(request.name, request.start, request.end, request.cluster, 0, 1)
+        result: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+        def judge(frame: bytes, _t_rx: float) -> None:
+            reply = reply_or_none(frame)
+            if reply is None or reply.status != scip.DATA or result.done():
+                return
+            try:
+                scan = parse_scan(once, reply)
+            except BadFrame as error:
+                result.set_result(str(error))
+            else:
+                dark = scan.intensity is not None and not scan.intensity.any()
+                result.set_result("every intensity is 0" if dark else "")
+
+        self.line.on_frame = judge
+        try:
+            reply = await self._try(once.command(), _ACK_S)
+            if reply is not None and reply.status != scip.ACCEPTED:
+                return f"{request.name} answers {reply.status}"
+            async with asyncio.timeout(FIRST_SCAN_S):
+                return await self._or_lost(result)
+        except TimeoutError:
+            return f"no scan within {FIRST_SCAN_S:g} s"
+        finally:
+            self.line.on_frame = None
+
+    async def start(self, request: ScanRequest, on_frame: OnFrame, streaming: Callable[[], bool]) -> None:
+        """Begin a stream; its frames go to ``on_frame`` from now on.
+
+        Args:
+            request: an endless one.
+            on_frame: gets the frames.
+            streaming: says whether scans have come, which proves success where the acknowledgement was lost.
+
+        Raises:
+            DeviceFault, AbnormalState, DeviceRefused: by status.
+        """
+        self.line.on_frame = on_frame
+        for _ in range(3):
+            reply = await self._try(request.command(), 4 * _ACK_S if self.baud else _ACK_S)
+            if streaming() or (reply is not None and reply.status in (scip.ACCEPTED, "0B")):
+                return
+            if reply is not None:
+                break
+        self.line.on_frame = None
+        raise self._refusal(request, reply)
+
+    def _refusal(self, request: ScanRequest, reply: Reply | None) -> HalError:
+        if reply is None:
+            return DeviceFault(self.device, f"does not acknowledge {request.name}", _POWER_CYCLE)
+        return explain_status(self.device, request.name, reply.status, self.health)
+
+    async def quiet(self) -> None:
+        """Laser off on the way out, within a tenth of a second; never raises for anything the device does."""
+        self.line.on_frame = None
+        with contextlib.suppress(HalError, TimeoutError):
+            await self.line.ask(scip.QT, QUIET_S)
+
+    # one exchange
+
+    async def _try_frame(self, command: bytes, timeout_s: float) -> bytes | None:
+        try:
+            return await self.line.ask(command, timeout_s)
+        except TimeoutError:
+            return None
+
+    async def _try(self, command: bytes, timeout_s: float) -> Reply | None:
+        """Reply, or None where none came or it was damaged."""
+        frame = await self._try_frame(command, timeout_s)
+        return None if frame is None else reply_or_none(frame)
+
+    async def _or_lost(self, result: asyncio.Future[str]) -> str:
+        def tell() -> None:
+            if not result.done() and self.line.lost is not None:
+                result.set_exception(self.line.lost)
+
+        self.line.when_lost(tell)
+        try:
+            return await result
+        finally:
+            self.line.when_lost(None)
+
+
+def explain_status(device: str, command: str, status: str, health: str = "") -> HalError:
+    """The error behind a refusal or a mid-stream status (SCIP 2.0 section 5; 0L, 0M: SCIP 2.2)."""
+    said = f"{command} answers {status}" + (f", state: {health}" if health else "")
+    if status == scip.ABNORMAL:
+        return AbnormalState(device, f"{said}: error state", _POWER_CYCLE)
+    if status in scip.DENIED:
+        return DeviceFault(device, f"{said}: not now (booting, or in another mode)", "it is tried again")
+    if status.isdigit() and 50 <= int(status) <= 97:
+        return DeviceFault(device, f"{said}: hardware trouble (laser, motor)", f"{_POWER_CYCLE}; else have it repaired")
+    if status.isdigit() and 21 <= int(status) <= 49:
+        return DeviceFault(device, f"{said}: it is checking itself for a fault", _POWER_CYCLE)
+    if status in ("01", "02", "03", "04", "05", "06", "07"):
+        return DeviceRefused(device, f"{said}: it does not accept the range it states itself", "report the model")
+    return DeviceFault(device, said, _POWER_CYCLE)

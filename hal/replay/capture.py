@@ -1,0 +1,73 @@
+"""Raw captures of a serial line: what a SCIP sensor said (``.logr``) and what its host said (``.logw``).
+
+Each record is an 8-byte big-endian time in microseconds, a 4-byte big-endian length, and the bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from hal.errors import DataInvalid
+from hal.replay.report import LogReport
+from hal.replay.text import unreadable
+
+_HEAD: Final = struct.Struct(">QI")
+_LONGEST: Final = 1 << 20
+_LATEST_US: Final = 1 << 53  # 285 years: what comes later is no time but text
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Bytes as they came off the line at ``t_us``, microseconds of the capturing host's clock."""
+
+    t_us: int
+    data: bytes
+
+
+def looks_like_capture(head: bytes) -> bool:
+    """Whether a file that begins with ``head`` (at least 12 bytes) can be such a capture."""
+    if len(head) < _HEAD.size:
+        return False
+    t_us: int
+    length: int
+    t_us, length = _HEAD.unpack_from(head)
+    return t_us < _LATEST_US and 0 < length <= _LONGEST
+
+
+def read_capture(path: Path, report: LogReport) -> list[Chunk]:
+    """All chunks of a capture; a torn end costs only the last chunk and is noted in ``report``.
+
+    Raises:
+        DeviceMissing, DeviceRefused: the file is not there or may not be read.
+        DataInvalid: empty, or not such a capture.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from error
+    if not looks_like_capture(data):
+        problem = "the file is empty" if not data else "not a capture of a serial line"
+        raise DataInvalid(str(path), problem, "name a .logr file, or another kind of log")
+    chunks = list(_chunks(data, report))
+    report.use("chunks", len(chunks))
+    report.use("bytes", sum(len(chunk.data) for chunk in chunks))
+    return chunks
+
+
+def _chunks(data: bytes, report: LogReport) -> Iterator[Chunk]:
+    at = 0
+    while at < len(data):
+        if not looks_like_capture(data[at : at + _HEAD.size]):
+            report.skip(at, "the capture goes on with bytes that are no record; they are left out")
+            return
+        t_us, length = _HEAD.unpack_from(data, at)
+        chunk = data[at + _HEAD.size : at + _HEAD.size + length]
+        if len(chunk) < length:
+            report.skip(at, "the capture ends within a record")
+            return
+        yield Chunk(t_us, chunk)
+        at += _HEAD.size + length

@@ -1,0 +1,275 @@
+r"""Our own recording: a folder of append-only segments that survive a power cut up to their last whole record.
+
+Segment file ``NNNNNN.lumirec``, all numbers little-endian:
+
+* head: ``LUMIREC\n``, format version (u16), length of the header (u32), the header (JSON), CRC-32 of all that (u32);
+* records: marker 0xA5 0x5A, kind (u8), channel (u8), payload length (u32), ``t_mono`` (f64), CRC-32 (u32) of
+  kind to ``t_mono`` and payload, payload.
+
+The header repeats in every segment, so that each can be read alone. Nothing in a segment is ever changed after it was
+written: what a torn end or a damaged place still holds is found again by the markers and proved by the CRC.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Final
+
+from hal.errors import DataInvalid
+from hal.imu import RawImu
+from hal.lidar import RawScan
+from hal.odometry import RawOdometry
+from hal.replay.report import LogReport
+from hal.replay.text import unreadable
+
+MAGIC: Final = b"LUMIREC\n"
+VERSION: Final = 1
+SUFFIX: Final = ".lumirec"
+MARKER: Final = b"\xa5\x5a"
+LONGEST: Final = 1 << 20
+"""No record is longer; a length beyond it is damage."""
+
+_START: Final = struct.Struct("<8sHI")
+_HEAD: Final = struct.Struct("<2sBBIdI")
+_SUMMED: Final = struct.Struct("<BBId")
+_CRC: Final = struct.Struct("<I")
+_ODOMETRY: Final = struct.Struct("<5d")
+_IMU: Final = struct.Struct("<3d")
+_SCAN: Final = struct.Struct("<q3d")
+
+
+class Kind(IntEnum):
+    """What a record is. Numbers are part of the format: never renumber."""
+
+    RX = 1  # bytes from a device, as they arrived
+    TX = 2  # bytes to a device
+    OPEN = 3  # a port was opened; payload: its name and rate as text
+    LOST = 4  # a port was lost; payload: why
+    BAUD = 5  # the line rate was changed; payload: the new rate as text
+    SCAN = 8  # a scan the driver delivered: which, and when it was measured
+    ODOMETRY = 16
+    IMU = 17
+    COMMAND = 18
+    CYCLE = 32
+    NOTE = 48  # text for people: gaps of the recording itself
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One record; ``channel`` tells devices of one kind apart (0: the lidar)."""
+
+    kind: int
+    channel: int
+    t_mono: float
+    payload: bytes
+
+
+def pack_head(header: dict[str, Any]) -> bytes:
+    """The head of a segment."""
+    text = json.dumps(header, sort_keys=True).encode()
+    start = _START.pack(MAGIC, VERSION, len(text)) + text
+    return start + _CRC.pack(zlib.crc32(start))
+
+
+def pack_frame(kind: int, channel: int, t_mono: float, payload: bytes) -> bytes:
+    """One record."""
+    crc = zlib.crc32(payload, zlib.crc32(_SUMMED.pack(kind, channel, len(payload), t_mono)))
+    return _HEAD.pack(MARKER, kind, channel, len(payload), t_mono, crc) + payload
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMark:
+    """A scan as the driver delivered it; its ranges are in the bytes. Fields as in `hal.lidar.RawScan`."""
+
+    seq: int
+    t_rx: float
+    t_mono: float
+    t_sigma: float
+
+
+def pack_scan(scan: RawScan) -> bytes:
+    """Payload of a SCAN record."""
+    return _SCAN.pack(scan.seq, scan.t_rx, scan.t_mono, scan.t_sigma)
+
+
+def unpack_scan(payload: bytes) -> ScanMark:
+    """The mark in a SCAN record; raises `struct.error` for a payload of another length."""
+    return ScanMark(*_SCAN.unpack(payload))
+
+
+def pack_odometry(reading: RawOdometry) -> bytes:
+    """Payload of an ODOMETRY record."""
+    return _ODOMETRY.pack(reading.t_rx, reading.t_mono, reading.x, reading.y, reading.yaw)
+
+
+def unpack_odometry(payload: bytes) -> RawOdometry:
+    """The reading in an ODOMETRY record; raises `struct.error` for a payload of another length."""
+    return RawOdometry(*_ODOMETRY.unpack(payload))
+
+
+def pack_imu(reading: RawImu) -> bytes:
+    """Payload of an IMU record."""
+    return _IMU.pack(reading.t_rx, reading.t_mono, reading.yaw_rate)
+
+
+def unpack_imu(payload: bytes) -> RawImu:
+    """The reading in an IMU record; raises `struct.error` for a payload of another length."""
+    return RawImu(*_IMU.unpack(payload))
+
+
+def segment_name(number: int) -> str:
+    """File name of the ``number``-th segment, counted from 0."""
+    return f"{number:06d}{SUFFIX}"
+
+
+def segments_of(folder: Path) -> list[Path]:
+    """Segments of a recording in order.
+
+    A single segment file is a recording too; a folder that holds one recording's folder stands for it.
+
+    Raises:
+        DeviceMissing, DeviceRefused: there is nothing, or it may not be read.
+        DataInvalid: the folder holds several recordings.
+    """
+    try:
+        if not folder.is_dir():
+            return [folder] if folder.stat() else []
+        inside = sorted(folder.iterdir())
+        runs = [path for path in inside if path.is_dir() and any(file.suffix == SUFFIX for file in path.iterdir())]
+        found = [path for path in inside if path.suffix == SUFFIX]
+        return segments_of(runs[0]) if len(runs) == 1 and not found else found or _choose(folder, runs)
+    except OSError as error:
+        raise unreadable(folder, error) from error
+
+
+def _choose(folder: Path, runs: list[Path]) -> list[Path]:
+    if len(runs) > 1:
+        names = ", ".join(path.name for path in runs)
+        raise DataInvalid(str(folder), f"holds {len(runs)} recordings: {names}", "name one of them")
+    return []
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording on disk: its header, and its records as a stream."""
+
+    path: Path
+    header: dict[str, Any]
+    segments: tuple[Path, ...]
+
+    def frames(self, report: LogReport) -> Iterator[Frame]:
+        """Every whole record in order; what is torn or damaged is counted in ``report``, with its place.
+
+        Raises:
+            DeviceRefused: a segment cannot be read.
+        """
+        number = None
+        for path in self.segments:
+            data = _load(path)
+            header, at = _read_head(data)
+            if header is None:
+                report.notes.append(f"{path.name}: the head is damaged, the segment is left out ({len(data)} bytes)")
+                continue
+            if header.get("recording") != self.header.get("recording"):
+                report.notes.append(f"{path.name}: belongs to another recording, left out")
+                continue
+            if number is not None and header.get("segment") != number + 1:
+                report.notes.append(f"{path.name}: the segment before it is missing")
+            number = header.get("segment")
+            yield from _frames(path.name, data, at, report)
+
+
+def open_recording(path: Path) -> Recording:
+    """Find the segments of a recording and read its header.
+
+    Raises:
+        DeviceMissing, DeviceRefused: nothing there, or it may not be read.
+        DataInvalid: no segment has a readable head, or a newer version wrote it.
+    """
+    segments = segments_of(path)
+    if not segments:
+        raise DataInvalid(str(path), f"holds no recording (no *{SUFFIX})", "name the folder given to `run --record`")
+    for segment in segments:
+        data = _load(segment)
+        _check_version(segment, data)
+        header, _ = _read_head(data)
+        if header is not None:
+            return Recording(path, header, tuple(segments))
+    raise DataInvalid(str(segments[0]), "not a recording: no segment has a readable head", "check the path")
+
+
+def looks_like_recording(head: bytes) -> bool:
+    """Whether a file beginning with ``head`` is a segment."""
+    return head.startswith(MAGIC)
+
+
+def _load(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def _check_version(path: Path, data: bytes) -> None:
+    if len(data) >= _START.size and data.startswith(MAGIC):
+        version = _START.unpack_from(data)[1]
+        if version > VERSION:
+            raise DataInvalid(
+                str(path), f"format version {version}; this program reads up to {VERSION}", "use a newer lumiloop"
+            )
+
+
+def _read_head(data: bytes) -> tuple[dict[str, Any] | None, int]:
+    """The header and where the records begin; None where it is damaged."""
+    if len(data) < _START.size or not data.startswith(MAGIC):
+        return None, 0
+    end = _START.size + _START.unpack_from(data)[2]
+    if len(data) < end + _CRC.size or _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
+        return None, 0
+    header = json.loads(data[_START.size : end])
+    return (header, end + _CRC.size) if isinstance(header, dict) else (None, 0)
+
+
+def _frames(name: str, data: bytes, at: int, report: LogReport) -> Iterator[Frame]:
+    while at < len(data):
+        frame, end = _frame_at(data, at)
+        if frame is not None:
+            report.use(_kind_name(frame.kind))
+            yield frame
+        else:
+            end = _next_frame(data, at + 1)
+            where = "ends within a record" if end == len(data) else "is damaged"
+            report.skip(at, f"{name} {where}: {end - at} bytes lost")
+        at = end
+
+
+def _frame_at(data: bytes, at: int) -> tuple[Frame | None, int]:
+    if len(data) < at + _HEAD.size:
+        return None, len(data)
+    marker, kind, channel, length, t_mono, crc = _HEAD.unpack_from(data, at)
+    begin = at + _HEAD.size
+    end = begin + length
+    if marker != MARKER or length > LONGEST or end > len(data):
+        return None, len(data)
+    if zlib.crc32(data[begin:end], zlib.crc32(_SUMMED.pack(kind, channel, length, t_mono))) != crc:
+        return None, len(data)
+    return Frame(kind, channel, t_mono, data[begin:end]), end
+
+
+def _next_frame(data: bytes, at: int) -> int:
+    """Where the next whole record begins, or the end of the data."""
+    while (at := data.find(MARKER, at)) >= 0:
+        if _frame_at(data, at)[0] is not None:
+            return at
+        at += 1
+    return len(data)
+
+
+def _kind_name(kind: int) -> str:
+    return Kind(kind).name.lower() if kind in Kind._value2member_map_ else f"kind {kind}"

@@ -1,0 +1,129 @@
+"""The reference clients against the daemon's own ends: written from the documents, they share no code with it."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from daemon.publish import registers
+from hal.clock import SystemClock
+from hal.imu import RawImu
+from hal.inputs import InputPort
+from hal.odometry import RawOdometry
+from tests.daemon.publish.network import publishing
+from tests.daemon.publish.test_registers import snapshot
+from tools.clients import read_modbus, send_odometry
+
+CLIENTS = Path(read_modbus.__file__).parent
+
+
+@pytest.mark.parametrize("path", sorted(CLIENTS.glob("*.*")), ids=lambda path: path.name)
+def test_clients_are_short(path: Path) -> None:
+    assert len(path.read_text().splitlines()) < 100
+
+
+@pytest.mark.parametrize("tcp", [False, True])
+def test_modbus_reader(tcp: bool) -> None:
+    def read(port: int) -> list[dict[str, float | int | str | None]]:
+        reader = read_modbus.Reader("127.0.0.1", port, tcp)
+        try:
+            return [reader.read() for _ in range(3)]
+        finally:
+            reader.close()
+
+    async def run() -> list[dict[str, float | int | str | None]]:
+        async with publishing() as publisher:
+            return await asyncio.to_thread(read, publisher.port)
+
+    for reading in asyncio.run(run()):
+        assert reading == {
+            "seq": 70_000, "state": "TRACKING", "reason": 7, "fault": 9, "x_known": 1, "y_known": 0, "yaw_known": 1,
+            "age": 0.025, "x": 1.2345, "y": -2.3456, "yaw": 3.0, "sigma_x": 0.02, "sigma_y": 0.01, "sigma_yaw": 0.01,
+        }  # fmt: skip
+
+
+def test_modbus_reader_without_a_pose() -> None:
+    block = registers.encode_block(snapshot(pose=None, covariance=None))
+    reading = read_modbus.decode(bytes(9) + block)
+    assert (reading["x"], reading["y"], reading["yaw"], reading["sigma_x"]) == (None, None, None, None)
+    with pytest.raises(ValueError, match="torn"):
+        read_modbus.decode(bytes(9) + block[:-1] + b"\x00")
+    with pytest.raises(ValueError, match="exception 2"):
+        read_modbus.decode(b"\x00\x01\x00\x00\x00\x03\x01\x84\x02")
+
+
+def test_odometry_sender() -> None:
+    odometry: list[RawOdometry] = []
+    imu: list[RawImu] = []
+
+    async def run() -> None:
+        port = InputPort(SystemClock(), "127.0.0.1", 0)
+        tasks = [asyncio.create_task(port.odometry.run(odometry.append)), asyncio.create_task(port.imu.run(imu.append))]
+        await asyncio.sleep(0.01)
+        sender = send_odometry.Sender("127.0.0.1", port.port, shared_clock=True)
+        for number in range(5):
+            sender.odometry(float(number), -1.0, 0.5, time.monotonic() - 0.01)
+            sender.imu(0.25)
+        sender.close()
+        await asyncio.sleep(0.05)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        assert port.invalid == 0
+
+    asyncio.run(run())
+    assert [(o.x, o.y, o.yaw) for o in odometry] == [(float(n), -1.0, 0.5) for n in range(5)]
+    assert all(o.t_rx - o.t_mono >= 0.009 for o in odometry), "the sender's time is used, not the arrival"
+    assert [i.yaw_rate for i in imu] == [0.25] * 5
+
+
+def test_listener_in_c(tmp_path: Path) -> None:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler (cc) on this computer")
+    program = tmp_path / "listen_pose"
+    flags = ["-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+    subprocess.run([compiler, *flags, "-o", program, CLIENTS / "listen_pose.c"], check=True)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    good, blind = registers.encode_datagram(snapshot()), registers.encode_datagram(snapshot(pose=None, seq=2))
+    rubbish = [b"", b"LUMI", good[:-1] + bytes([good[-1] ^ 1]), good[:4] + b"\x02" + good[5:], good + b"\x00"]
+    with (
+        subprocess.Popen(
+            [program, str(port), str(2 + len(rubbish))], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as listener,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+    ):
+        try:
+            wait_until_bound(port)
+            for data in (good, *rubbish, blind):
+                sock.sendto(data, ("127.0.0.1", port))
+            out, err = listener.communicate(timeout=10)
+        finally:
+            listener.kill()
+    assert out.splitlines() == [
+        "seq 70000 t_mono 1234.500000 TRACKING x 1.2345 y -2.3456 yaw 3.000000 age 0.0250 sigma 0.0200 0.0100 0.0100",
+        "seq 2 t_mono 1234.500000 TRACKING no pose",
+    ]
+    words = ("not a pose datagram", "not a pose datagram", "damaged", "another version", "wrong length")
+    assert err.splitlines() == [f"dropped: {word}" for word in words]
+
+
+def wait_until_bound(port: int) -> None:
+    """Until the port cannot be bound any more: the listener has it."""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("0.0.0.0", port))
+            except OSError:
+                return
+        time.sleep(0.01)
+    raise TimeoutError("the listener does not listen")

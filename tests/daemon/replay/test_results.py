@@ -1,0 +1,138 @@
+"""Results as other tools read them."""
+
+from __future__ import annotations
+
+import errno
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from daemon.png import encode_png
+from daemon.results import FREE, OCCUPIED, Folder, OutputRefused, Trajectory, greys, map_yaml, pgm, tum, write_map
+from estimator.grid import Grid
+
+LOGITS = np.array([[4.0, 0.0, -4.0], [-1.4, -1.42, 0.61], [0.63, 10.0, -10.0]], dtype=np.float32)
+"""Row 0 has the smallest y: wall, unknown, free; then just over FREE, just under, just under OCCUPIED; then walls."""
+GRID = Grid(np.array([-3.0, 7.5]), 0.05, LOGITS)
+
+
+def test_grid_pixels_run_from_the_top() -> None:
+    assert greys(GRID).tolist() == [[0, 0, 254], [205, 254, 205], [0, 205, 254]]
+
+
+def load_like_map_server(folder: Path) -> tuple[np.ndarray, dict[str, object]]:
+    """The trinary rule of ROS map_server, from its documentation, with the thresholds of the file."""
+    facts = yaml.safe_load((folder / "map.yaml").read_text())
+    assert not Path(str(facts["image"])).is_absolute()
+    image = np.array(Image.open(folder / facts["image"])).astype(float)
+    assert facts["mode"] == "trinary"
+    assert facts["negate"] == 0
+    p = (255.0 - image) / 255.0
+    cells = np.full(p.shape, -1)
+    cells[p > facts["occupied_thresh"]] = 100
+    cells[p < facts["free_thresh"]] = 0
+    return cells[::-1], facts  # row 0 at the smallest y again
+
+
+def test_map_server_reads_back_what_the_grid_says(tmp_path: Path) -> None:
+    write_map(Folder(tmp_path / "out"), GRID, np.zeros((0, 2)))
+    cells, facts = load_like_map_server(tmp_path / "out")
+    p = GRID.probability
+    assert np.array_equal(cells == 100, p > OCCUPIED)
+    assert np.array_equal(cells == 0, p < FREE)
+    assert np.array_equal(cells == -1, (p >= FREE) & (p <= OCCUPIED))
+    assert facts["origin"] == [-3.0, 7.5, 0.0]
+    assert facts["resolution"] == 0.05
+    assert (facts["occupied_thresh"], facts["free_thresh"]) == (0.65, 0.196)
+
+
+def test_unknown_stays_unknown_under_the_rule_of_the_readers() -> None:
+    assert FREE < (255 - 205) / 255 < OCCUPIED
+
+
+def test_an_empty_map_is_still_a_map(tmp_path: Path) -> None:
+    empty = Grid(np.zeros(2), 0.05, np.zeros((0, 0), np.float32))
+    write_map(Folder(tmp_path), empty, np.zeros((0, 3)))
+    cells, _ = load_like_map_server(tmp_path)
+    assert cells.tolist() == [[-1]]
+    Image.open(tmp_path / "map.png").verify()
+
+
+def test_no_minus_zero_in_the_origin() -> None:
+    assert (
+        "origin: [0.000000, -1.000000, 0.0]" in map_yaml(Grid(np.array([-0.0, -1.0]), 0.05, LOGITS), "m.pgm").decode()
+    )
+
+
+def test_png_shows_the_pixels_it_was_given() -> None:
+    pixels = np.random.default_rng(1).integers(0, 256, (17, 23, 3), dtype=np.uint8)
+    assert np.array_equal(np.array(Image.open(io.BytesIO(encode_png(pixels)))), pixels)
+    assert encode_png(pixels) == encode_png(pixels.copy())
+
+
+def test_the_picture_shows_walls_free_space_and_the_path(tmp_path: Path) -> None:
+    logits = np.full((40, 60), -8.0, np.float32)
+    logits[:, :20] = 0.0
+    logits[0] = 8.0
+    write_map(Folder(tmp_path), Grid(np.array([0.0, 0.0]), 0.1, logits), np.array([(2.5, 1.0), (5.5, 1.0), (5.5, 3.5)]))
+    picture = np.array(Image.open(tmp_path / "map.png")).astype(int)
+    scale = picture.shape[1] // 60
+    assert picture.shape == (40 * scale, 60 * scale, 3)
+
+    def at(x: float, y: float) -> list[int]:
+        return picture[picture.shape[0] - 1 - int(y / 0.1 * scale), int(x / 0.1 * scale)].tolist()
+
+    assert min(at(3.0, 3.0)) > 250  # free
+    assert max(at(5.0, 0.05)) < 60  # wall, at the bottom
+    assert at(1.0, 3.0) == [205, 211, 220]  # unknown
+    assert at(2.5, 1.0) == [37, 99, 235]  # the start, blue
+    assert at(5.5, 3.5) == [220, 38, 38]  # the end, red
+    assert max(at(4.0, 1.0)) - min(at(4.0, 1.0)) > 60  # a coloured path between
+
+
+def test_tum_is_what_evo_and_the_benchmarks_read() -> None:
+    path = Trajectory(
+        np.array([2.0, 1.0, 1.0]), np.array([(1.0, 2.0, np.pi / 2), (0, 0, 0.0), (0.1234567, -1.0, -3.0)])
+    )
+    lines = tum(path).decode().splitlines()
+    assert lines[0].startswith("#")
+    assert lines[1] == "1.000000 0.000000 0.000000 0 0 0 0.000000000 1.000000000"
+    assert lines[2].startswith("1.000000 0.123457 -1.000000 0 0 0 -0.997494987 0.0707372")
+    assert lines[3] == "2.000000 1.000000 2.000000 0 0 0 0.707106781 0.707106781"
+    assert all(len(line.split(" ")) == 8 for line in lines[1:])
+
+
+def test_no_poses_no_lines() -> None:
+    assert tum(Trajectory(np.empty(0), np.empty((0, 3)))).decode().count("\n") == 1
+
+
+def test_folder_problems_are_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputRefused, match=r"file is a file; name a folder"):
+        Folder(tmp_path / "file")
+    with pytest.raises(OutputRefused, match="cannot make"):
+        Folder(tmp_path / "file" / "below")
+
+
+def test_a_full_disk_keeps_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Folder(tmp_path)
+    folder.write("a.txt", b"first")
+
+    def full(self: Path, data: bytes) -> int:
+        self.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OutputRefused, match=r"a\.txt: No space left on device; free space"):
+        folder.write("a.txt", b"second")
+    assert (tmp_path / "a.txt").read_text() == "first"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt"]
+
+
+def test_pgm_head() -> None:
+    assert pgm(GRID).startswith(b"P5\n3 3\n255\n")
+    assert len(pgm(GRID)) == len(b"P5\n3 3\n255\n") + 9

@@ -1,0 +1,239 @@
+"""The state machine: every state and reason by the evidence that should lead there, and what must never be said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon import state as rules
+from daemon.publish.snapshot import State
+from daemon.state import REASONS, Evidence, Match, Memory, Reason, judge
+
+PERIOD = 0.1
+ALL = (True, True, True)
+GOOD = Match(True, ALL)
+BAD = Match(False, (False, False, False))
+CORRIDOR = Match(True, (False, True, True))
+
+
+def seen(t: float, match: Match | None = GOOD, **more: object) -> Evidence:
+    return replace(Evidence(t, silence=0.5, match=match, mapped=True), **more)  # type: ignore[arg-type]  # test shorthand
+
+
+def run(memory: Memory, evidence: Iterable[Evidence]) -> Memory:
+    for item in evidence:
+        memory = judge(memory, item)
+    return memory
+
+
+def scans(begin: float, count: int, match: Match | None = GOOD, **more: object) -> list[Evidence]:
+    return [seen(begin + PERIOD * i, match, **more) for i in range(count)]
+
+
+def tracking(**more: object) -> Memory:
+    memory = run(Memory(), scans(0.0, 30, **more))
+    assert memory.state is State.TRACKING
+    return memory
+
+
+def said(memory: Memory) -> tuple[State, Reason]:
+    return memory.state, memory.reason
+
+
+def test_before_the_first_scan() -> None:
+    assert said(Memory()) == (State.STARTING, Reason.WARMING_UP)
+    assert said(judge(Memory(), Evidence(0.0))) == (State.STARTING, Reason.OPENING_LIDAR)
+    assert said(judge(Memory(), Evidence(0.0, unreachable=True))) == (State.NO_LIDAR, Reason.LIDAR_UNREACHABLE)
+
+
+def test_the_first_scan_makes_the_map_and_proves_nothing() -> None:
+    first = Evidence(0.0, silence=0.1, match=None, mapped=False)
+    assert said(judge(Memory(), first)) == (State.MAPPING, Reason.UNPROVED)
+
+
+def test_a_laser_alone_is_believed_after_it_has_proved_itself_and_not_before() -> None:
+    evidence = scans(0.0, 100)
+    memory, first = Memory(), None
+    for item in evidence:
+        memory = judge(memory, item)
+        if memory.state is State.TRACKING and first is None:
+            first = item.t_mono
+    assert first == pytest.approx(rules.PROOF_S, abs=1.5 * PERIOD)
+    assert said(memory) == (State.TRACKING, Reason.NONE)
+
+
+def test_two_agreeing_witnesses_are_believed_sooner() -> None:
+    count = round((rules.CLEAN_S + 0.8) / PERIOD)
+    assert run(Memory(), scans(0.0, count, agree=True, odometry=True)).state is State.TRACKING
+    assert run(Memory(), scans(0.0, count)).state is State.MAPPING
+
+
+def test_silence_of_three_periods_is_no_lidar_and_not_a_moment_before() -> None:
+    memory = tracking()
+    t = 3.0
+    assert judge(memory, Evidence(t, silence=2.9, mapped=True)).state is State.TRACKING
+    gone = judge(memory, Evidence(t, silence=3.0, mapped=True))
+    assert said(gone) == (State.NO_LIDAR, Reason.LIDAR_SILENT)
+    assert gone.known == (False, False, False)
+    assert judge(gone, Evidence(t, silence=4.0, mapped=True, unreachable=True)).reason is Reason.LIDAR_UNREACHABLE
+
+
+def test_after_a_short_silence_the_pose_is_proved_again() -> None:
+    gone = judge(tracking(), Evidence(3.2, silence=3.0, mapped=True))
+    back = judge(gone, seen(3.3))
+    assert said(back) == (State.MAPPING, Reason.UNPROVED)
+    assert run(back, scans(3.4, 25)).state is State.TRACKING
+
+
+def test_after_a_long_blind_gap_the_proof_takes_longer() -> None:
+    gone = run(tracking(), [Evidence(3.0 + i, silence=3.0 + 10 * i, mapped=True) for i in range(5)])
+    assert gone.doubt
+    soon = run(gone, scans(8.0, 30))
+    assert said(soon) == (State.MAPPING, Reason.UNPROVED)
+    assert run(soon, scans(11.0, 25)).state is State.TRACKING
+
+
+def test_odometry_through_the_gap_leaves_no_doubt() -> None:
+    gaps = [Evidence(3.0 + i, silence=3.0 + 10 * i, mapped=True, odometry=True) for i in range(5)]
+    assert not run(tracking(odometry=True), gaps).doubt
+
+
+def test_one_bad_scan_is_no_news_three_are() -> None:
+    memory = tracking(odometry=True)
+    assert run(memory, scans(3.0, 2, BAD, odometry=True)).state is State.TRACKING
+    failed = run(memory, scans(3.0, 3, BAD, odometry=True))
+    assert said(failed) == (State.DEGRADED, Reason.MATCH_FAILED)
+    assert failed.known == (False, False, False)
+
+
+def test_without_odometry_a_pose_is_held_for_a_second_only() -> None:
+    memory = run(tracking(), scans(3.0, 5, BAD))
+    assert said(memory) == (State.DEGRADED, Reason.MATCH_FAILED)
+    memory = run(memory, scans(3.5, 10, BAD))
+    assert said(memory) == (State.LOST, Reason.NO_WITNESS)
+
+
+def test_a_lost_pose_is_confirmed_for_longer_before_it_is_said_again() -> None:
+    lost = run(tracking(), scans(3.0, 20, BAD))
+    fits = run(lost, scans(5.0, 6))
+    assert said(fits) == (State.RELOCATING, Reason.CONFIRMING)
+    assert run(fits, scans(5.6, 30)).state is State.RELOCATING
+    assert said(run(fits, scans(5.6, 60))) == (State.TRACKING, Reason.NONE)
+    assert run(fits, scans(5.6, 1, BAD)).state is State.LOST
+
+
+def test_lost_stays_lost_through_a_silence() -> None:
+    lost = run(tracking(), scans(3.0, 20, BAD))
+    gone = judge(lost, Evidence(6.0, silence=4.0, mapped=True))
+    assert gone.state is State.NO_LIDAR
+    assert judge(gone, seen(6.1)).state is State.LOST
+
+
+def test_an_unobservable_axis_degrades_and_is_named() -> None:
+    memory = run(tracking(), scans(3.0, rules.AXIS_LOST_SCANS - 1, CORRIDOR))
+    assert (memory.state, memory.known) == (State.TRACKING, ALL)
+    memory = judge(memory, seen(3.5, CORRIDOR))
+    assert said(memory) == (State.DEGRADED, Reason.AXIS_UNKNOWN)
+    assert memory.known == (False, True, True)
+    memory = run(memory, scans(4.0, 7))
+    assert memory.known == ALL
+    assert memory.state is State.DEGRADED
+    assert run(memory, scans(4.7, 10)).state is State.TRACKING
+
+
+def test_a_start_in_a_corridor_is_degraded_not_tracking() -> None:
+    assert said(run(Memory(), scans(0.0, 100, CORRIDOR))) == (State.DEGRADED, Reason.AXIS_UNKNOWN)
+
+
+def test_disagreement_has_to_last_and_then_degrades_while_it_lasts() -> None:
+    memory = run(tracking(odometry=True), scans(3.0, 4, agree=False, odometry=True))
+    assert memory.state is State.TRACKING
+    memory = run(memory, scans(3.4, 4, agree=False, odometry=True))
+    assert said(memory) == (State.DEGRADED, Reason.WITNESSES_DISAGREE)
+    assert run(memory, scans(3.8, 100, agree=False, odometry=True)).state is State.DEGRADED
+    assert run(memory, scans(3.8, 2, agree=True, odometry=True)).state is State.TRACKING
+
+
+def test_configured_odometry_that_does_not_arrive_is_a_missing_witness() -> None:
+    assert said(judge(tracking(), seen(3.0, odometry=False))) == (State.DEGRADED, Reason.ODOMETRY_SILENT)
+
+
+def test_uncertainty_degrades_then_loses() -> None:
+    vague = judge(tracking(), seen(3.0, sigma_m=1.1 * rules.VAGUE_M))
+    assert said(vague) == (State.DEGRADED, Reason.UNCERTAIN)
+    assert said(judge(vague, seen(3.1, sigma_rad=1.1 * rules.LOST_RAD))) == (State.LOST, Reason.UNCERTAIN)
+
+
+def test_looking_for_the_place() -> None:
+    memory = tracking()
+    assert said(judge(memory, seen(3.0, places=0))) == (State.RELOCATING, Reason.SEARCHING)
+    assert said(judge(memory, seen(3.0, places=3))) == (State.AMBIGUOUS, Reason.SEVERAL_PLACES)
+    assert judge(memory, seen(3.0, places=1)).state is State.TRACKING
+
+
+def test_an_order_starts_the_proof_anew() -> None:
+    memory = judge(tracking(), seen(3.0, ordered=True))
+    assert memory.good == 1
+    lost = run(tracking(), scans(3.0, 20, BAD))
+    assert judge(lost, seen(5.0, ordered=True)).state is not State.LOST
+
+
+def test_every_reason_has_a_meaning_and_every_trouble_a_remedy() -> None:
+    assert set(REASONS) == set(Reason)
+    assert all(meaning for meaning, _ in REASONS.values())
+    assert [reason for reason, (_, remedy) in REASONS.items() if not remedy] == [Reason.NONE]
+
+
+matches = st.none() | st.builds(Match, st.booleans(), st.tuples(st.booleans(), st.booleans(), st.booleans()))
+evidences = st.lists(
+    st.builds(
+        Evidence,
+        t_mono=st.floats(0.001, 0.5),  # made cumulative below
+        silence=st.none() | st.floats(0.0, 6.0),
+        unreachable=st.booleans(),
+        match=matches,
+        mapped=st.booleans(),
+        sigma_m=st.sampled_from([0.0, 0.0, 0.2, 3.0]),
+        sigma_rad=st.sampled_from([0.0, 0.0, 0.2, 3.0]),
+        odometry=st.sampled_from([None, True, False]),
+        agree=st.sampled_from([None, True, False]),
+        places=st.sampled_from([None, None, None, 0, 1, 2]),
+        ordered=st.sampled_from([False, False, True]),
+    ),
+    max_size=60,
+)
+
+
+@given(steps=evidences)
+def test_what_must_hold_whatever_happens(steps: list[Evidence]) -> None:
+    memory, t = tracking(odometry=True), 3.0
+    for step in steps:
+        t += step.t_mono
+        evidence = replace(step, t_mono=t)
+        memory = judge(memory, evidence)
+        if memory.state is State.TRACKING:
+            assert all(memory.known)
+            assert evidence.silence is not None
+            assert evidence.silence < rules.SILENT_PERIODS
+            assert memory.failed < rules.FAILED_SCANS
+            assert evidence.odometry is not False
+            assert evidence.sigma_m <= rules.VAGUE_M
+            assert not memory.lost
+            assert not memory.doubt
+        assert (memory.reason is Reason.NONE) == (memory.state is State.TRACKING)
+        if evidence.silence is not None and evidence.silence >= rules.SILENT_PERIODS:
+            assert memory.state is State.NO_LIDAR
+
+
+@given(steps=evidences)
+def test_from_anywhere_good_scans_lead_back_to_tracking(steps: list[Evidence]) -> None:
+    memory, t = Memory(), 0.0
+    for step in steps:
+        t += step.t_mono
+        memory = judge(memory, replace(step, t_mono=t))
+    memory = run(memory, scans(t + PERIOD, 80))
+    assert memory.state is State.TRACKING

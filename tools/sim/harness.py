@@ -1,0 +1,198 @@
+"""A whole daemon and a whole simulated world in one process and in virtual time, as fast as the machine can.
+
+The lidar is a fake HOKUYO on a memory port that carries the very bytes a tty carries; odometry arrives as the very
+datagrams a socket carries. Nothing reads a real clock, so one seed gives one result. For tests and experiments.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from daemon.budget import FixedBudget
+from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig
+from daemon.main import Daemon, World
+from daemon.publish.snapshot import Snapshot, State
+from daemon.worker import CycleWorker
+from hal.clock import LoopClock, run_virtual
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import Unit
+from hal.fake.schedule import FaultSchedule
+from hal.fake.transport import FakeOpener
+from hal.inputs import InputPort
+from tools.sim.feed import feed_odometry
+from tools.sim.scene import Scenario, Scene, SimulatedScene
+from tools.sim.world import Array
+
+DEVICE: Final = "/dev/simulated"
+_ANY_PORT: Final = 1  # says that odometry is configured; the harness delivers the datagrams itself
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """What came out. All arrays have one row per published snapshot; angles in rad, NaN where nothing was known.
+
+    Attributes:
+        t_mono: instant each pose is true for. pose: T_map_base (n, 3). odom: T_odom_base (n, 3).
+        truth: true poses in the map frame, which is where the robot stood at the first pose.
+        sigma: (n, 3) one-sigma of x, y, yaw. known: (n, 3) axes said to be observed. state, reason: as published.
+        snapshots: all of them, as published. scans_sent: by the fake sensor.
+    """
+
+    t_mono: Array
+    pose: Array
+    odom: Array
+    truth: Array
+    sigma: Array
+    known: npt.NDArray[np.bool_]
+    state: npt.NDArray[np.int64]
+    reason: npt.NDArray[np.int64]
+    snapshots: tuple[Snapshot, ...] = field(repr=False)
+    scans_sent: int
+
+    @property
+    def error_m(self) -> Array:
+        """Distance between published and true position, (n,)."""
+        return np.asarray(np.hypot(*(self.pose[:, :2] - self.truth[:, :2]).T))
+
+    @property
+    def error_rad(self) -> Array:
+        """Published minus true heading, (n,), wrapped."""
+        return np.asarray(np.angle(np.exp(1j * (self.pose[:, 2] - self.truth[:, 2]))))
+
+    def share(self, *states: State) -> float:
+        """Share of the snapshots that were in one of the states."""
+        return float(np.mean(np.isin(self.state, [int(state) for state in states])))
+
+
+def run(
+    seconds: float,
+    scenario: Scenario | None = None,
+    scene: Scene | None = None,
+    faults: str = "",
+    odometry: bool = True,
+) -> Run:
+    """Run daemon and world together for some virtual seconds.
+
+    Args:
+        seconds: from the first scan asked for.
+        scenario: the simulated scene; default the paper's robot in the paper's room.
+        scene: another scene, instead of a scenario.
+        faults: TOML schedule of lidar faults.
+        odometry: whether wheel odometry is fed.
+
+    Raises:
+        RuntimeError: the daemon ended by itself, or never published a pose.
+    """
+    if scene is None:
+        scene = SimulatedScene(scenario or Scenario())
+    x, y, yaw = scene.mount
+    seed = scene.scenario.seed if isinstance(scene, SimulatedScene) else 0
+    settings = Config(
+        lidar=LidarConfig(device=DEVICE, mount=Mount(x, y, math.degrees(yaw))),
+        odometry=OdometryConfig(port=_ANY_PORT if odometry else 0),
+        modbus=ModbusConfig(port=0),
+    )
+    snapshots: list[Snapshot] = []
+    sent = run_virtual(_main(settings, scene, snapshots, _Order(seconds, faults, seed)))
+    return _collect(snapshots, scene, sent)
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    seconds: float
+    faults: str
+    seed: int
+
+
+async def _main(settings: Config, scene: Scene, snapshots: list[Snapshot], order: _Order) -> int:
+    loop = asyncio.get_running_loop()
+    clock = LoopClock(loop)
+    device = FakeHokuyo(scene.model, scene.scan, unit=Unit(seed=order.seed), rotor=scene.rotor())
+    opener = FakeOpener(clock)
+    opener.plug(DEVICE, device)
+    schedule = FaultSchedule({"lidar": device})
+    if order.faults:
+        schedule.load(order.faults)
+    daemon = Daemon(settings, world(clock, opener, snapshots))
+    stop = asyncio.Event()
+    loop.call_later(order.seconds, stop.set)
+    wheels = _connect_wheels(daemon, scene, clock) if settings.odometry.port else None
+    try:
+        await daemon.run(stop)
+    finally:
+        if wheels is not None:
+            wheels.cancel()
+        schedule.close()
+        device.close()
+    return device.scans_sent
+
+
+def world(clock: LoopClock, opener: FakeOpener, snapshots: list[Snapshot]) -> World:
+    """What the daemon meets in virtual time: no thread, no stopwatch, no chance."""
+
+    async def warm() -> None:
+        from daemon.warmup import load
+
+        load()
+
+    return World(
+        clock=clock,
+        opener=opener,
+        make_worker=CycleWorker,
+        make_budget=FixedBudget,
+        stopwatch=None,
+        warm_up=warm,
+        sinks=(snapshots.append,),
+        draw_map_id=lambda: 1,
+    )
+
+
+def _connect_wheels(daemon: Daemon, scene: Scene, clock: LoopClock) -> asyncio.Task[None]:
+    """Feed odometry datagrams past the socket, which would wait in real time."""
+    for part in ("odometry", "imu"):
+        daemon.network.parts.pop(part)
+    port = InputPort(clock, "", _ANY_PORT)
+    port.send_odometry_to(daemon.cycle.inbox.put_odometry)
+    return asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
+
+
+def _collect(snapshots: list[Snapshot], scene: Scene, scans_sent: int) -> Run:
+    posed = [snapshot for snapshot in snapshots if snapshot.pose is not None]
+    if not posed:
+        last = snapshots[-1].state.name if snapshots else "no snapshot at all"
+        raise RuntimeError(f"the daemon never published a pose; its last state was {last}")
+    t = np.array([snapshot.t_mono for snapshot in snapshots])
+    covariance = np.array([snapshot.covariance or [np.nan] * 6 for snapshot in snapshots])
+    pose = _poses(snapshots, "pose")
+    first = snapshots.index(posed[0])
+    truth = in_frame_of(scene.truth(t), scene.truth(t[first : first + 1])[0], pose[first])
+    return Run(
+        t_mono=t,
+        pose=pose,
+        odom=_poses(snapshots, "odom"),
+        truth=truth,
+        sigma=np.sqrt(covariance[:, [0, 2, 5]]),
+        known=np.array([snapshot.known for snapshot in snapshots]),
+        state=np.array([int(snapshot.state) for snapshot in snapshots]),
+        reason=np.array([snapshot.reason for snapshot in snapshots]),
+        snapshots=tuple(snapshots),
+        scans_sent=scans_sent,
+    )
+
+
+def _poses(snapshots: list[Snapshot], name: str) -> Array:
+    return np.array([getattr(snapshot, name) or [np.nan] * 3 for snapshot in snapshots])
+
+
+def in_frame_of(truth: Array, at: Array, pose: Array) -> Array:
+    """True poses (n, 3) as seen from the map in which the robot, truly ``at``, has ``pose``."""
+    turn = pose[2] - at[2]
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = truth[:, 0] - at[0], truth[:, 1] - at[1]
+    return np.column_stack([pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, truth[:, 2] + turn])

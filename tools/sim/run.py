@@ -1,0 +1,188 @@
+"""The simulated world as a process of its own, in real time: a lidar on a pty or TCP, odometry datagrams, the truth.
+
+::
+
+    python -m tools.sim --building paper_room --pty /tmp/lidar --odometry udp://127.0.0.1:5601
+    python -m tools.sim --building office_floor --lidar UST-20LX --tcp 127.0.0.1:10940 --truth truth.tum
+    python -m tools.sim --log intel.clf.gz --pty /tmp/lidar --odometry udp://127.0.0.1:5601
+
+It meets the daemon only there. The robot stands still until the lidar is first read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import secrets
+import signal
+import sys
+from collections.abc import Callable, Coroutine
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.errors import HalError
+from hal.fake.faults import FaultError
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import MODELS, Unit
+from hal.fake.pty_server import PtyServer
+from hal.fake.schedule import FaultSchedule
+from hal.fake.tcp_server import TcpServer
+from tools.sim.buildings import BUILDINGS
+from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
+from tools.sim.hybrid import HybridScene
+from tools.sim.scene import Scenario, Scene, SimulatedScene
+
+LOG_LEAD_S = 3.0
+"""A log starts this long after the simulator, so that its first scans find a reader."""
+
+
+@dataclass(slots=True)
+class Options:
+    """The command line, see :func:`parser`."""
+
+    building: str
+    log: Path | None
+    lidar: str
+    seed: int
+    empty: bool
+    laps: float
+    dwell: float
+    pty: Path | None
+    tcp: str | None
+    odometry: str | None
+    truth: str | None
+    faults: Path | None
+    clock_ppm: float
+    seconds: float
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(prog="python -m tools.sim", description="The simulated world in real time.")
+    add = made.add_argument
+    add("--building", default="paper_room", choices=sorted(BUILDINGS), help="where (default %(default)s)")
+    add("--log", type=Path, help="a CARMEN log whose scans drive the lidar, instead of a building")
+    add("--lidar", default="paper", choices=sorted(MODELS), help="type of sensor (default %(default)s)")
+    add("--seed", type=int, default=0, help="of noise, slip and people")
+    add("--empty", action="store_true", help="nobody walks about")
+    add("--laps", type=float, default=np.inf, help="tours to drive, then stand still (default: for ever)")
+    add("--dwell", type=float, default=2.0, help="seconds of standing still before each tour (default %(default)s)")
+    add("--pty", type=Path, metavar="LINK", help="the lidar as a serial port, found by this symbolic link")
+    add("--tcp", metavar="HOST:PORT", help="the lidar over TCP; port 0 chooses a free one")
+    add("--odometry", metavar="udp://HOST:PORT", help="where wheel odometry datagrams go")
+    add("--truth", metavar="udp://HOST:PORT|FILE", help="where the true pose goes: JSON datagrams, or a TUM file")
+    add("--faults", type=Path, metavar="FILE", help="TOML schedule of lidar faults, starts at once")
+    add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
+    add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
+    return made
+
+
+def make_scene(options: Options, t_mono: float) -> Scene:
+    """A building or a log; a log starts a little after ``t_mono``, its clock cannot wait for a reader."""
+    if options.log is None:
+        scenario = Scenario(
+            options.building,
+            options.lidar,
+            options.seed,
+            people=not options.empty,
+            dwell_s=options.dwell,
+            laps=options.laps,
+        )
+        return SimulatedScene(scenario)
+    from hal.replay.carmen import read_carmen
+
+    log = read_carmen(options.log)
+    return HybridScene(log.events(t_mono + LOG_LEAD_S), mount=log.mount)
+
+
+async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None:
+    """Run until told to stop. ``say`` gets one object when the devices are there and one at the end."""
+    loop = asyncio.get_running_loop()
+    scene = make_scene(options, loop.time())
+    unit = Unit(serial=f"SIM{options.seed:05d}", clock_gain=options.clock_ppm * 1e-6, seed=options.seed)
+    device = FakeHokuyo(scene.model, scene.scan, unit=unit, rotor=scene.rotor())
+    async with AsyncExitStack() as stack:
+        stack.callback(device.close)
+        if options.faults is not None:
+            schedule = FaultSchedule({"lidar": device})
+            stack.callback(schedule.close)
+            schedule.load(options.faults.read_text(encoding="utf-8"))
+        lidar = await _connect(options, device, stack)
+        feeds = _feeds(options, scene, stack)
+        say({"lidar": lidar, "model": scene.model.modl, "start": scene.truth(np.array([loop.time()]))[0].tolist()})
+        await _until_told(options.seconds, feeds)
+    counts = device.counts
+    say({"scans": device.scans_sent, "sent": counts.sent, "unheard": counts.unheard, "lost": counts.lost_in_sensor})
+
+
+async def _connect(options: Options, device: FakeHokuyo, stack: AsyncExitStack) -> str:
+    """Offer the lidar; returns what the daemon's ``lidar.device`` has to be."""
+    if options.tcp is None:
+        pty = PtyServer(device, options.pty)
+        stack.callback(pty.close)
+        return pty.path
+    host, _, port = options.tcp.rpartition(":")
+    if not port.isdigit():
+        raise ValueError(f"--tcp {options.tcp}: expected HOST:PORT")
+    server = TcpServer(device)
+    stack.push_async_callback(server.close)
+    return f"tcp://{host}:{await server.listen(host, int(port))}"
+
+
+def _feeds(options: Options, scene: Scene, stack: AsyncExitStack) -> list[Coroutine[Any, Any, None]]:
+    feeds = []
+    if options.odometry is not None:
+        sender = UdpSender(options.odometry)
+        stack.callback(sender.close)
+        feeds.append(feed_odometry(scene, sender.send, session=secrets.randbits(32)))
+    if options.truth is not None:
+        sink = UdpSender(options.truth) if options.truth.startswith("udp:") else TumWriter(Path(options.truth))
+        stack.callback(sink.close)
+        feeds.append(feed_truth(scene, sink.tell))
+    return feeds
+
+
+async def _until_told(seconds: float, feeds: list[Coroutine[Any, Any, None]]) -> None:
+    """Run the feeds until a signal or the time's end; a feed that fails ends everything."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    if seconds > 0:
+        loop.call_later(seconds, stop.set)
+    tasks = [asyncio.create_task(feed) for feed in feeds]
+    stopped = asyncio.create_task(stop.wait())
+    try:
+        pending = {stopped, *tasks}
+        while stopped in pending:
+            done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+    finally:
+        for task in (stopped, *tasks):
+            task.cancel()
+        await asyncio.gather(stopped, *tasks, return_exceptions=True)
+
+
+def _say(what: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run until interrupted; 2 when something in the arguments is wrong."""
+    options = Options(**vars(parser().parse_args(arguments)))
+    if options.pty is not None and options.tcp is not None:
+        sys.stderr.write("one sensor has one line: give --pty or --tcp\n")
+        return 2
+    try:
+        asyncio.run(serve(options, _say))
+    except (HalError, FaultError, OSError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    return 0
