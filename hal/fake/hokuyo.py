@@ -226,7 +226,8 @@ class FakeHokuyo:
         self._core.orders.remove(fault)
         effects = self._effects().get(fault.what)
         if effects is not None:
-            effects[1](fault)
+            other = self._core.orders.on(fault.what)  # the same was ordered twice
+            effects[1](fault) if other is None else effects[0](other)
 
     def _effects(self) -> dict[str, tuple[Effect, Effect]]:
         """What the words do at their beginning and at their end, beyond being in force."""
@@ -243,7 +244,7 @@ class FakeHokuyo:
             "verify": (self._verify, lambda _: self._verified()),
             "baud": (lambda f: core.use_baud(int(f.number("rate"))), _nothing),
             "inject": (lambda f: self.receive(f.text("text").encode("latin-1")), _nothing),
-            "reset": (lambda _: self.power_on(keep_link=True), _nothing),
+            "reset": (lambda _: None if core.orders.on("off") else self.power_on(keep_link=True), _nothing),
             "scip1": (lambda _: self._fall_back(), _nothing),
             "set_clock": (lambda f: core.clock.set(core.now(), f.number("ms")), _nothing),
             "error": (self._fail, _nothing),

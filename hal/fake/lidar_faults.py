@@ -5,6 +5,7 @@ from __future__ import annotations
 from hal.fake.commands import PARAMETERS, SINGLES, STREAMS
 from hal.fake.faults import Parameter, Vocabulary, Word
 from hal.fake.outlet import MAX_JOIN
+from hal.fake.scip_encoder import MAX_3
 
 ON = {"on": Parameter("scans", choices=("scans", "replies", "all"))}
 COMMANDS = tuple(sorted({*PARAMETERS, *STREAMS, *SINGLES, "SC"}))
@@ -15,7 +16,9 @@ LIDAR: Vocabulary = {
     "off": Word("no power: the connection drops (a serial line falls silent), then a boot", "lasts"),
     "stuck": Word("the same scan with the same stamp again and again", "strikes"),
     "garbage": Word("random bytes of the same length instead", "strikes", ON),
-    "wrong": Word("valid ranges off by `by_mm`, with correct sums", "strikes", {"by_mm": Parameter(500)}),
+    "wrong": Word(
+        "valid ranges off by `by_mm`, with correct sums", "strikes", {"by_mm": Parameter(500, -MAX_3, MAX_3)}
+    ),
     "slow": Word("the motor takes `factor` times the period", "lasts", {"factor": Parameter(2.0, 0.1, 100.0)}),
     "delayed": Word("everything arrives `by_s` later, in order", "lasts", {"by_s": Parameter(0.3, 0.0, 60.0)}),
     "intermittent": Word("scans are lost on the way", "strikes", ON, share=0.5),
@@ -39,11 +42,13 @@ LIDAR: Vocabulary = {
     "status": Word("a scan's 99 is another status, without data", "strikes", {"code": Parameter(50, 0, 99)}),
     "frozen_stamp": Word("the stamp stands still while ranges go on", "strikes"),
     "stamp_jump": Word("stamps are off by `by_ms`", "strikes", {"by_ms": Parameter(-5000, -(1 << 24), 1 << 24)}),
-    "wrong_steps": Word("`by` steps more or fewer than asked for, with correct sums", "strikes", {"by": Parameter(-1)}),
+    "wrong_steps": Word(
+        "`by` steps more or fewer than asked for, with correct sums", "strikes", {"by": Parameter(-1, -1000, 1000)}
+    ),
     "codes": Word(
         "a share of the beams reports `value` (an error code, or 65533: no return)",
         "strikes",
-        {"value": Parameter(65533, 0, (1 << 18) - 1), "beams": Parameter(0.3, 0.0, 1.0)},
+        {"value": Parameter(65533, 0, MAX_3), "beams": Parameter(0.3, 0.0, 1.0)},
     ),
     "dark": Word("all intensities are 0", "strikes"),
     # the line
@@ -70,7 +75,7 @@ LIDAR: Vocabulary = {
         {"variant": Parameter("whole", choices=("whole", "mark"))},
     ),
     "semicolon": Word("the firmware text holds a semicolon", "lasts"),
-    "dmax": Word("PP reports another DMAX", "lasts", {"value": Parameter((1 << 18) - 1, 1)}),
+    "dmax": Word("PP reports another DMAX", "lasts", {"value": Parameter(MAX_3, 1)}),
     "trouble": Word("II reports a fault in words", "lasts", {"text": Parameter("Trouble!! Error No. =[00->33]")}),
     # power and state
     "reset": Word("brown-out: starts up again, connection kept", "once"),

@@ -476,6 +476,26 @@ def test_verify() -> None:
     assert len(got) > 35
 
 
+def test_the_same_ordered_twice_ends_with_the_last() -> None:
+    twice = order("off", when=1.0, **{"for": 1.0}) + "\n" + order("off", when=1.5, **{"for": 2.0})
+    twice += "\n" + order("reset", when=2.5)  # no effect without power
+    twice += "\n" + order("slow", factor=4.0, when=6.0) + "\n" + order("slow", factor=2.0, when=6.0, **{"for": 0.5})
+
+    async def scene(talk: Talk) -> tuple[list[bool], int]:
+        talk.schedule.load(twice)
+        seen = []
+        for _ in range(6):
+            await asyncio.sleep(0.9)
+            seen.append(talk.device.reachable)
+        await asyncio.sleep(1.6)
+        await talk.open()
+        return seen, int(np.diff([scan.tick for scan in (await talk.ask(MD, 1.0))[1:]]).mean())
+
+    seen, step = virtual(scene)
+    assert seen == [True, False, False, False, True, True]
+    assert step == pytest.approx(100, abs=1)
+
+
 @pytest.mark.parametrize("what", sorted(LIDAR))
 def test_lifted_faults_leave_a_sound_stream(what: str) -> None:
     """However a fault ends, a sensor that is opened and asked again streams as before."""
