@@ -122,6 +122,9 @@ class Talk:
     def _lose(self, error: HalError) -> None:
         self.lost = error
 
+    async def wait(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
     def say(self, text: str) -> None:
         assert self.port is not None
         self.port.write(text.encode("latin-1"))
