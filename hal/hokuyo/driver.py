@@ -140,9 +140,13 @@ class HokuyoDriver:
         if self._faults >= _REOPEN_FROM:
             return False
         await asyncio.sleep(self._pause())
+        if session.baud:
+            await session.find_rate(session.baud)
         await session.settle()
         if self._faults >= _RESET_FROM:
             await session.reset()
+        assert session.identity is not None
+        await self._suit_rate(session, session.identity)
         return True
 
     async def _find(self) -> Session:

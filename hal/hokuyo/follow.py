@@ -17,6 +17,7 @@ from hal.lidar import LidarStatus, RawScan
 
 _PATIENCE_S: Final = 1.0
 _PATIENCE_PERIODS: Final = 10
+_LOOK_S: Final = 0.25
 _SELF_CHECK_S: Final = 10.0  # a sensor that stopped to verify an error (status 21 to 49) takes seconds
 _WATCH_CABLE: Final = "check its cable and power; it is restarted by itself"
 
@@ -50,9 +51,7 @@ class Follower:
 
     def take(self, frame: bytes, t_rx: float) -> None:
         """One frame, as the line hands it over."""
-        if self._line.dropped_bytes != self._dropped:
-            self._dropped = self._line.dropped_bytes
-            self._status.resyncs += 1
+        self._note_dropped()
         try:
             reply = parse_reply(frame)
             if reply.status == scip.DATA:
@@ -75,7 +74,7 @@ class Follower:
                 left = self._deadline - self._clock.now()
                 if left <= 0:
                     raise self._silence()
-                await asyncio.wait({self._trouble}, timeout=left)
+                await asyncio.wait({self._trouble}, timeout=min(left, _LOOK_S))
                 if self._trouble.done():
                     raise self._trouble.result()
         finally:
@@ -112,8 +111,18 @@ class Follower:
         self._damaged = why
         self._status.error = DataInvalid(self._line.port.name, f"a frame was dropped: {why}")
 
+    def _note_dropped(self) -> bool:
+        dropped = self._line.dropped_bytes
+        if dropped == self._dropped:
+            return False
+        self._dropped = dropped
+        self._status.resyncs += 1
+        return True
+
     def _silence(self) -> HalError:
         name = self._line.port.name
+        if self._note_dropped() and not self._damaged:
+            return DataInvalid(name, "only unreadable bytes come", "check its cable and, on RS-232, the line rate")
         if self._damaged:
             return DataInvalid(name, f"only damaged frames come ({self._damaged})", _WATCH_CABLE)
         what = "has fallen silent" if self.scans else f"sends no scan within {FIRST_SCAN_S:g} s"

@@ -205,13 +205,3 @@ def line_speed(device: str, baud: int, facts: ModelFacts) -> float:
     if device.startswith("tcp://"):
         return _BYTES_PER_S["ethernet"]
     return _BYTES_PER_S["usb" if "ttyACM" in device else facts.line]
-
-
-def latency_s(identity: Identity, request: ScanRequest, bytes_per_s: float) -> float:
-    """Seconds from the beam at step 0 to the arrival of a frame's last byte when nothing delays it.
-
-    Data leave the sensor at once after the last measurable step (C-42-03320B; UST on the next tick of its millisecond
-    clock, which is a delay like any other), and then take their time on the line.
-    """
-    geometry = identity.geometry
-    return geometry.amax * geometry.beam_dt_s + request.frame_bytes / bytes_per_s

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from hal.hokuyo.models import Identity, latency_s
+from hal.hokuyo.models import Identity
 from hal.hokuyo.payload import Ints, ScanReply, ScanRequest, parse_scan
 from hal.hokuyo.scip import Reply
 from hal.hokuyo.ticks import ScanTime, TickClock
@@ -29,8 +29,11 @@ class ScanStream:
         self.identity = identity
         self.request = request
         self._status = status
+        # data leave at once after the last measurable step, whatever part of the turn was asked for (C-42-03320B);
+        # a UST's wait for the next tick of its millisecond clock is a delay like any other
+        geometry, turns = identity.geometry, request.skip + 1
         self._clock = TickClock(
-            identity.geometry.period_s * (request.skip + 1), latency_s(identity, request, bytes_per_s)
+            geometry.period_s * turns, geometry.amax / geometry.ares / turns, request.frame_bytes / bytes_per_s
         )
         self._resets_seen = 0
         self._dmax = identity.geometry.dmax

@@ -31,6 +31,8 @@ _SETTLED_SCANS: Final = 20
 _STUCK_REPEATS: Final = 2
 _AHEAD_S: Final = 0.5  # a first scan may have been late by this much when it set the scale
 _AHEAD_SETTLED_S: Final = 0.015
+_EARLY_S: Final = 0.002  # earlier than ever before by this: believed when it happens again and again
+_EARLY_BELIEVED: Final = 3
 _LAG_S: Final = 0.020  # a lag that outlasts _LAG_BINS was a jump of the clock, not a queue
 _LAG_BINS: Final = 40
 
@@ -84,8 +86,11 @@ class Unwrapper:
             return Verdict.REPEATED
         unwrapped = stamp + TICK_MODULUS * round((newest_ms - stamp) / TICK_MODULUS)
         ahead = unwrapped - newest_ms
-        if ahead <= ahead_ms and unwrapped > self.last and _whole_revolutions(unwrapped - self.last, period_ms):
-            return self._accept(unwrapped, t_rx, Verdict.GOOD)
+        step_ms = unwrapped - self.last
+        if ahead <= ahead_ms and step_ms > 0:
+            as_long = abs(step_ms - 1000.0 * (t_rx - self._t_last)) < 0.2 * self._nominal_ms  # then the motor changes
+            if as_long or _whole_revolutions(step_ms, period_ms):
+                return self._accept(unwrapped, t_rx, Verdict.GOOD)
         before, self._doubtful = self._doubtful, (stamp, t_rx)
         if before is not None and self._continues(before, stamp, t_rx):
             return self._accept(stamp, t_rx, Verdict.RESTARTED)
@@ -114,7 +119,12 @@ def _whole_revolutions(step_ms: float, period_ms: float) -> bool:
 
 
 class Revolutions:
-    """Sensor time of each scan in fractional ms, from whole ms and the evenness of the motor."""
+    """Sensor time of each scan in fractional ms, from whole ms and the evenness of the motor.
+
+    Attributes:
+        exact_ms: of the latest scan. period_ms: learned time between two scans of the stream.
+        steady: False while the motor changes its speed, and shortly after.
+    """
 
     def __init__(self, nominal_ms: float) -> None:
         self._nominal_ms = nominal_ms
@@ -124,6 +134,7 @@ class Revolutions:
         """Forget the phase and the learned period."""
         self.exact_ms = -1.0
         self.period_ms = self._nominal_ms
+        self.steady = True
         self._index = 0
         self._anchors: deque[tuple[int, float]] = deque()
 
@@ -138,12 +149,27 @@ class Revolutions:
             self.exact_ms = unwrapped + 0.5
             self._anchors.append((0, self.exact_ms))
             return 0
-        turns = max(1, round((unwrapped - self.exact_ms) / self.period_ms))
+        step_ms = unwrapped - self.exact_ms
+        turns = max(1, round(step_ms / self.period_ms))
         self._index += turns
         predicted = self.exact_ms + turns * self.period_ms
         self.exact_ms = min(max(predicted, float(unwrapped)), unwrapped + 1.0)
-        self._learn()
+        if abs(self.exact_ms - predicted) > 2.0 + 0.02 * self.period_ms * turns:
+            self._begin_again(unwrapped, step_ms)
+        else:
+            self._learn()
+            self.steady = self.steady or self._index >= 5
         return turns
+
+    def _begin_again(self, unwrapped: int, step_ms: float) -> None:
+        """The motor has changed its speed: learn from here on."""
+        self.exact_ms = unwrapped + 0.5
+        if step_ms < 3.0 * self._nominal_ms:
+            self.period_ms = max(step_ms, 0.3 * self._nominal_ms)
+        self.steady = False
+        self._index = 0
+        self._anchors.clear()
+        self._anchors.append((0, self.exact_ms))
 
     def _learn(self) -> None:
         oldest_index, oldest_ms = self._anchors[0]
@@ -245,18 +271,21 @@ class TickClock:
 
     Args:
         period_s: nominal time between two scans of the stream.
-        latency_s: from the beam at step 0 to the arrival of the frame's last byte, undelayed.
-        latency_sigma_s: how well that is known.
+        sweep: periods from the beam at step 0 to the moment at which the data are complete.
+        line_s: time the bytes of a scan take on the line, undelayed.
+        latency_sigma_s: how well both are known.
     """
 
-    def __init__(self, period_s: float, latency_s: float, latency_sigma_s: float = 2e-4) -> None:
-        self._latency_s = latency_s
+    def __init__(self, period_s: float, sweep: float, line_s: float, latency_sigma_s: float = 2e-4) -> None:
+        self._sweep = sweep
+        self._line_s = line_s
         self._latency_sigma_s = latency_sigma_s
         self._unwrapper = Unwrapper(1000.0 * period_s)
         self._revolutions = Revolutions(1000.0 * period_s)
         self._envelope = Envelope()
         self._count = 0
         self._excess = 0.0
+        self._early = 0
         self._t_last = -math.inf
         self.resets = 0
 
@@ -291,28 +320,39 @@ class TickClock:
             return None
         periods = self._revolutions.feed(self._unwrapper.last)
         x = 1e-3 * self._revolutions.exact_ms
-        excess = self._envelope.feed(x, t_rx - x)
+        delay = t_rx - x - self._sweep * 1e-3 * self._revolutions.period_ms
+        if self._believable(x, delay):
+            excess = self._envelope.feed(x, delay)
+            self._excess += (excess - self._excess) / min(self._count + 1, 200)
         if self._envelope.lag_lasts:
             self._note_reset()
             self._unwrapper.restart()
             return None
         self._count += 1
-        self._excess += (excess - self._excess) / min(self._count, 200)
-        t_mono = x + self._envelope.delay(x) - self._latency_s
+        t_mono = x + self._envelope.delay(x) - self._line_s
         if t_mono <= self._t_last:
             return None
         self._t_last = t_mono
         return ScanTime(t_mono, self._sigma(), max(1, periods))
 
+    def _believable(self, x: float, delay: float) -> bool:
+        """False for a delay that says more about a motor in change than about the clocks."""
+        if self._count == 0:
+            return True
+        early = self._count >= _SETTLED_SCANS and delay < self._envelope.delay(x) - _EARLY_S
+        self._early = self._early + 1 if early else 0
+        return self._revolutions.steady and (not early or self._early >= _EARLY_BELIEVED)
+
     def _expect(self, t_rx: float) -> tuple[float, float]:
         """Newest stamp that could arrive now, and how far past that is still believed; ms."""
         if self._unwrapper.last < 0:
             return 0.0, 0.0
+        sweep_s = self._sweep * 1e-3 * self._revolutions.period_ms
         x = 1e-3 * self._unwrapper.last
-        for _ in range(2):  # t = x + delay(x), solved for x
-            x = t_rx - self._envelope.delay(x)
+        for _ in range(2):  # t = x + sweep + delay(x), solved for x
+            x = t_rx - sweep_s - self._envelope.delay(x)
         settled = self._count >= _SETTLED_SCANS
-        gap = max(0.0, t_rx - self._envelope.delay(x) - 1e-3 * self._unwrapper.last)
+        gap = max(0.0, x - 1e-3 * self._unwrapper.last)
         ahead = (_AHEAD_SETTLED_S if settled else _AHEAD_S) + SLOPE_LIMIT * gap
         return 1000.0 * x, 1000.0 * ahead
 
