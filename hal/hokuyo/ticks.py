@@ -5,9 +5,7 @@ Three stages, each a class:
 1. :class:`Unwrapper` decides what a stamp is: the next revolution, a wrap, a repeat, a damaged or restarted clock.
 2. :class:`Revolutions` finds the fraction of the millisecond that the stamp cut off: the motor turns evenly, so a run
    of whole milliseconds around an uneven period pins it down like a vernier.
-3. :class:`Envelope` maps sensor seconds to host seconds. Arrival is never early, only late, so the truth is the lower
-   edge of (arrival - stamp). The line under all points that lies closest to them is an edge of their convex hull
-   (Moon, Skelly, Towsley: "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
+3. :class:`hal.hokuyo.envelope.Envelope` maps sensor seconds to host seconds by the lower edge of (arrival - stamp).
 
 A stamp names the moment the beam passes step 0 (SCIP 2.0, C-42-03320B); because the map is made from the same stamps,
 a constant error of a firmware's stamps cancels, and only the constant way from step 0 to arrival must be known.
@@ -15,26 +13,29 @@ a constant error of a firmware's stamps cancels, and only the constant way from 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from hal.hokuyo.envelope import LAG_S, SLOPE_LIMIT, Envelope
 from hal.hokuyo.scip import TICK_MODULUS
 
-SLOPE_LIMIT: Final = 1.5e-3  # of sensor clock against host clock; quartz does 50e-6, accept much worse
-_BIN_S: Final = 0.25
+_LEARN_TURNS: Final = 300  # over fewer, the one millisecond of a stamp shows in the period
 _WINDOW_S: Final = 30.0
+_DRIFT_MS: Final = 1.2  # a cut-off fraction is at most 1 ms
+_DRIFT_SCANS: Final = 40
+_ROUGH_SCANS: Final = 10  # by then the period is known better than nominally
+_CORRECTED_MS: Final = 0.05
 _SETTLED_SCANS: Final = 20
 _STUCK_REPEATS: Final = 2
 _AHEAD_S: Final = 0.5  # a first scan may have been late by this much when it set the scale
 _AHEAD_SETTLED_S: Final = 0.015
 _EARLY_S: Final = 0.002  # earlier than ever before by this: believed when it happens again and again
-_EARLY_BELIEVED: Final = 3
-_LAG_S: Final = 0.020  # a lag that outlasts _LAG_BINS was a jump of the clock, not a queue
-_LAG_BINS: Final = 40
+_EARLY_BELIEVED: Final = 2.5  # three times, or a little less often in a longer time
+_RATE_SIGMA: Final = 3e-5
+_NEW_SYNC_S: Final = 20.0  # of silence: the rate is not known well enough to bridge more
 
 
 class Verdict(Enum):
@@ -123,6 +124,7 @@ class Revolutions:
 
     Attributes:
         exact_ms: of the latest scan. period_ms: learned time between two scans of the stream.
+        correction_ms: by how much the latest stamp has contradicted the run of the motor so far.
         steady: False while the motor changes its speed, and shortly after.
     """
 
@@ -134,6 +136,8 @@ class Revolutions:
         """Forget the phase and the learned period."""
         self.exact_ms = -1.0
         self.period_ms = self._nominal_ms
+        self.correction_ms = self._drift_ms = 0.0
+        self._changed = False
         self.steady = True
         self._index = 0
         self._anchors: deque[tuple[int, float]] = deque()
@@ -149,24 +153,32 @@ class Revolutions:
             self.exact_ms = unwrapped + 0.5
             self._anchors.append((0, self.exact_ms))
             return 0
-        step_ms = unwrapped - self.exact_ms
+        step_ms = unwrapped + 0.5 - self.exact_ms
         turns = max(1, round(step_ms / self.period_ms))
-        self._index += turns
         predicted = self.exact_ms + turns * self.period_ms
         self.exact_ms = min(max(predicted, float(unwrapped)), unwrapped + 1.0)
-        if abs(self.exact_ms - predicted) > 2.0 + 0.02 * self.period_ms * turns:
-            self._begin_again(unwrapped, step_ms)
-        else:
-            self._learn()
-            self.steady = self.steady or self._index >= 5
+        self._index += turns
+        self._judge(self.exact_ms - predicted, turns, step_ms)
+        self._learn()
         return turns
 
-    def _begin_again(self, unwrapped: int, step_ms: float) -> None:
-        """The motor has changed its speed: learn from here on."""
-        self.exact_ms = unwrapped + 0.5
-        if step_ms < 3.0 * self._nominal_ms:
-            self.period_ms = max(step_ms, 0.3 * self._nominal_ms)
+    def _judge(self, correction_ms: float, turns: int, step_ms: float) -> None:
+        """Is a contradiction the fraction that stamps cut off, or has the motor changed its speed?"""
+        self.correction_ms = 0.0
+        if abs(correction_ms) > 2.0 + 0.02 * self.period_ms * turns:
+            if 0.3 * self._nominal_ms < step_ms < 3.0 * self._nominal_ms:
+                self.period_ms = step_ms
+            self._learn_anew()
+        elif self._index >= (_DRIFT_SCANS if self._changed else _ROUGH_SCANS):
+            self._drift_ms += correction_ms - self._drift_ms / _DRIFT_SCANS
+            self.correction_ms = correction_ms
+            if abs(self._drift_ms) > _DRIFT_MS:
+                self._learn_anew()
+
+    def _learn_anew(self) -> None:
+        self._changed = True
         self.steady = False
+        self.correction_ms = self._drift_ms = 0.0
         self._index = 0
         self._anchors.clear()
         self._anchors.append((0, self.exact_ms))
@@ -176,85 +188,11 @@ class Revolutions:
         turns, span = self._index - oldest_index, self.exact_ms - oldest_ms
         if turns >= 4:
             self.period_ms = span / turns
+            self.steady = True
         if self.exact_ms - self._anchors[-1][1] >= 1000.0:
             self._anchors.append((self._index, self.exact_ms))
-            if span > 1000.0 * _WINDOW_S:
+            if span > 1000.0 * _WINDOW_S and turns > _LEARN_TURNS:
                 self._anchors.popleft()
-
-
-class Envelope:
-    """Lower edge of (arrival - stamp) over a sliding window, as a line in sensor time."""
-
-    def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget all points."""
-        self._bins: deque[tuple[float, float]] = deque()  # lowest point of each quarter second: (x, delay)
-        self._bin_end = -math.inf
-        self._slope = 0.0
-        self._base = 0.0
-        self._x0 = 0.0
-        self._lagging = 0
-
-    @property
-    def slope(self) -> float:
-        """Host seconds per sensor second, less one."""
-        return self._slope
-
-    @property
-    def lag_lasts(self) -> bool:
-        """True when everything of the last ten seconds came late by the same and more: the sensor's clock has moved."""
-        return self._lagging >= _LAG_BINS
-
-    def delay(self, x: float) -> float:
-        """Arrival less stamp of an undelayed scan, at sensor time ``x``; seconds."""
-        return self._base + self._slope * (x - self._x0)
-
-    def feed(self, x: float, delay: float) -> float:
-        """Take a point; returns its excess over the edge as now known, >= 0, in seconds."""
-        if not self._bins:
-            self._x0, self._base = x, delay
-        excess = delay - self.delay(x)
-        if x >= self._bin_end:
-            self._open_bin(x, delay)
-        elif excess < self._bins[-1][1] - self.delay(self._bins[-1][0]):
-            self._bins[-1] = (x, delay)
-        if excess < 0:
-            self._base += excess
-            self._fit()
-        return max(0.0, delay - self.delay(x))
-
-    def _open_bin(self, x: float, delay: float) -> None:
-        if self._bins:
-            last_x, last_delay = self._bins[-1]
-            self._lagging = self._lagging + 1 if last_delay - self.delay(last_x) > _LAG_S else 0
-        self._bins.append((x, delay))
-        while self._bins[0][0] < x - _WINDOW_S:
-            self._bins.popleft()
-        self._bin_end = x + _BIN_S
-        self._fit()
-
-    def _fit(self) -> None:
-        """Tangent of the lower hull under the middle of the window, its slope limited."""
-        hull: list[tuple[float, float]] = []
-        for point in self._bins:
-            while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
-                hull.pop()
-            hull.append(point)
-        middle = sum(x for x, _ in self._bins) / len(self._bins)
-        slope = 0.0
-        for (x0, y0), (x1, y1) in itertools.pairwise(hull):
-            slope = (y1 - y0) / (x1 - x0)
-            if x1 >= middle:
-                break
-        self._slope = min(max(slope, -SLOPE_LIMIT), SLOPE_LIMIT)
-        self._x0 = self._bins[-1][0]
-        self._base = min(y + self._slope * (self._x0 - x) for x, y in hull)
-
-
-def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,10 +220,10 @@ class TickClock:
         self._latency_sigma_s = latency_sigma_s
         self._unwrapper = Unwrapper(1000.0 * period_s)
         self._revolutions = Revolutions(1000.0 * period_s)
-        self._envelope = Envelope()
+        self._envelope = Envelope(period_s)
         self._count = 0
         self._excess = 0.0
-        self._early = 0
+        self._early = 0.0
         self._t_last = -math.inf
         self.resets = 0
 
@@ -318,12 +256,17 @@ class TickClock:
             self._note_reset()
         elif verdict is not Verdict.GOOD:
             return None
+        if self._unwrapper.last - self._revolutions.exact_ms > 1e3 * _NEW_SYNC_S:
+            self._begin_epoch()
         periods = self._revolutions.feed(self._unwrapper.last)
         x = 1e-3 * self._revolutions.exact_ms
-        delay = t_rx - x - self._sweep * 1e-3 * self._revolutions.period_ms
+        delay = t_rx - x - self._sweep * self.period_s
+        if abs(self._revolutions.correction_ms) > _CORRECTED_MS:
+            self._envelope.shift(-1e-3 * self._revolutions.correction_ms)
         if self._believable(x, delay):
             excess = self._envelope.feed(x, delay)
-            self._excess += (excess - self._excess) / min(self._count + 1, 200)
+            if excess < LAG_S:
+                self._excess += (excess - self._excess) / min(self._count + 1, 200)
         if self._envelope.lag_lasts:
             self._note_reset()
             self._unwrapper.restart()
@@ -333,21 +276,21 @@ class TickClock:
         if t_mono <= self._t_last:
             return None
         self._t_last = t_mono
-        return ScanTime(t_mono, self._sigma(), max(1, periods))
+        return ScanTime(t_mono, self._sigma(x), max(1, periods))
 
     def _believable(self, x: float, delay: float) -> bool:
         """False for a delay that says more about a motor in change than about the clocks."""
         if self._count == 0:
             return True
         early = self._count >= _SETTLED_SCANS and delay < self._envelope.delay(x) - _EARLY_S
-        self._early = self._early + 1 if early else 0
-        return self._revolutions.steady and (not early or self._early >= _EARLY_BELIEVED)
+        self._early = 0.9 * self._early + early
+        return self._revolutions.steady and (not early or self._early > _EARLY_BELIEVED)
 
     def _expect(self, t_rx: float) -> tuple[float, float]:
         """Newest stamp that could arrive now, and how far past that is still believed; ms."""
         if self._unwrapper.last < 0:
             return 0.0, 0.0
-        sweep_s = self._sweep * 1e-3 * self._revolutions.period_ms
+        sweep_s = self._sweep * self.period_s
         x = 1e-3 * self._unwrapper.last
         for _ in range(2):  # t = x + sweep + delay(x), solved for x
             x = t_rx - sweep_s - self._envelope.delay(x)
@@ -366,8 +309,9 @@ class TickClock:
         self._count = 0
         self._excess = 0.0
 
-    def _sigma(self) -> float:
-        """Cut-off milliseconds and an edge not yet reached, with the latency's own uncertainty."""
-        early = 0.01 if self._count < 3 else self._excess / math.sqrt(self._count)
+    def _sigma(self, x: float) -> float:
+        """Cut-off milliseconds, an edge not yet reached or long ago, with the latency's own uncertainty."""
+        early = 0.01 if self._count < 3 else max(self._excess / math.sqrt(self._count), 5e-3 / self._count)
         fraction = 5e-4 / math.sqrt(min(self._count, 25))
-        return math.hypot(early, fraction, 1e-4, self._latency_sigma_s)
+        bridged = _RATE_SIGMA * self._envelope.age(x)
+        return math.hypot(early, fraction, bridged, 1e-4, self._latency_sigma_s)

@@ -1,0 +1,118 @@
+"""Sensor seconds to host seconds by the lower edge of a cloud: arrival is never early, only late.
+
+The line under all points that lies closest to them is an edge of their convex hull (Moon, Skelly, Towsley: "Estimation
+and removal of clock skew from network delay measurements", INFOCOM 1999).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from typing import Final
+
+SLOPE_LIMIT: Final = 1.5e-3  # of sensor clock against host clock; quartz does 50e-6, accept much worse
+LAG_S: Final = 0.020
+_LAG_LASTS_S: Final = 3.0  # a queue is gone by then: what still lags by LAG_S is a clock that has moved
+_BIN_S: Final = 0.25
+_WINDOW_S: Final = 30.0
+_LOOK_BACK_S: Final = 2.0
+_KEEP_BINS: Final = 8
+
+
+class Envelope:
+    """Lower edge of (arrival - stamp) over a sliding window, as a line in sensor time.
+
+    Args:
+        period_s: between two points; a slow stream needs a longer window.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._window_s = max(_WINDOW_S, 100.0 * period_s)
+        self._look_back_s = max(_LOOK_BACK_S, 20.0 * period_s)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all points."""
+        self._bins: deque[tuple[float, float]] = deque()  # lowest point of each quarter second: (x, delay)
+        self._bin_end = -math.inf
+        self._slope = 0.0
+        self._base = 0.0
+        self._x0 = 0.0
+        self._lagging_since = math.inf
+        self._t_last = -math.inf
+
+    @property
+    def slope(self) -> float:
+        """Host seconds per sensor second, less one."""
+        return self._slope
+
+    @property
+    def lag_lasts(self) -> bool:
+        """True when everything in three seconds came late: no queue lasts that long, the sensor's clock has moved."""
+        return self._t_last - self._lagging_since > _LAG_LASTS_S
+
+    def age(self, x: float) -> float:
+        """Sensor seconds since a point has last told anything about the edge."""
+        return x - self._bins[-1][0] if self._bins else 0.0
+
+    def delay(self, x: float) -> float:
+        """Arrival less stamp of an undelayed scan, at sensor time ``x``; seconds."""
+        return self._base + self._slope * (x - self._x0)
+
+    def feed(self, x: float, delay: float) -> float:
+        """Take a point; returns its excess over the edge as now known, >= 0, in seconds."""
+        if not self._bins:
+            self._x0, self._base = x, delay
+        excess = delay - self.delay(x)
+        self._t_last = x + delay
+        if excess > LAG_S:  # says nothing about the edge
+            self._lagging_since = min(self._lagging_since, self._t_last)
+            return excess
+        self._lagging_since = math.inf
+        if x >= self._bin_end:
+            self._open_bin(x, delay)
+        elif excess < self._bins[-1][1] - self.delay(self._bins[-1][0]):
+            self._bins[-1] = (x, delay)
+        if excess < 0:
+            self._base += excess
+            self._fit()
+        return max(0.0, delay - self.delay(x))
+
+    def shift(self, seconds: float) -> None:
+        """Sensor times before now turn out to have been too late by this: the delays they gave were too short."""
+        self._bins = deque((x, delay + seconds) for x, delay in self._bins)
+        self._base += seconds
+
+    def _open_bin(self, x: float, delay: float) -> None:
+        self._bins.append((x, delay))
+        while len(self._bins) > _KEEP_BINS and self._bins[0][0] < x - self._window_s:
+            self._bins.popleft()
+        self._bin_end = x + _BIN_S
+        self._fit()
+
+    def _fit(self) -> None:
+        """Tangent of the lower hull a little before the end of the window, its slope limited.
+
+        Under the middle it would be the line closest to all points; but periods close to a whole number of
+        milliseconds bend the edge, and it is the end of the window that is asked for.
+        """
+        hull: list[tuple[float, float]] = []
+        for point in self._bins:
+            while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
+                hull.pop()
+            hull.append(point)
+        first, last = self._bins[0][0], self._bins[-1][0]
+        under = max(last - self._look_back_s, 0.5 * (first + last))
+        slope = 0.0
+        for (x0, y0), (x1, y1) in itertools.pairwise(hull):
+            slope = (y1 - y0) / (x1 - x0)
+            if x1 >= under:
+                break
+        self._slope = min(max(slope, -SLOPE_LIMIT), SLOPE_LIMIT)
+        self._x0 = self._bins[-1][0]
+        self._base = min(y + self._slope * (self._x0 - x) for x, y in hull)
+
+
+def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
