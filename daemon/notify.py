@@ -16,11 +16,3 @@ def notify(*words: str) -> None:
             sock.sendto("\n".join(words).encode(), address.replace("@", "\0", 1))
         except OSError:
             return  # it restarts, or its queue is full: the next word will do
-
-
-def watchdog_s() -> float | None:
-    """Seconds within which the service manager expects ``WATCHDOG=1``; None where it does not watch us."""
-    limit, pid = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
-    if not limit.isdigit() or (pid and pid != str(os.getpid())):
-        return None
-    return int(limit) * 1e-6

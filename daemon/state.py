@@ -27,7 +27,7 @@ AXIS_FOUND_SCANS: Final = 5
 """Scans in a row after which an axis changes between known and unknown."""
 CLEAN_S: Final = 1.0
 """Every axis has to be known for this long before TRACKING is said (again)."""
-DISAGREE_S: Final = 0.5
+DISAGREE_S: Final = 1.0
 """Disagreement of the witnesses has to last this long: stamps jitter."""
 HELD_S: Final = 1.0
 """Without odometry a pose is held by its last velocity for this long after the last good match, then it is lost."""

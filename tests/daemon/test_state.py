@@ -150,12 +150,12 @@ def test_a_start_in_a_corridor_is_degraded_not_tracking() -> None:
 
 
 def test_disagreement_has_to_last_and_then_degrades_while_it_lasts() -> None:
-    memory = run(tracking(odometry=True), scans(3.0, 4, agree=False, odometry=True))
+    memory = run(tracking(odometry=True), scans(3.0, 9, agree=False, odometry=True))
     assert memory.state is State.TRACKING
-    memory = run(memory, scans(3.4, 4, agree=False, odometry=True))
+    memory = run(memory, scans(3.9, 3, agree=False, odometry=True))
     assert said(memory) == (State.DEGRADED, Reason.WITNESSES_DISAGREE)
-    assert run(memory, scans(3.8, 100, agree=False, odometry=True)).state is State.DEGRADED
-    assert run(memory, scans(3.8, 2, agree=True, odometry=True)).state is State.TRACKING
+    assert run(memory, scans(4.2, 100, agree=False, odometry=True)).state is State.DEGRADED
+    assert run(memory, scans(4.2, 2, agree=True, odometry=True)).state is State.TRACKING
 
 
 def test_configured_odometry_that_does_not_arrive_is_a_missing_witness() -> None:

@@ -1,0 +1,155 @@
+"""Faults from vitals: each appears and goes with its cause, the gravest first, said once each way."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import replace
+
+import pytest
+
+from daemon import heartbeat as module
+from daemon.health import FAULTS, Fault, Vitals, assess, describe
+from daemon.heartbeat import Heartbeat
+from hal.clock import run_virtual
+from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused
+from hal.lidar import Link
+
+BEFORE = Vitals(0.0, link=Link.STREAMING)
+WELL = replace(BEFORE, t_mono=10.0, scans=400, cycles=400)
+
+
+def test_all_is_well() -> None:
+    assert assess(WELL, BEFORE) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"link": Link.WAITING, "error": DeviceMissing("/dev/ttyACM0", "gone")}, Fault.LIDAR_MISSING),
+        ({"link": Link.WAITING, "error": DeviceRefused("/dev/ttyACM0", "busy")}, Fault.LIDAR_REFUSED),
+        ({"link": Link.OPENING, "error": DeviceFault("/dev/ttyACM0", "0L")}, Fault.LIDAR_BROKEN),
+        ({"silent": True, "error": DataInvalid("/dev/ttyACM0", "checksum")}, Fault.LIDAR_SILENT),
+        ({"silent": True}, Fault.LIDAR_SILENT),
+        ({"invalid": 30}, Fault.LIDAR_GARBLED),
+        ({"missed": 10}, Fault.LIDAR_GAPS),
+        ({"odometry": False}, Fault.ODOMETRY_SILENT),
+        ({"odometry": True, "odometry_jumps": 1}, Fault.ODOMETRY_JUMPS),
+        ({"odometry": True, "disagree": True}, Fault.ODOMETRY_DISAGREES),
+        ({"lateness": 0.11}, Fault.LOOP_STALLED),
+        ({"overruns": 30}, Fault.OVERRUNS),
+        ({"jobs_failed": 1}, Fault.WORKER_FAILED),
+        ({"failed": frozenset(["modbus"])}, Fault.PUBLISHER_FAILED),
+        ({"failed": frozenset(["recorder"])}, Fault.RECORDER_FAILED),
+    ],
+)
+def test_each_cause_has_its_fault(change: dict[str, object], fault: Fault) -> None:
+    assert assess(replace(WELL, **change), BEFORE) == (fault,)  # type: ignore[arg-type]  # test shorthand
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"invalid": 15}, {"missed": 7}, {"overruns": 15}, {"lateness": 0.09}, {"error": DataInvalid("lidar", "once")}],
+)
+def test_a_little_of_it_is_no_fault(change: dict[str, object]) -> None:
+    assert assess(replace(WELL, **change), BEFORE) == ()  # type: ignore[arg-type]  # test shorthand
+
+
+def test_only_what_is_new_counts() -> None:
+    old = replace(BEFORE, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3)
+    now = replace(WELL, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3, odometry=True)
+    assert assess(now, old) == ()
+
+
+def test_the_gravest_comes_first() -> None:
+    now = replace(WELL, overruns=100, invalid=100, failed=frozenset(["pose"]))
+    assert assess(now, BEFORE) == (Fault.LIDAR_GARBLED, Fault.OVERRUNS, Fault.PUBLISHER_FAILED)
+
+
+def test_missing_scans_of_a_lidar_that_is_down_are_no_fault_of_their_own() -> None:
+    now = replace(WELL, link=Link.WAITING, error=DeviceMissing("/dev/ttyACM0", "gone"), missed=100)
+    assert assess(now, BEFORE) == (Fault.LIDAR_MISSING,)
+
+
+def test_every_fault_has_a_meaning_and_a_remedy() -> None:
+    assert set(FAULTS) == set(Fault)
+    assert all(text for text, _ in FAULTS.values())
+    assert [fault for fault, (_, remedy) in FAULTS.items() if not remedy] == [Fault.NONE]
+    assert describe(Fault.OVERRUNS).startswith("fault 302: more than 5 % of the cycles")
+
+
+class Patient:
+    """Vitals that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = Vitals(0.0, link=Link.STREAMING)
+        self.beats = 0
+
+    def sample(self, lateness: float) -> Vitals:
+        self.beats += 1
+        self.now = replace(
+            self.now,
+            t_mono=float(self.beats),
+            scans=40 * self.beats,
+            cycles=self.now.cycles + 40,
+            lateness=lateness,
+        )
+        return self.now
+
+
+def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, lambda: "statistics")
+    heart.beat(0.0)
+    patient.now = replace(patient.now, invalid=50)
+    for _ in range(5):
+        heart.beat(0.0)
+    assert heart.fault() == Fault.LIDAR_GARBLED
+    for _ in range(15):
+        heart.beat(0.0)
+    assert heart.fault() == 0
+    assert [record.message.split(" (")[0] for record in caplog.records] == [
+        "fault 105: more than 5 % of the lidar's frames are damaged",
+        "over: fault 105: more than 5 % of the lidar's frames are damaged",
+    ]
+
+
+def test_statistics_are_logged_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    heart = Heartbeat(Patient().sample, lambda: "so many cycles")
+    for _ in range(2 * module.STATISTICS_BEATS):
+        heart.beat(0.0)
+    assert [record.message for record in caplog.records] == ["so many cycles"] * 2
+
+
+def test_the_watchdog_is_fed_only_while_cycles_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(module, "notify", lambda *words: said.extend(words))
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    for _ in range(3):
+        heart.beat(0.0)
+    assert said == ["WATCHDOG=1"] * 3
+    still = patient.now
+    heart = Heartbeat(lambda lateness: still, str)
+    for _ in range(5):
+        heart.beat(0.0)
+    assert len(said) == 4, "the first beat knows no earlier one"
+
+
+def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
+    seen: list[float] = []
+
+    async def go() -> None:
+        def sample(lateness: float) -> Vitals:
+            seen.append(lateness)
+            return Vitals(asyncio.get_running_loop().time())
+
+        beating = asyncio.create_task(Heartbeat(sample, str).run())
+        await asyncio.sleep(10.5)
+        beating.cancel()
+
+    run_virtual(go())
+    assert len(seen) == 10
+    assert max(seen) < 1e-6

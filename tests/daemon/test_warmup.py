@@ -1,0 +1,126 @@
+"""Warm-up: beside the loop, with progress, under a lock, and no longer than it has to be."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from daemon import warmup
+from daemon.warmup import Warmth, kernel_count, warm_up
+from estimator.kernel import CACHE_DIR
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def _unfrozen() -> object:
+    yield None
+    gc.unfreeze()
+
+
+def test_the_loop_goes_on_while_the_estimator_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    release = threading.Event()
+
+    def slow() -> Warmth:
+        release.wait(10.0)
+        return Warmth(compiled=True, seconds=12.3)
+
+    monkeypatch.setattr(warmup, "load", slow)
+    monkeypatch.setattr(warmup, "REPORT_S", 0.02)
+    lines: list[str] = []
+
+    async def go() -> Warmth:
+        third = asyncio.Event()
+
+        def progress(line: str) -> None:
+            lines.append(line)
+            if len(lines) == 3:
+                third.set()
+
+        warming = asyncio.create_task(warm_up(progress))
+        await third.wait()
+        release.set()
+        return await warming
+
+    assert asyncio.run(asyncio.wait_for(go(), 10.0)).compiled
+    assert f"of {kernel_count()} kernels after" in lines[0]
+    assert lines[-1].startswith("kernels compiled in 12 s")
+
+
+def test_a_failure_to_load_is_raised_not_swallowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> Warmth:
+        raise RuntimeError("no writable directory for compiled kernels")
+
+    monkeypatch.setattr(warmup, "load", fail)
+    with pytest.raises(RuntimeError, match="no writable directory"):
+        asyncio.run(warm_up())
+
+
+def test_a_stop_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    release = threading.Event()
+    monkeypatch.setattr(warmup, "load", lambda: release.wait(30.0) and Warmth(False, 0.0))
+
+    async def go() -> None:
+        warming = asyncio.create_task(warm_up())
+        await asyncio.sleep(0.05)
+        warming.cancel()
+
+    begun = time.monotonic()
+    asyncio.run(go())
+    assert time.monotonic() - begun < 5.0
+    release.set()
+
+
+def test_warm_means_loaded_frozen_and_quick() -> None:
+    first = warmup.load()
+    again = warmup.load()
+    assert not again.compiled
+    assert again.seconds <= max(1.0, first.seconds)
+    asyncio.run(warm_up())
+    assert gc.get_freeze_count() > 1000
+
+
+def test_two_starts_at_once_wait_for_each_other() -> None:
+    """The second process waits as long as the first holds the lock."""
+    import fcntl
+
+    warmup.load()
+    code = "from daemon import warmup; warmup.load(); print('loaded')"
+    with (CACHE_DIR / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        second = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        with pytest.raises(subprocess.TimeoutExpired):
+            second.communicate(timeout=3.0)
+    output, _ = second.communicate(timeout=60.0)
+    assert output == "loaded\n"
+
+
+def test_there_are_kernels_to_count() -> None:
+    assert kernel_count() >= 5
+
+
+@pytest.mark.slow
+def test_the_first_start_ever_says_that_it_compiles_and_how_long(tmp_path: Path) -> None:
+    code = (
+        "import asyncio, logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+        "from daemon.warmup import warm_up; print(asyncio.run(warm_up()))"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    texts = []
+    for _ in range(2):
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+        texts.append(done.stdout + done.stderr)
+    assert "compiled=True" in texts[0]
+    assert f"compiling {kernel_count()} kernels, which takes up to a minute" in texts[0]
+    assert "kernels compiled in" in texts[0]
+    assert "compiled=False" in texts[1]
+    assert "compil" not in texts[1].replace("compiled=False", "")
