@@ -15,7 +15,7 @@ import numpy as np
 from hal.input_codec import ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, encode
 from tools.sim.scene import Scene
 
-TRUTH_PERIOD_S: Final = 0.025
+TRUTH_PERIOD_S: Final = 0.01
 Send = Callable[[bytes], None]
 
 
@@ -32,7 +32,7 @@ async def feed_odometry(scene: Scene, send: Send, session: int = 1) -> None:
 
 
 async def feed_truth(scene: Scene, tell: Callable[[float, tuple[float, float, float]], None]) -> None:
-    """Tell the true pose forty times a second: ``t_mono`` and (x, y, yaw) in the scene's frame."""
+    """Tell the true pose a hundred times a second: ``t_mono`` and (x, y, yaw) in the scene's frame."""
     loop = asyncio.get_running_loop()
     while True:
         t = loop.time()

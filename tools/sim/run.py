@@ -6,7 +6,7 @@
     python -m tools.sim --building office_floor --lidar UST-20LX --tcp 127.0.0.1:10940 --truth truth.tum
     python -m tools.sim --log intel.clf.gz --pty /tmp/lidar --odometry udp://127.0.0.1:5601
 
-It meets the daemon only there. The robot stands still until the lidar is first read.
+It meets the daemon only there. The robot stands still until the lidar is first read, or until it is told to drive.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class Options:
     empty: bool
     laps: float
     dwell: float
+    hold: bool
     pty: Path | None
     tcp: str | None
     odometry: str | None
@@ -72,6 +73,7 @@ def parser() -> argparse.ArgumentParser:
     add("--empty", action="store_true", help="nobody walks about")
     add("--laps", type=float, default=np.inf, help="tours to drive, then stand still (default: for ever)")
     add("--dwell", type=float, default=2.0, help="seconds of standing still before each tour (default %(default)s)")
+    add("--hold", action="store_true", help="the robot stands still until this process gets SIGUSR1")
     add("--pty", type=Path, metavar="LINK", help="the lidar as a serial port, found by this symbolic link")
     add("--tcp", metavar="HOST:PORT", help="the lidar over TCP; port 0 chooses a free one")
     add("--odometry", metavar="udp://HOST:PORT", help="where wheel odometry datagrams go")
@@ -93,7 +95,9 @@ def make_scene(options: Options, t_mono: float) -> Scene:
             dwell_s=options.dwell,
             laps=options.laps,
         )
-        return SimulatedScene(scenario)
+        scene = SimulatedScene(scenario, held=options.hold)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, scene.release)
+        return scene
     from hal.replay.carmen import read_carmen
 
     log = read_carmen(options.log)

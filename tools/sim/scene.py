@@ -86,18 +86,21 @@ PAPER: Final = Scenario(laps=1)
 
 
 class SimulatedScene:
-    """A robot on its tour through a building. Its clock starts with the first scan that is asked for.
+    """A robot on its tour through a building. People start to walk with the first scan that is asked for.
 
-    Until then the robot stands at the start, so that a daemon that is slow to start misses nothing.
+    So does the robot, unless it is held: then it drives off with the first scan after :meth:`release`. Until it does it
+    stands at the start, so that a daemon that is slow to start misses nothing.
     """
 
-    def __init__(self, scenario: Scenario, place: Building | None = None) -> None:
+    def __init__(self, scenario: Scenario, place: Building | None = None, held: bool = False) -> None:
         self.scenario = scenario
         self.model = lidar_model(scenario.lidar)
         self.building = place or building(scenario.building)
         self.drive = Drive(self.building.route, scenario.body, scenario.dwell_s, scenario.laps)
         self.optics = scenario.optics or OPTICS.get(scenario.lidar, beams.UTM_30LX)
+        self.held = held
         self.t_go: float | None = None
+        self._t_first: float | None = None
         self._crowd = Crowd(self.building.people if scenario.people else ())
         self._scanner = Scanner(self.building.world, _sweep(self.model), self.optics, scenario.seed)
         self._odometer = Odometer(self.drive, self.building.world, scenario.wheels, scenario.seed)
@@ -113,14 +116,22 @@ class SimulatedScene:
 
     def scan(self, t_mono: float) -> FakeScan:
         """See :class:`Scene`."""
-        if self.t_go is None:
+        if self._t_first is None:
+            self._t_first = t_mono
+        if self.t_go is None and not self.held:
             self.t_go = t_mono
-        t = t_mono - self.t_go
-        pitch, roll = self.drive.tilt(t)
-        robot = self.drive.pose(np.array([t]))[0]
+        t = t_mono - self._t_first
+        since = self._t_first - t_mono if self.t_go is None else self._t_first - self.t_go  # <= 0: not driving yet
+        pitch, roll = self.drive.tilt(t + since)
+        robot = self.drive.pose(np.array([t + since]))[0]
         legs = self._crowd.legs(t + self._scanner.sweep.first_s, robot)
         posture = Posture(self.scenario.body.height, pitch, roll)
-        return to_device(self.model, self._scanner.measure(t, self._lidar_poses, legs, posture))
+        seen = self._scanner.measure(t, lambda at: compose(self.drive.pose(at + since), self.mount), legs, posture)
+        return to_device(self.model, seen)
+
+    def release(self) -> None:
+        """Let a held robot drive off."""
+        self.held = False
 
     def odometry_after(self, t_mono: float) -> tuple[float, Array] | None:
         """See :class:`Scene`; readings start with the clock, before that the wheels stand still."""
@@ -135,9 +146,6 @@ class SimulatedScene:
         if self.t_go is None:
             return self.drive.pose(np.zeros(len(t_mono)))
         return self.drive.pose(np.asarray(t_mono) - self.t_go)
-
-    def _lidar_poses(self, t: Array) -> Array:
-        return compose(self.drive.pose(t), self.mount)
 
 
 def lidar_model(name: str) -> LidarModel:

@@ -84,6 +84,20 @@ def test_robot_waits_for_the_first_scan() -> None:
     assert later[2, 0] - start[0, 0] > 1.0
 
 
+def test_a_held_robot_drives_when_it_is_released() -> None:
+    scene = SimulatedScene(PAPER, held=True)
+    start = scene.truth(np.zeros(1))[0]
+    standing = [scene.scan(t).ranges_mm for t in (10.0, 40.0)]
+    np.testing.assert_array_equal(scene.truth(np.array([40.0]))[0], start)
+    assert np.median(np.abs(standing[0] - standing[1])) < 30
+    scene.release()
+    scene.scan(41.0)
+    np.testing.assert_allclose(scene.truth(np.array([43.0]))[0], start, atol=1e-12)
+    assert scene.truth(np.array([46.0]))[0, 0] > start[0] + 1.0
+    moved = scene.scan(46.0).ranges_mm
+    assert np.median(np.abs(moved - standing[0])) > 100
+
+
 def test_odometry_readings_are_timed_by_the_drive() -> None:
     scene = SimulatedScene(PAPER)
     scene.scan(50.003)

@@ -1,0 +1,181 @@
+"""The demo judges honestly, runs end to end, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.publish.snapshot import State
+from tools.demo import Score, Track, free_port, in_map, line, summary, verdict, write_config
+from tools.sim.robot import Body
+
+
+def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Any:
+    x, y, yaw = pose or (None, None, None)
+    return {
+        "state": int(state), "map_x": x, "map_y": y, "map_yaw": yaw, "cycle": 0.001, "scan_rate": 40.0, "missed": 0,
+        "overruns": 0, "t_mono": 1.0,
+    }  # fmt: skip
+
+
+def test_truth_is_turned_into_the_map() -> None:
+    """The map's origin is where the robot truly stood at (1, 2) facing north; it has driven 3 m north since."""
+    origin = ((0.0, 0.0, 0.0), (1.0, 2.0, math.pi / 2))
+    seen = in_map((1.0, 5.0, math.pi / 2), origin)
+    assert seen == pytest.approx((3.0, 0.0, 0.0), abs=1e-12)
+
+
+def test_errors_are_measured_from_the_first_pose() -> None:
+    score = Score()
+    score.take(reading(pose=(0.1, 0.0, 0.0)), (5.0, 5.0, 0.0))
+    score.take(reading(pose=(1.1, 0.3, 0.02)), (6.0, 5.0, 0.0))
+    assert score.error_m == pytest.approx([0.0, 0.3])
+    assert score.error_rad == pytest.approx([0.0, 0.02])
+    assert score.driven_m == pytest.approx(1.0)
+
+
+def test_a_reading_without_pose_or_truth_is_not_compared() -> None:
+    score = Score()
+    score.take(reading(State.NO_LIDAR, None), (0.0, 0.0, 0.0))
+    score.take(reading(), None)
+    assert (score.error_m, score.reads) == ([], 2)
+    score.trip_s.append(0.001)
+    assert "no pose yet" in line(1.0, Score(reads=1, last=reading(State.NO_LIDAR, None), trip_s=[0.001]), 20.0)
+
+
+def test_truth_is_interpolated_and_never_guessed() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        track = Track(sock)
+        track.poses.extend([(1.0, (0.0, 0.0, 3.1)), (2.0, (1.0, 2.0, -3.1))])
+        middle = track.at(1.5)
+        assert middle is not None
+        assert middle[:2] == (0.5, 1.0)
+        assert math.cos(middle[2]) == pytest.approx(-1.0)
+        assert track.at(0.9) is None
+        assert track.at(2.1) is None
+
+
+@pytest.mark.parametrize(
+    ("state", "off", "complaint"),
+    [
+        (State.TRACKING, 0.02, ""),
+        (State.MAPPING, 0.02, ""),
+        (State.LOST, 0.02, "never MAPPING or TRACKING"),
+        (State.TRACKING, 0.9, "the median position error is 0.90 m"),
+    ],
+)
+def test_verdict(state: State, off: float, complaint: str) -> None:
+    score = Score()
+    score.take(reading(), (0.0, 0.0, 0.0))
+    score.states.clear()
+    for _ in range(4):
+        score.take(reading(state, (off, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    assert verdict(summary(score)) == complaint or (complaint and complaint in verdict(summary(score)))
+
+
+def test_verdict_on_nothing() -> None:
+    assert "nothing was read" in verdict(summary(Score()))
+
+
+def test_configuration_is_good_and_mounts_the_lidar_where_the_robot_has_it(tmp_path: Path) -> None:
+    from daemon.configfile import load
+
+    settings = load(write_config(tmp_path, free_port(), free_port()))
+    assert settings.bind == "127.0.0.1"
+    assert (settings.lidar.mount.x, settings.lidar.mount.y, settings.lidar.mount.yaw) == Body().lidar
+    assert settings.modbus.port != settings.odometry.port
+
+
+def left_behind(mark: str) -> list[str]:
+    """Command lines of processes that still use files below ``mark``."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:  # it has ended meanwhile
+            continue
+        if mark in words and "tools.demo" not in words:
+            found.append(words)
+    return found
+
+
+def start(folder: Path, *words: str) -> subprocess.Popen[str]:
+    """A demo whose temporary files are below ``folder``, which is how its children are told from others."""
+    command = [sys.executable, "-m", "tools.demo", "--out", str(folder / "out"), *words]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, "TMPDIR": str(folder)}
+    )
+
+
+@pytest.mark.system
+@pytest.mark.realtime
+def test_fifteen_seconds(tmp_path: Path) -> None:
+    demo = start(tmp_path, "--seconds", "15")
+    text, _ = demo.communicate(timeout=240)
+    assert demo.returncode == 0, text
+    assert "TRACKING" in text
+    figures = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert figures["ok"]
+    assert figures["driven_m"] > 3.0
+    assert figures["error_m"]["median"] < 0.10
+    assert figures["scan_rate_hz"] == pytest.approx(39.9, abs=0.5)
+    assert figures["modbus_reads_per_s"] > 5.0
+    assert (tmp_path / "out" / "map.png").read_bytes().startswith(b"\x89PNG")
+    assert left_behind(str(tmp_path)) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.system
+@pytest.mark.realtime
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_it_shows_what_it_has_and_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    demo = start(tmp_path, "--forever")
+    assert demo.stdout is not None
+    try:
+        for text in demo.stdout:
+            if "TRACKING" in text:
+                break
+        demo.send_signal(number)
+        rest, _ = demo.communicate(timeout=60)
+        assert demo.returncode == 0, rest
+        assert "map.png" in rest
+    finally:
+        demo.kill()
+        demo.wait()
+    time.sleep(0.1)
+    assert left_behind(str(tmp_path)) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.system
+@pytest.mark.realtime
+def test_a_daemon_that_dies_is_reported(tmp_path: Path) -> None:
+    demo = start(tmp_path, "--seconds", "60")
+    assert demo.stdout is not None
+    try:
+        for text in demo.stdout:
+            if "TRACKING" in text or "MAPPING" in text:
+                break
+        [daemon] = [
+            int(path.parent.name)
+            for path in Path("/proc").glob("[0-9]*/cmdline")
+            if f"run\0--config\0{tmp_path}".encode() in path.read_bytes()
+        ]
+        os.kill(daemon, signal.SIGKILL)
+        rest, _ = demo.communicate(timeout=60)
+    finally:
+        demo.kill()
+        demo.wait()
+    assert demo.returncode == 1
+    assert "a process ended with code -9" in rest
+    assert left_behind(str(tmp_path)) == []

@@ -1,0 +1,399 @@
+"""``make demo``: the real daemon and a simulated robot in the paper's room; live pose against truth, a map picture.
+
+The simulator is one process (a lidar on a pty, odometry and truth as datagrams), the daemon another (``lumiloop run``).
+This process reads the pose over Modbus, as any PLC would, and compares it with the truth of the same instant. At the
+end the map is taken from the daemon's own recording. Loopback only; nothing is left running.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import select
+import shutil
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from daemon.publish.client import NoAnswer, Reader, Reading
+from daemon.publish.snapshot import State
+
+ROOT: Final = Path(__file__).parents[1]
+OUT: Final = Path("out/demo")
+READ_PERIOD_S: Final = 0.05
+LINE_PERIOD_S: Final = 1.0
+COLD_START_S: Final = 300.0
+"""Longest wait for the first start ever, which compiles. After `TELL_S` the viewer is told."""
+TELL_S: Final = 4.0
+STOP_S: Final = 10.0
+ABSURD_M: Final = 0.5
+"""Median position error beyond which the demo has failed."""
+INTERRUPTED: Final = 130
+CONFIG: Final = "demo.toml"
+RECORDING: Final = "recording"
+GOOD: Final = (State.MAPPING, State.TRACKING)
+LIDAR_X: Final = 0.15
+"""Where the simulated robot carries its lidar (:class:`tools.sim.robot.Body`), told to the daemon as `lidar.mount`."""
+
+Pose = tuple[float, float, float]
+
+
+class DemoError(Exception):
+    """The demo cannot go on; the text says why and where to look."""
+
+
+@dataclass(slots=True)
+class Track:
+    """True poses of the last seconds, from the simulator's datagrams."""
+
+    sock: socket.socket
+    poses: deque[tuple[float, Pose]] = field(default_factory=lambda: deque(maxlen=400))
+
+    def collect(self) -> None:
+        """Take what has arrived."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                told = json.loads(self.sock.recv(512))
+                self.poses.append((told["t_mono"], (told["x"], told["y"], told["yaw"])))
+
+    def at(self, t_mono: float) -> Pose | None:
+        """The true pose at an instant, interpolated; None where it is not covered."""
+        after = next((k for k, (t, _) in enumerate(self.poses) if t >= t_mono), 0)
+        if after == 0:
+            return None
+        (t0, a), (t1, b) = self.poses[after - 1], self.poses[after]
+        part = (t_mono - t0) / (t1 - t0)
+        turn = math.remainder(b[2] - a[2], math.tau)
+        return a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn
+
+
+@dataclass(slots=True)
+class Score:
+    """What has been read and how good it was; errors in m and rad."""
+
+    origin: tuple[Pose, Pose] | None = None  # the first pose and the truth of its instant
+    error_m: list[float] = field(default_factory=list)
+    error_rad: list[float] = field(default_factory=list)
+    states: dict[str, int] = field(default_factory=dict)
+    reads: int = 0
+    unanswered: int = 0
+    cycle_s: list[float] = field(default_factory=list)
+    trip_s: list[float] = field(default_factory=list)
+    last: Reading = field(default_factory=dict)
+    driven_m: float = 0.0
+    watched_s: float = 0.0
+    _was: Pose | None = None
+
+    def take(self, reading: Reading, truth: Pose | None) -> None:
+        """One reading of the published block, and where the robot truly was then."""
+        self.reads += 1
+        self.last = reading
+        state = State(int(reading["state"] or 0)).name
+        self.states[state] = self.states.get(state, 0) + 1
+        if reading["cycle"] is not None:
+            self.cycle_s.append(float(reading["cycle"]))
+        pose = pose_of(reading)
+        if pose is None or truth is None:
+            return
+        if self.origin is None:
+            self.origin = pose, truth
+        want = in_map(truth, self.origin)
+        self.error_m.append(math.hypot(pose[0] - want[0], pose[1] - want[1]))
+        self.error_rad.append(math.remainder(pose[2] - want[2], math.tau))
+        if self._was is not None:
+            self.driven_m += math.hypot(truth[0] - self._was[0], truth[1] - self._was[1])
+        self._was = truth
+
+
+def pose_of(reading: Reading) -> Pose | None:
+    """The published map pose, if there is one."""
+    x, y, yaw = (reading[f"map_{axis}"] for axis in ("x", "y", "yaw"))
+    return None if x is None or y is None or yaw is None else (float(x), float(y), float(yaw))
+
+
+def in_map(truth: Pose, origin: tuple[Pose, Pose]) -> Pose:
+    """A true pose as seen from the map, which is fixed by one published pose and the truth of its instant."""
+    (x, y, yaw), (x0, y0, yaw0) = origin
+    turn = yaw - yaw0
+    c, s = math.cos(turn), math.sin(turn)
+    dx, dy = truth[0] - x0, truth[1] - y0
+    return x + c * dx - s * dy, y + s * dx + c * dy, truth[2] + turn
+
+
+# processes
+
+
+@contextlib.contextmanager
+def running(command: list[str], log: Path, **kw: Any) -> Iterator[subprocess.Popen[str]]:
+    """A child process in a session of its own (a Ctrl-C here must not reach it first); stopped on the way out."""
+    with log.open("w") as errors:
+        child = subprocess.Popen(command, cwd=ROOT, stderr=errors, text=True, start_new_session=True, **kw)
+        try:
+            yield child
+        finally:
+            stop(child)
+
+
+def stop(child: subprocess.Popen[str]) -> None:
+    """Ask it to end, then make it."""
+    try:
+        if child.poll() is None:
+            child.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(STOP_S)
+    finally:
+        if child.poll() is None:  # it does not listen, or a second Ctrl-C came while we waited
+            child.kill()
+            child.wait()
+        if child.stdout is not None:
+            child.stdout.close()
+
+
+def free_port() -> int:
+    """A port that is free on loopback for both TCP and UDP just now."""
+    for _ in range(50):
+        with socket.socket() as tcp, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            tcp.bind(("127.0.0.1", 0))
+            port = int(tcp.getsockname()[1])
+            with contextlib.suppress(OSError):
+                udp.bind(("127.0.0.1", port))
+                return port
+    raise DemoError("no port is free on 127.0.0.1 for both TCP and UDP; close some programs")
+
+
+def write_config(folder: Path, modbus: int, odometry: int) -> Path:
+    """The daemon's configuration for this run."""
+    path = folder / CONFIG
+    path.write_text(
+        f'name = "demo"\nbind = "127.0.0.1"\nstate_dir = "{folder / "state"}"\n\n'
+        f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
+        f"[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\n"
+    )
+    return path
+
+
+class Patience:
+    """Waits for a child and says once, after a few seconds, that the first start takes long."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._begin, self._told = out, time.monotonic(), False
+
+    def wait(self, child: subprocess.Popen[str], log: str) -> None:
+        """A moment.
+
+        Raises:
+            DemoError: the child has ended, or the wait is over.
+        """
+        waited = time.monotonic() - self._begin
+        if child.poll() is not None:
+            raise DemoError(f"it ended with code {child.returncode} before it was ready; read {self._out / log}")
+        if waited > COLD_START_S:
+            raise DemoError(f"it is not ready after {COLD_START_S:.0f} s; read {self._out / log}")
+        if waited > TELL_S and not self._told:
+            self._told = True
+            print("first start: compiling the numerical kernels, up to a minute; later starts take seconds", flush=True)
+        time.sleep(0.05)
+
+
+def wait_for_simulator(simulator: subprocess.Popen[str], patience: Patience) -> None:
+    """Until its devices are there, which it says on its first line."""
+    assert simulator.stdout is not None
+    while not select.select([simulator.stdout], [], [], 0.0)[0]:
+        patience.wait(simulator, "simulator.log")
+
+
+def wait_for_pose(daemon: subprocess.Popen[str], reader: Reader, patience: Patience) -> None:
+    """Until the daemon says that it follows the laser."""
+    while True:
+        with contextlib.suppress(NoAnswer):
+            if int(reader.read()["state"] or 0) in GOOD:
+                return
+        patience.wait(daemon, "daemon.log")
+
+
+# the show
+
+
+def watch(reader: Reader, track: Track, score: Score, seconds: float, children: list[subprocess.Popen[str]]) -> None:
+    """Read the pose twenty times a second and print a line every second; 0 seconds: for ever."""
+    print("    t |      x       y     yaw |  error          | state     scans  cycle  Modbus reads")
+    print("    s |      m       m     deg |     cm     deg  |              Hz     ms  per s     ms")
+    begin = time.monotonic()
+    line_at, read_at = begin + LINE_PERIOD_S, begin
+    reads = 0
+    while not seconds or time.monotonic() - begin < seconds:
+        for child in children:
+            if child.poll() is not None:
+                raise DemoError(f"a process ended with code {child.returncode}: {' '.join(child.args[1:4])}")  # type: ignore[index, arg-type]  # a list
+        asked = time.monotonic()
+        try:
+            reading = reader.read()
+        except NoAnswer:
+            score.unanswered += 1
+            continue
+        now = time.monotonic()
+        score.watched_s = now - begin
+        score.trip_s.append(now - asked)
+        track.collect()
+        score.take(reading, None if reading["t_mono"] is None else track.at(float(reading["t_mono"])))
+        if now >= line_at:
+            print(line(now - begin, score, (score.reads - reads) / (now - line_at + LINE_PERIOD_S)), flush=True)
+            line_at, reads = now + LINE_PERIOD_S, score.reads
+        read_at = max(read_at + READ_PERIOD_S, now)
+        time.sleep(read_at - now)
+
+
+def line(t: float, score: Score, rate: float) -> str:
+    """One line about the latest reading."""
+    reading = score.last
+    pose = pose_of(reading)
+    where = "        no pose yet    " if pose is None else f"{pose[0]:7.3f} {pose[1]:7.3f} {math.degrees(pose[2]):7.1f}"
+    off = "               "
+    if score.error_m:
+        off = f"{100 * score.error_m[-1]:6.1f}  {math.degrees(score.error_rad[-1]):+7.2f}"
+    state = State(int(reading["state"] or 0)).name
+    scans, cycle = reading["scan_rate"] or 0.0, 1e3 * float(reading["cycle"] or 0.0)
+    trip = 1e3 * score.trip_s[-1]
+    return f"{t:5.1f} |{where} |{off}  | {state:<9}{scans:6.1f} {cycle:6.2f} {rate:6.1f} {trip:6.2f}"
+
+
+def summary(score: Score) -> dict[str, Any]:
+    """The run in figures."""
+    errors, angles = score.error_m, [abs(math.degrees(angle)) for angle in score.error_rad]
+    known, seconds = bool(errors), score.watched_s
+    return {
+        "seconds": round(seconds, 2),
+        "driven_m": round(score.driven_m, 2),
+        "poses_compared": len(errors),
+        "error_m": {"median": statistics.median(errors), "max": max(errors), "last": errors[-1]} if known else None,
+        "error_deg": {"median": statistics.median(angles), "max": max(angles), "last": angles[-1]} if known else None,
+        "states": score.states,
+        "scan_rate_hz": score.last.get("scan_rate"),
+        "scans_missed": score.last.get("missed"),
+        "cycle_ms": 1e3 * statistics.median(score.cycle_s) if score.cycle_s else None,
+        "cycles_over_budget": score.last.get("overruns"),
+        "modbus_reads_per_s": score.reads / max(seconds, 1e-9),
+        "modbus_round_trip_ms": 1e3 * statistics.median(score.trip_s) if score.trip_s else None,
+        "modbus_unanswered": score.unanswered,
+    }
+
+
+def verdict(figures: dict[str, Any]) -> str:
+    """What is wrong with the run; empty when nothing is."""
+    if not any(figures["states"].get(state.name) for state in GOOD):
+        return f"the pose was never MAPPING or TRACKING, but: {figures['states'] or 'nothing was read'}"
+    if figures["error_m"] is None:
+        return "no pose could be compared with the truth"
+    if figures["error_m"]["median"] > ABSURD_M:
+        return f"the median position error is {figures['error_m']['median']:.2f} m"
+    return ""
+
+
+def export_map(folder: Path, out: Path) -> str:
+    """The map with the trajectory, from the daemon's own recording; returns what went wrong, if anything."""
+    words = [sys.executable, "-m", "daemon", "map", "export", str(folder / RECORDING), "--out", str(out / "map")]
+    words += ["--config", str(folder / CONFIG)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        return f"the map could not be exported: {done.stderr.strip()}"
+    shutil.copyfile(out / "map" / "map.png", out / "map.png")
+    print(f"map with trajectory: {out / 'map.png'}")
+    return ""
+
+
+def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> None:
+    """Run simulator and daemon, and watch; everything is stopped when this returns or raises."""
+    modbus, odometry = free_port(), free_port()
+    config = write_config(folder, modbus, odometry)
+    daemon_words = [sys.executable, "-m", "daemon", "run", "--config", str(config), "--record", str(folder / RECORDING)]
+    with contextlib.ExitStack() as stack:
+        truth = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        truth.bind(("127.0.0.1", 0))
+        truth.setblocking(False)
+        words = [
+            sys.executable,
+            "-m",
+            "tools.sim",
+            "--building",
+            options.building,
+            "--seed",
+            str(options.seed),
+            "--hold",
+        ]
+        words += ["--pty", str(folder / "lidar"), "--odometry", f"udp://127.0.0.1:{odometry}"]
+        words += ["--truth", f"udp://127.0.0.1:{truth.getsockname()[1]}"]
+        patience = Patience(out)
+        simulator = stack.enter_context(running(words, out / "simulator.log", stdout=subprocess.PIPE))
+        wait_for_simulator(simulator, patience)
+        daemon = stack.enter_context(running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL))
+        reader = stack.enter_context(Reader("127.0.0.1", modbus))
+        wait_for_pose(daemon, reader, patience)
+        print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
+        simulator.send_signal(signal.SIGUSR1)
+        watch(reader, Track(truth), score, options.seconds, [daemon, simulator])
+
+
+def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
+    """The demo itself; returns the exit code."""
+    score, wrong = Score(), ""
+    try:
+        play(options, folder, out, score)
+    except KeyboardInterrupt:
+        if not score.reads:
+            return INTERRUPTED
+    except DemoError as error:
+        wrong = str(error)
+    figures = summary(score)
+    wrong = wrong or verdict(figures)
+    if score.error_m:
+        wrong = export_map(folder, out) or wrong
+        off, turned = figures["error_m"], figures["error_deg"]
+        print(
+            f"{figures['driven_m']:.1f} m driven; error median {100 * off['median']:.1f} cm, "
+            f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg"
+        )
+    (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
+    print(f"figures: {out / 'summary.json'}")
+    if wrong:
+        print(f"FAILED: {wrong} (logs: {out})", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the demo; 0 if the pose was good, 1 if not, 130 if interrupted before there was anything to show."""
+    parser = argparse.ArgumentParser(prog="python -m tools.demo", description=__doc__.splitlines()[0])
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--seconds", type=float, default=60.0, help="how long to watch (default %(default)s)")
+    length.add_argument(
+        "--forever", action="store_const", const=0.0, dest="seconds", help="until Ctrl-C; records 0.3 GB an hour"
+    )
+    parser.add_argument("--building", default="paper_room", help="see `python -m tools.sim --help`")
+    parser.add_argument("--seed", type=int, default=0, help="of noise, slip and people")
+    parser.add_argument("--out", type=Path, default=OUT, help="where results go (default %(default)s)")
+    options = parser.parse_args(arguments)
+    out = options.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.default_int_handler)
+    os.environ.setdefault("PYTHONUNBUFFERED", "1")
+    try:
+        with tempfile.TemporaryDirectory(prefix="lumiloop-demo-") as folder:
+            return show(options, Path(folder), out)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
