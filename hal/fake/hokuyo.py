@@ -123,6 +123,11 @@ class FakeHokuyo:
         """False while the connection cannot be opened: plug pulled, no power, USB or network not up yet."""
         return self._reachable
 
+    @property
+    def attached(self) -> bool:
+        """True while a host has the line open."""
+        return self._core.outlet.host is not None
+
     def watch(self, changed: Callable[[bool], None]) -> None:
         """Transports ask to be told when :attr:`reachable` changes."""
         self._watchers.append(changed)

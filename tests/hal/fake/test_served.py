@@ -63,6 +63,17 @@ def opened(path: str, baud: int = 19200) -> serial.Serial:
     return serial.Serial(path, baud, timeout=0, exclusive=True)
 
 
+async def quiet(port: serial.Serial) -> None:
+    """Wait until nothing has come for a while."""
+    deadline = time.monotonic() + 5.0 * PATIENCE
+    while True:
+        port.read(65536)
+        await asyncio.sleep(0.3)
+        if port.read(65536) == b"":
+            return
+        assert time.monotonic() < deadline, "it goes on talking"
+
+
 async def gather(port: serial.Serial, replies: int) -> list[bytes]:
     text = bytearray()
 
@@ -149,10 +160,10 @@ def test_pty_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
 def test_pty_knows_the_rate_of_the_host(tmp_path: Path) -> None:
     async def scene(device: FakeHokuyo, server: PtyServer) -> None:
         with opened(server.path, 57600) as port:
-            await asyncio.sleep(0.1)
+            await until(lambda: device.attached)
             port.write(b"VV\n")
-            await asyncio.sleep(0.3)
-            assert port.read(1000) == b""
+            await quiet(port)
+            assert device.counts.sent == 0
             port.baudrate = 19200
             port.write(b"SS250000\n")
             assert await gather(port, 1) == [b"SS250000\n00P\n\n"]
@@ -351,10 +362,7 @@ def test_command_serves_takes_orders_and_ends(tmp_path: Path) -> None:
                 writer.write(b"order silence\nlist\n")
                 assert await reader.readline() == b"ordered lidar:silence\n"
                 assert await reader.readline() == b"ok\n"
-                await asyncio.sleep(0.3)
-                port.read(65536)
-                await asyncio.sleep(0.3)
-                assert port.read(65536) == b""
+                await quiet(port)
                 writer.close()
 
         asyncio.run(talk())
