@@ -20,8 +20,9 @@ from hal.lidar import VALID, LidarGeometry, LidarStatus, Link, RawScan
 DEVICES = {"usb": "/dev/ttyACM7", "rs232": "/dev/ttyUSB7", "ethernet": "tcp://192.168.0.10"}
 """Names that tell the driver the kind of line; nothing is opened under them but the fake."""
 LOOK_S = 0.005
-STAMP_S = 0.004
-"""How far a stamp may be off the truth."""
+STAMP_S = 0.005
+"""How far a stamp may be off the truth, seconds: a delay that comes a few seconds after the start may be taken for a
+clock that is slow by the most a clock may be (1.5e-3) while it lasts, which makes 4.5 ms in the 3 s of these faults."""
 COUNTERS = ("missed", "invalid", "resyncs", "reconnects", "clock_resets")
 
 

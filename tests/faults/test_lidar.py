@@ -79,8 +79,8 @@ BYTES += [
 BYTES += [
     Case("wrong_steps fewer", "what = 'wrong_steps'; by = -1; every = 4", ("invalid", "~1081 steps"), gap=0.06),
     Case("wrong_steps more", "what = 'wrong_steps'; by = 1; every = 4", ("invalid", "~1081 steps"), gap=0.06),
-    Case("all damaged", "what = 'bit_flip'", ("invalid", "resyncs", "~only damaged frames"), RESTART),
-    Case("all garbage", "what = 'garbage'; on = 'all'", ("resyncs", "~fallen silent"), REOPEN),
+    Case("all damaged", "what = 'bit_flip'", ("invalid", "resyncs", "~frame was dropped"), RESTART),
+    Case("all garbage", "what = 'garbage'; on = 'all'", ("resyncs", "~unreadable"), REOPEN),
     Case("damaged texts", "what = 'bit_flip'; on = 'replies'; share = 0.5", (), REOPEN, start=True),
     Case("all kinds", " + ".join(f"what = '{w}'; share = 0.1" for w in KINDS), ("invalid", "missed"), RESTART),
 ]  # fmt: skip
@@ -114,7 +114,7 @@ LINE = [
     Case(
         "modem manager", "what = 'inject'; when = 0.5 + what = 'inject'; text = 'ATE1 E0\\r'; when = 1.0", (), gap=0.03
     ),
-    Case("baud", "what = 'baud'; rate = 57600", ("reconnects", "~."), 8.0, model=URG_04LX),
+    Case("baud", "what = 'baud'; rate = 57600", ("resyncs", "~."), 8.0, model=URG_04LX),
     Case("baud from the start", "what = 'baud'; rate = 57600", (), 8.0, start=True, model=URG_04LX),
 ]
 
