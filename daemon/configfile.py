@@ -12,12 +12,14 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
-from msgspec import inspect
 
 from daemon.config import Config
+
+if TYPE_CHECKING:
+    from msgspec import inspect
 
 REFERENCE_HEAD: Final = """\
 # Configuration
@@ -69,6 +71,8 @@ def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
 
 def options() -> list[Option]:
     """Every option of the tree in order of declaration."""
+    from msgspec import inspect  # costs 10 ms, and only explanations need it
+
     kind = inspect.type_info(Config)
     assert isinstance(kind, inspect.StructType)
     return list(_walk(kind, ""))
@@ -190,6 +194,8 @@ def _plain(key: str) -> str:
 
 
 def _walk(kind: inspect.StructType, prefix: str) -> Iterator[Option]:
+    from msgspec import inspect
+
     for field in kind.fields:
         path = prefix + field.name
         if isinstance(field.type, inspect.StructType):
@@ -199,11 +205,15 @@ def _walk(kind: inspect.StructType, prefix: str) -> Iterator[Option]:
 
 
 def _description(kind: inspect.Type) -> str:
+    from msgspec import inspect
+
     found = (kind.extra_json_schema or {}).get("description", "") if isinstance(kind, inspect.Metadata) else ""
     return str(found)
 
 
 def _kind(kind: inspect.Type) -> str:
+    from msgspec import inspect
+
     if isinstance(kind, inspect.Metadata):
         return _kind(kind.type)
     if isinstance(kind, (inspect.IntType, inspect.FloatType)):

@@ -23,7 +23,7 @@ FLOOR_M: Final = 0.08
 PART_RAD: Final = 0.2
 FLOOR_RAD: Final = 0.1
 """Allowed disagreement: a part of the motion (slip, scale) and a floor (stamps, and wheels that turn the robot by
-itself: on the recorded drive through the Intel Research Lab half of all windows are 0.03 rad apart, one in 100 0.11)."""
+itself: on the recorded drive through the Intel Research Lab half of all windows are 0.03 rad apart, 1 % 0.11)."""
 
 
 class Witnesses:

@@ -23,9 +23,21 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
 import llvmlite
-import numba
 import numpy as np
-from numba.core import config
+
+# Importing numba asks whether scipy's BLAS is there, which loads a large part of scipy: a third of a warm start and
+# 17 MB. No kernel uses BLAS. None makes that one import fail, which numba takes for an answer.
+_BLAS: Final = "scipy.linalg.cython_blas"
+_hide = _BLAS not in sys.modules
+if _hide:
+    sys.modules[_BLAS] = None  # type: ignore[assignment]  # the documented way to block an import
+try:
+    import numba
+    import numba.np.arraymath  # the module that asks
+    from numba.core import config
+finally:
+    if _hide:
+        del sys.modules[_BLAS]
 
 P = ParamSpec("P")
 R = TypeVar("R")
