@@ -16,19 +16,17 @@ import select
 import shutil
 import signal
 import socket
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.publish.client import NoAnswer, Reader, Reading
+from daemon.publish.client import NoAnswer, Reader
 from daemon.publish.snapshot import State
+from tools.demo_score import GOOD, Score, Track, pose_of, summary, verdict
 
 ROOT: Final = Path(__file__).parents[1]
 OUT: Final = Path("out/demo")
@@ -38,98 +36,15 @@ COLD_START_S: Final = 300.0
 """Longest wait for the first start ever, which compiles. After `TELL_S` the viewer is told."""
 TELL_S: Final = 4.0
 STOP_S: Final = 10.0
-ABSURD_M: Final = 0.5
-"""Median position error beyond which the demo has failed."""
 INTERRUPTED: Final = 130
 CONFIG: Final = "demo.toml"
 RECORDING: Final = "recording"
-GOOD: Final = (State.MAPPING, State.TRACKING)
 LIDAR_X: Final = 0.15
 """Where the simulated robot carries its lidar (:class:`tools.sim.robot.Body`), told to the daemon as `lidar.mount`."""
-
-Pose = tuple[float, float, float]
 
 
 class DemoError(Exception):
     """The demo cannot go on; the text says why and where to look."""
-
-
-@dataclass(slots=True)
-class Track:
-    """True poses of the last seconds, from the simulator's datagrams."""
-
-    sock: socket.socket
-    poses: deque[tuple[float, Pose]] = field(default_factory=lambda: deque(maxlen=400))
-
-    def collect(self) -> None:
-        """Take what has arrived."""
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                told = json.loads(self.sock.recv(512))
-                self.poses.append((told["t_mono"], (told["x"], told["y"], told["yaw"])))
-
-    def at(self, t_mono: float) -> Pose | None:
-        """The true pose at an instant, interpolated; None where it is not covered."""
-        after = next((k for k, (t, _) in enumerate(self.poses) if t >= t_mono), 0)
-        if after == 0:
-            return None
-        (t0, a), (t1, b) = self.poses[after - 1], self.poses[after]
-        part = (t_mono - t0) / (t1 - t0)
-        turn = math.remainder(b[2] - a[2], math.tau)
-        return a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn
-
-
-@dataclass(slots=True)
-class Score:
-    """What has been read and how good it was; errors in m and rad."""
-
-    origin: tuple[Pose, Pose] | None = None  # the first pose and the truth of its instant
-    error_m: list[float] = field(default_factory=list)
-    error_rad: list[float] = field(default_factory=list)
-    states: dict[str, int] = field(default_factory=dict)
-    reads: int = 0
-    unanswered: int = 0
-    cycle_s: list[float] = field(default_factory=list)
-    trip_s: list[float] = field(default_factory=list)
-    last: Reading = field(default_factory=dict)
-    driven_m: float = 0.0
-    watched_s: float = 0.0
-    _was: Pose | None = None
-
-    def take(self, reading: Reading, truth: Pose | None) -> None:
-        """One reading of the published block, and where the robot truly was then."""
-        self.reads += 1
-        self.last = reading
-        state = State(int(reading["state"] or 0)).name
-        self.states[state] = self.states.get(state, 0) + 1
-        if reading["cycle"] is not None:
-            self.cycle_s.append(float(reading["cycle"]))
-        pose = pose_of(reading)
-        if pose is None or truth is None:
-            return
-        if self.origin is None:
-            self.origin = pose, truth
-        want = in_map(truth, self.origin)
-        self.error_m.append(math.hypot(pose[0] - want[0], pose[1] - want[1]))
-        self.error_rad.append(math.remainder(pose[2] - want[2], math.tau))
-        if self._was is not None:
-            self.driven_m += math.hypot(truth[0] - self._was[0], truth[1] - self._was[1])
-        self._was = truth
-
-
-def pose_of(reading: Reading) -> Pose | None:
-    """The published map pose, if there is one."""
-    x, y, yaw = (reading[f"map_{axis}"] for axis in ("x", "y", "yaw"))
-    return None if x is None or y is None or yaw is None else (float(x), float(y), float(yaw))
-
-
-def in_map(truth: Pose, origin: tuple[Pose, Pose]) -> Pose:
-    """A true pose as seen from the map, which is fixed by one published pose and the truth of its instant."""
-    (x, y, yaw), (x0, y0, yaw0) = origin
-    turn = yaw - yaw0
-    c, s = math.cos(turn), math.sin(turn)
-    dx, dy = truth[0] - x0, truth[1] - y0
-    return x + c * dx - s * dy, y + s * dx + c * dy, truth[2] + turn
 
 
 # processes
@@ -267,38 +182,6 @@ def line(t: float, score: Score, rate: float) -> str:
     scans, cycle = reading["scan_rate"] or 0.0, 1e3 * float(reading["cycle"] or 0.0)
     trip = 1e3 * score.trip_s[-1]
     return f"{t:5.1f} |{where} |{off}  | {state:<9}{scans:6.1f} {cycle:6.2f} {rate:6.1f} {trip:6.2f}"
-
-
-def summary(score: Score) -> dict[str, Any]:
-    """The run in figures."""
-    errors, angles = score.error_m, [abs(math.degrees(angle)) for angle in score.error_rad]
-    known, seconds = bool(errors), score.watched_s
-    return {
-        "seconds": round(seconds, 2),
-        "driven_m": round(score.driven_m, 2),
-        "poses_compared": len(errors),
-        "error_m": {"median": statistics.median(errors), "max": max(errors), "last": errors[-1]} if known else None,
-        "error_deg": {"median": statistics.median(angles), "max": max(angles), "last": angles[-1]} if known else None,
-        "states": score.states,
-        "scan_rate_hz": score.last.get("scan_rate"),
-        "scans_missed": score.last.get("missed"),
-        "cycle_ms": 1e3 * statistics.median(score.cycle_s) if score.cycle_s else None,
-        "cycles_over_budget": score.last.get("overruns"),
-        "modbus_reads_per_s": score.reads / max(seconds, 1e-9),
-        "modbus_round_trip_ms": 1e3 * statistics.median(score.trip_s) if score.trip_s else None,
-        "modbus_unanswered": score.unanswered,
-    }
-
-
-def verdict(figures: dict[str, Any]) -> str:
-    """What is wrong with the run; empty when nothing is."""
-    if not any(figures["states"].get(state.name) for state in GOOD):
-        return f"the pose was never MAPPING or TRACKING, but: {figures['states'] or 'nothing was read'}"
-    if figures["error_m"] is None:
-        return "no pose could be compared with the truth"
-    if figures["error_m"]["median"] > ABSURD_M:
-        return f"the median position error is {figures['error_m']['median']:.2f} m"
-    return ""
 
 
 def export_map(folder: Path, out: Path) -> str:

@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 
 from daemon.publish.snapshot import State
-from tools.demo import Score, Track, free_port, in_map, line, summary, verdict, write_config
+from tools.demo import free_port, line, write_config
+from tools.demo_score import Score, Track, in_map, summary, verdict
 from tools.sim.robot import Body
 
 

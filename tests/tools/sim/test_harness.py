@@ -11,6 +11,7 @@ from daemon.publish.snapshot import State
 from hal.replay.carmen import read_carmen
 from tools.sim.harness import Run, in_frame_of, run
 from tools.sim.hybrid import HybridScene
+from tools.sim.report import describe, write_csv
 from tools.sim.scene import Scenario
 
 
@@ -40,6 +41,18 @@ def test_the_daemon_ends_up_tracking(paper: Run) -> None:
     assert paper.share(State.TRACKING, State.MAPPING) > 0.95
     assert paper.share(*State) == 1.0
     assert np.all(paper.known[-100:])
+
+
+def test_a_run_can_be_told_and_written(paper: Run, tmp_path: Path) -> None:
+    text = describe(paper)
+    assert f"{len(paper.t_mono)} snapshots of {paper.scans_sent} scans, 0 missed" in text
+    assert "TRACKING and more than 0.3 m off: 0.0% of the time" in text
+    assert "the pose is confirmed" in text
+    write_csv(paper, tmp_path / "run.csv")
+    rows = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(
+        np.hypot(rows["x"] - rows["true_x"], rows["y"] - rows["true_y"]), paper.error_m, atol=2e-6
+    )
 
 
 def test_one_seed_gives_one_run() -> None:
