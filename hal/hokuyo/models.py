@@ -6,6 +6,7 @@ specifications C-42-03320B, C-42-04076, C-42-03907; field reports named at the e
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -115,6 +116,7 @@ class Identity:
         return self.facts.codes.get(value, "error code without published meaning")
 
 
+_NUMBER: Final = re.compile(r"[0-9]{1,9}")
 _PP_NUMBERS: Final = ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
 
 
@@ -127,8 +129,8 @@ def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
     numbers: dict[str, int] = {}
     for key in _PP_NUMBERS:
         text = pp.get(key, "")
-        if not text.isdigit():
-            raise DeviceRefused(device, f"PP says {key}={text!r}, expected a number", "is this a HOKUYO 2D lidar?")
+        if not _NUMBER.fullmatch(text):
+            raise DeviceRefused(device, f"PP says {key}={text[:20]!r}, expected a number", "is this a HOKUYO 2D lidar?")
         numbers[key] = int(text)
     ares, amin, amax = numbers["ARES"], numbers["AMIN"], numbers["AMAX"]
     if not (numbers["SCAN"] > 0 and 0 <= amin < amax <= ares <= 9999 and amin <= numbers["AFRT"] <= amax):

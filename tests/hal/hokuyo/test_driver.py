@@ -1,0 +1,412 @@
+"""The driver's conduct: finding the right sensor, waiting, telling people, stopping, and what it never says to whom."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hal.errors import DeviceFault, DeviceMissing, DeviceRefused
+from hal.fake.answers import State
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import ECHOES, MODELS, PLAIN, UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.hokuyo import discover
+from hal.hokuyo.driver import HokuyoDriver
+from hal.lidar import Link
+from hal.port import Port
+from tests.hal.hokuyo.bench import PORT, Bench, Scene, error_of, on_fake
+
+
+class TestFindingTheSensor:
+    def test_auto_takes_the_first_that_is_a_lidar(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        async def body(bench: Bench) -> None:
+            assert bench.plugs is not None
+            mute = FakeHokuyo(UTM_30LX, Scene(UTM_30LX))
+            mute.receive = lambda data: None  # type: ignore[method-assign]  # something that is no lidar
+            bench.plugs.plug("/dev/ttyUSB3", mute)
+            monkeypatch.setattr(discover, "candidates", lambda: ["/dev/ttyUSB3", "/dev/ttyACM5", PORT])
+            bench.device = "auto"
+            driver = bench.driver()
+            await bench.deliver(driver, 5, within=12.0)
+            assert driver.status.extra["device"] == PORT
+
+        on_fake(body)
+
+    def test_a_sensor_is_known_by_its_serial_wherever_it_is_plugged_in(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        async def body(bench: Bench) -> None:
+            assert bench.plugs is not None
+            assert bench.fake is not None
+            other = FakeHokuyo(UTM_30LX, Scene(UTM_30LX), unit=Unit(serial="H0000002"))
+            bench.plugs.plug("/dev/ttyACM0", other)
+            monkeypatch.setattr(discover, "candidates", lambda: [f"/dev/ttyACM{i}" for i in range(9)])
+            bench.device = "auto"
+            driver = bench.driver(serial="H0000001")
+            async with bench.running(driver):
+                await bench.more(40, 8.0, driver)
+                assert driver.status.extra["device"] == PORT
+                bench.plugs.unplug(PORT)
+                await asyncio.sleep(3.0)
+                assert isinstance(error_of(driver), (DeviceMissing, DeviceRefused))
+                assert "H0000001" in str(error_of(driver))
+                bench.plugs.plug("/dev/ttyACM3", bench.fake)
+                await bench.more(40, 7.0, driver)
+                assert driver.status.extra["device"] == "/dev/ttyACM3"
+                assert driver.status.reconnects == 1
+            assert other.state is State.IDLE
+
+        on_fake(body, unit=Unit(serial="H0000001"))
+
+    def test_auto_with_nothing_there(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        async def body(bench: Bench) -> None:
+            monkeypatch.setattr(discover, "candidates", list)
+            bench.device = "auto"
+            driver = bench.driver(serial="H7")
+            async with bench.running(driver):
+                await asyncio.sleep(1.0)
+                assert str(error_of(driver)).startswith("auto: no HOKUYO H7 found (plug the sensor in")
+
+        on_fake(body)
+
+    def test_another_sensor_at_the_named_port_is_refused(self) -> None:
+        async def body(bench: Bench) -> None:
+            driver = bench.driver(serial="H0000009")
+            async with bench.running(driver):
+                await asyncio.sleep(3.0)
+                error = error_of(driver)
+                assert isinstance(error, DeviceRefused)
+                assert "is sensor H0000001, not H0000009" in str(error)
+                assert bench.scans == []
+
+        on_fake(body, unit=Unit(serial="H0000001"))
+
+    def test_impossible_rate(self) -> None:
+        async def body(bench: Bench) -> None:
+            with pytest.raises(ValueError, match="baud 9600: SCIP knows 19200"):
+                bench.driver(baud=9600)
+
+        on_fake(body)
+
+
+class TestWaiting:
+    def test_missing_then_there(self, caplog: pytest.LogCaptureFixture) -> None:
+        async def body(bench: Bench) -> None:
+            assert bench.plugs is not None
+            assert bench.fake is not None
+            bench.plugs.unplug(PORT)
+            driver = bench.driver()
+            async with bench.running(driver):
+                await asyncio.sleep(60.0)
+                assert driver.status.link in (Link.WAITING, Link.OPENING)
+                assert isinstance(error_of(driver), DeviceMissing)
+                assert error_of(driver).device == PORT
+                assert len(caplog.records) == 1  # once, not at every attempt
+                bench.plugs.plug(PORT, bench.fake)
+                await bench.more(40, 8.0, driver)
+                assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+                assert "no such device (plugged in: nothing)" in caplog.text
+                assert "UTM-30LX" in caplog.records[1].message
+                bench.plugs.unplug(PORT)
+                await asyncio.sleep(0.5)
+                bench.plugs.plug(PORT, bench.fake)
+                before = bench.clock.now()
+                await bench.more(1, 2.0, driver)
+                assert bench.clock.now() - before < 2.0
+                assert [record.levelname for record in caplog.records][2:3] == ["WARNING"]
+                assert caplog.records[-1].levelname == "INFO"
+
+        with caplog.at_level(logging.INFO, "hal"):
+            on_fake(body)
+
+    @pytest.mark.parametrize(
+        "error",
+        [
+            DeviceRefused(PORT, "permission denied", "add the user to group dialout and log in again"),
+            DeviceRefused(PORT, "in use by another program", f"find it with: fuser -v {PORT}"),
+            DeviceRefused(PORT, "not a serial port", "name the sensor's own device file"),
+            DeviceMissing(PORT, "no such device", "plug the sensor in"),
+        ],
+        ids=str,
+    )
+    def test_what_the_port_says_reaches_the_status(self, error: DeviceMissing | DeviceRefused) -> None:
+        async def body(bench: Bench) -> None:
+            good, refuse = bench.opener, True
+
+            async def opener(device: str, baud: int) -> Port:
+                if refuse:
+                    raise error
+                return await good(device, baud)
+
+            bench.opener = opener
+            driver = bench.driver()
+            async with bench.running(driver):
+                await asyncio.sleep(30.0)
+                assert driver.status.error is error
+                refuse = False
+                await bench.more(5, 7.0, driver)
+
+        on_fake(body)
+
+    def test_waits_grow_to_five_seconds_and_it_never_gives_up(self) -> None:
+        async def body(bench: Bench) -> None:
+            attempts: list[float] = []
+
+            async def opener(device: str, baud: int) -> Port:
+                attempts.append(bench.clock.now())
+                raise DeviceMissing(device, "no such device")
+
+            bench.opener = opener
+            async with bench.running(bench.driver()):
+                await asyncio.sleep(86_400.0)
+            gaps = np.diff(attempts)
+            assert 0.15 < gaps[0] < 0.21
+            assert gaps[:10].max() > 3.9
+            assert gaps.max() <= 5.0
+            assert len(set(np.round(gaps[10:], 3))) > 100  # jitter
+            assert 86_400 - (attempts[-1] - attempts[0]) < 6.0
+
+        on_fake(body)
+
+
+class TestStopping:
+    @pytest.mark.parametrize("after", [0.0, 0.0003, 0.001, 0.004, 0.02, 0.05, 0.1, 0.5, 2.0])
+    def test_laser_off_within_a_tenth_of_a_second(self, after: float) -> None:
+        async def body(bench: Bench) -> None:
+            assert bench.fake is not None
+            assert bench.plugs is not None
+            driver = bench.driver()
+            async with bench.running(driver):
+                await asyncio.sleep(after)
+                began = bench.clock.now()
+            assert bench.clock.now() - began <= 0.1001
+            await asyncio.sleep(0.05)
+            assert bench.fake.state is State.IDLE
+            assert driver.status.link is Link.CLOSED
+            if after:
+                (await bench.opener(PORT, 0)).close()  # the port was given back
+
+        on_fake(body)
+
+    def test_a_sensor_that_ignores_qt_does_not_hold_us_up(self) -> None:
+        async def body(bench: Bench) -> None:
+            async with bench.running(bench.driver()):
+                await asyncio.sleep(3.0)
+                assert bench.scans
+                bench.order('[[fault]]\nwhat = "ignore"\ncommand = "QT"')
+                await asyncio.sleep(0.01)
+                began = bench.clock.now()
+            assert 0.09 < bench.clock.now() - began < 0.11
+
+        on_fake(body)
+
+    def test_during_every_wait_of_a_recovery(self) -> None:
+        async def body(bench: Bench) -> None:
+            bench.order('[[fault]]\nwhat = "silence"')
+            for after in np.arange(0.05, 12.0, 0.37):
+                async with bench.running(bench.driver()):
+                    await asyncio.sleep(float(after))
+                    began = bench.clock.now()
+                assert bench.clock.now() - began <= 0.1001
+
+        on_fake(body)
+
+
+def heard(bench: Bench) -> list[str]:
+    """Everything said to the fake, as two-letter words with the digit of TM."""
+    assert bench.fake is not None
+    words: list[str] = []
+    receive = bench.fake.receive
+
+    def listen(data: bytes) -> None:
+        words.extend(line.decode() for line in data.split(b"\n") if line)
+        receive(data)
+
+    bench.fake.receive = listen  # type: ignore[method-assign]  # a tap
+    return words
+
+
+class TestWords:
+    @pytest.mark.parametrize("name", ["URG-04LX", "URG-04LX-UG01", "UBG-04LX-F01", "UHG-08LX"])
+    @pytest.mark.parametrize(
+        "faults",
+        [
+            "",
+            '[[fault]]\nwhat = "intermittent"\nshare = 1.0\nfor = 40.0\nwhen = 3.0',
+            '[[fault]]\nwhat = "silence"\nfor = 40.0\nwhen = 3.0',
+            '[[fault]]\nwhat = "garbage"\non = "all"\nfor = 40.0\nwhen = 3.0',
+            '[[fault]]\nwhat = "status"\ncode = 60\nfor = 20.0\nwhen = 3.0',
+            '[[fault]]\nwhat = "no_reply"\ncommand = "VV"\nfor = 20.0',
+        ],
+        ids=["fine", "no scans", "mute", "garbage", "hardware trouble", "VV lost"],
+    )
+    def test_old_firmware_hears_only_what_it_can_digest(self, name: str, faults: str) -> None:
+        """Anything else has been seen to wedge it until a power cycle."""
+        model = MODELS[name]
+
+        async def body(bench: Bench) -> None:
+            words = heard(bench)
+            if faults:
+                bench.order(faults)
+            driver = bench.driver(intensity=True)
+            async with bench.running(driver):
+                await asyncio.sleep(60.0)
+                await bench.more(5, 20.0, driver)
+            assert driver.status.extra["intensity"] == "off: the model has none"
+            said = {word[:2] for word in words}
+            assert said <= {"VV", "PP", "II", "QT", "RS", "BM", "TM", "SS", "SC", "MD", "MS", "GD", "GS"}
+            assert "MD" in said
+
+        rs232 = model.link == "rs232"
+        on_fake(body, model, device="/dev/ttyUSB7" if rs232 else PORT)
+
+    def test_ladder_of_a_sensor_that_never_delivers(self) -> None:
+        """QT, then a reset, then a new connection, then a reboot; and again, for ever, with waits between."""
+
+        async def body(bench: Bench) -> None:
+            assert bench.plugs is not None
+            words = heard(bench)
+            bench.order('[[fault]]\nwhat = "intermittent"\nshare = 1.0')
+            driver = bench.driver()
+            async with bench.running(driver):
+                await asyncio.sleep(300.0)
+                first = {word: words.index(word) for word in ("QT", "VV", "RT", "RB")}
+                assert first["QT"] < first["VV"] < first["RT"] < first["RB"]
+                assert words[first["RB"] + 1] == "RB"  # a pair within a second
+                streams = [i for i, word in enumerate(words) if word.startswith("MD")]
+                assert sum(i < first["RT"] for i in streams) == 2
+                assert bench.plugs.opened > 5
+                assert words.count("RB") > 6
+                assert len(words) < 1500  # it does not spin
+                assert isinstance(error_of(driver), DeviceFault)
+                assert bench.faults is not None
+                bench.faults.clear()
+                await bench.more(20, 20.0, driver)
+                assert driver.status.error is None
+
+        on_fake(body, UST_10LX)
+
+    def test_only_a_valid_scan_sets_the_ladder_back(self) -> None:
+        """Opening well, and even frames that are damaged, must not look like success."""
+
+        async def body(bench: Bench) -> None:
+            words = heard(bench)
+            bench.order('[[fault]]\nwhat = "bit_flip"\npart = "data"')
+            async with bench.running(bench.driver()):
+                await asyncio.sleep(60.0)
+            assert bench.scans == []
+            assert "RT" in words
+            assert "RB" in words
+
+        on_fake(body, UST_10LX)
+
+    def test_error_state_is_answered_with_a_reboot(self) -> None:
+        async def body(bench: Bench) -> None:
+            words = heard(bench)
+            driver = bench.driver()
+            async with bench.running(driver):
+                await bench.more(20, 6.0, driver)
+                bench.order('[[fault]]\nwhat = "error"')
+                await asyncio.sleep(0.02)
+                await bench.more(20, 12.0, driver)
+            assert words.count("RB") == 2
+
+        on_fake(body, UST_10LX)
+
+    def test_self_check_is_waited_for(self) -> None:
+        """21, seconds of nothing, 98: the sensor verifies a doubt; resetting it then would start all over."""
+
+        async def body(bench: Bench) -> None:
+            words = heard(bench)
+            driver = bench.driver()
+            async with bench.running(driver):
+                await bench.more(20, 6.0, driver)
+                before = len(words)
+                bench.order('[[fault]]\nwhat = "verify"\nfor = 5.0')
+                await asyncio.sleep(2.0)
+                assert "21" in str(error_of(driver))
+                await bench.more(20, 5.0, driver)
+                assert len(words) == before
+
+        on_fake(body)
+
+
+class TestIntensity:
+    def run(self, model: LidarModel, check: Callable[[Bench, HokuyoDriver], None], fault: str = "") -> None:
+        async def body(bench: Bench) -> None:
+            if fault:
+                bench.order(fault)
+            driver = bench.driver(intensity=True)
+            await bench.deliver(driver, 30, within=20.0)
+            check(bench, driver)
+
+        on_fake(body, model)
+
+    def test_proved_and_used(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "on"
+            assert driver.status.dialect == "SCIP 2.2 ME"
+            for scan in bench.scans:
+                assert scan.intensity is not None
+                assert (scan.intensity[3:9] == scan.ranges[3:9] // 2).all()
+
+        self.run(UST_10LX, check)
+
+    def test_a_usb_utm_is_not_asked_for_more_than_it_can_bear(self) -> None:
+        """95 degrees times the cluster: all 270 degrees at three steps together."""
+
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.dialect == "SCIP 2.0 ME, 3 steps together"
+            assert {len(scan.ranges) for scan in bench.scans} <= {360, 361}
+            assert bench.scans[0].stride == 3
+
+        self.run(UTM_30LX, check)
+
+    def test_refused(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "off: ME answers 0E"
+            assert driver.status.dialect == "SCIP 2.2 MD"
+            assert bench.scans[0].intensity is None
+
+        self.run(replace(UST_10LX, measures=PLAIN), check)
+
+    def test_all_dark(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "off: every intensity is 0"
+            assert driver.status.dialect == "SCIP 2.2 MD"
+
+        self.run(UST_10LX, check, '[[fault]]\nwhat = "dark"\nfor = 2.0')
+
+    def test_never_arrives(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "off: no scan within 6 s"
+
+        self.run(UST_10LX, check, '[[fault]]\nwhat = "intermittent"\nshare = 1.0\ncount = 1')
+
+    def test_damaged(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"].startswith("off: checksum")
+
+        self.run(UST_10LX, check, '[[fault]]\nwhat = "bit_flip"\nbit = 0\ncount = 1')
+
+    def test_lost_port_while_proving(self) -> None:
+        async def body(bench: Bench) -> None:
+            driver = bench.driver(intensity=True)
+            bench.order('[[fault]]\nwhat = "hangup"\nwhen = 0.05\nfor = 1.0')
+            await bench.deliver(driver, 30, within=20.0)
+            assert driver.status.extra["intensity"] == "on"
+
+        on_fake(body, replace(UST_10LX, measures=ECHOES), Unit(spin_up_s=2.0))
+
+
+def test_sensors_text_is_kept_for_people() -> None:
+    async def body(bench: Bench) -> None:
+        bench.order('[[fault]]\nwhat = "trouble"')
+        driver = bench.driver()
+        await bench.deliver(driver, 10, within=8.0)
+        assert driver.status.extra["state"] == "Trouble!! Error No. =[00->33]"
+        assert driver.status.extra["serial"] == "H0706400"
+
+    on_fake(body)
