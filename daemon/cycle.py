@@ -274,7 +274,7 @@ class Pacemaker:
     async def run(self) -> None:
         """Run cycles until cancelled."""
         loop = asyncio.get_running_loop()
-        self._cycle.inbox.forget_dropped()
+        self._cycle.inbox.begin()
         while True:
             self._due = loop.create_future()
             timer = loop.call_at(loop.time() + IDLE_PERIODS * self._cycle.period.seconds, self._wake)

@@ -61,6 +61,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
 
 WINDOW_S: Final = 10.0
 """Rates are judged over the latest vitals that are at least this far apart, or all there are."""
+FEW: Final = 2
+"""Events that are no rate yet: shortly after the start a single one would be a large part of all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +114,9 @@ def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
     elif now.silent:
         yield Fault.LIDAR_SILENT
     scans, missed, invalid = now.scans - before.scans, now.missed - before.missed, now.invalid - before.invalid
-    if invalid > 0.05 * (scans + invalid):
+    if invalid > FEW + 0.05 * (scans + invalid):
         yield Fault.LIDAR_GARBLED
-    if not down and missed > 0.02 * (scans + missed):
+    if not down and missed > FEW + 0.02 * (scans + missed):
         yield Fault.LIDAR_GAPS
 
 
@@ -135,7 +137,7 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
 def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
     if now.lateness > now.period:
         yield Fault.LOOP_STALLED
-    if now.overruns - before.overruns > 0.05 * max(1, now.cycles - before.cycles):
+    if now.overruns - before.overruns > FEW + 0.05 * (now.cycles - before.cycles):
         yield Fault.OVERRUNS
     if now.jobs_failed > before.jobs_failed:
         yield Fault.WORKER_FAILED

@@ -51,6 +51,8 @@ class Heartbeat:
     def beat(self, lateness: float) -> None:
         """One beat; ``lateness``: seconds by which the loop was late for it."""
         now = self._vitals(lateness)
+        if self._samples and self._samples[-1].cycles == 0:
+            self._samples.clear()  # what was lost while the estimator was being loaded is no fault
         self._samples.append(now)
         while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
             self._samples.popleft()

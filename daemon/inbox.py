@@ -45,10 +45,9 @@ class Inbox:
         self._imu_total = 0
         self._commands: list[Command] = []
 
-    def forget_dropped(self) -> None:
+    def begin(self) -> None:
         """Cycles begin: scans that came before there was anyone to take them are no loss."""
         self.dropped = 0
-        self._dropped = []
 
     def put_scan(self, scan: RawScan) -> None:
         """Hold a scan; one that no cycle has taken yet is dropped for it and counted."""

@@ -31,7 +31,7 @@ from daemon.notify import notify
 from daemon.publish.snapshot import Snapshot
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
-from daemon.warmup import warm_up
+from daemon.warmup import CannotLoad, warm_up
 from daemon.worker import ThreadWorker, Worker
 from estimator.records import Limits, Record
 from estimator.result import StepResult
@@ -234,7 +234,7 @@ def main(args: argparse.Namespace) -> int:
 
             recorder = Recorder(args.record, settings, SystemClock())
         asyncio.run(_run_until_signal(settings, recorder))
-    except HalError as error:
+    except (HalError, CannotLoad) as error:
         log.error("%s", error)
         return 1
     return 0

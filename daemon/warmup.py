@@ -29,6 +29,10 @@ REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
 
 
+class CannotLoad(Exception):
+    """The estimator cannot be loaded; the text says why and what to do."""
+
+
 @dataclass(frozen=True, slots=True)
 class Warmth:
     """How the warm-up went: whether kernels had to be compiled, and the seconds it took."""
@@ -81,8 +85,22 @@ def _settle(done: asyncio.Future[Warmth], warmth: Warmth | None, error: Exceptio
 
 
 def load() -> Warmth:
-    """Import and exercise the estimator under the lock. Blocks; for a thread, or for a command that may wait."""
+    """Import and exercise the estimator under the lock. Blocks; for a thread, or for a command that may wait.
+
+    Raises:
+        CannotLoad: nowhere to keep compiled kernels, or memory must not be made executable here.
+    """
     begun = time.monotonic()
+    try:
+        return _load_locked(begun)
+    except PermissionError as error:  # raised by the compiler under the service manager's MemoryDenyWriteExecute=
+        remedy = "the process must be allowed to make memory executable"
+        raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
+    except (OSError, RuntimeError) as error:
+        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
+
+
+def _load_locked(begun: float) -> Warmth:
     from estimator.kernel import CACHE_DIR
 
     with (CACHE_DIR / "lock").open("w") as lock:

@@ -32,7 +32,7 @@ def test_all_is_well() -> None:
         ({"silent": True, "error": DataInvalid("/dev/ttyACM0", "checksum")}, Fault.LIDAR_SILENT),
         ({"silent": True}, Fault.LIDAR_SILENT),
         ({"invalid": 30}, Fault.LIDAR_GARBLED),
-        ({"missed": 10}, Fault.LIDAR_GAPS),
+        ({"missed": 12}, Fault.LIDAR_GAPS),
         ({"odometry": False}, Fault.ODOMETRY_SILENT),
         ({"odometry": True, "odometry_jumps": 1}, Fault.ODOMETRY_JUMPS),
         ({"odometry": True, "disagree": True}, Fault.ODOMETRY_DISAGREES),
@@ -53,6 +53,11 @@ def test_each_cause_has_its_fault(change: dict[str, object], fault: Fault) -> No
 )
 def test_a_little_of_it_is_no_fault(change: dict[str, object]) -> None:
     assert assess(replace(WELL, **change), BEFORE) == ()  # type: ignore[arg-type]  # test shorthand
+
+
+def test_the_first_second_after_a_start_is_no_rate() -> None:
+    early = Vitals(1.0, link=Link.STREAMING, scans=8, cycles=8, missed=2, invalid=1, overruns=2)
+    assert assess(early, early) == assess(early, BEFORE) == ()
 
 
 def test_only_what_is_new_counts() -> None:
@@ -113,6 +118,23 @@ def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: py
         "fault 105: more than 5 % of the lidar's frames are damaged",
         "over: fault 105: more than 5 % of the lidar's frames are damaged",
     ]
+
+
+def test_what_is_lost_before_the_first_cycle_is_no_fault() -> None:
+    samples = [
+        Vitals(1.0, link=Link.STREAMING, scans=30, missed=10),
+        Vitals(2.0, link=Link.STREAMING, scans=60, missed=20),
+        Vitals(3.0, link=Link.STREAMING, scans=90, missed=30, cycles=20),
+        Vitals(4.0, link=Link.STREAMING, scans=130, missed=30, cycles=60),
+        Vitals(5.0, link=Link.STREAMING, scans=150, missed=50, cycles=100),
+    ]
+    waiting = iter(samples)
+    heart = Heartbeat(lambda lateness: next(waiting), str)
+    for _ in range(4):
+        heart.beat(0.0)
+        assert heart.faults == ()
+    heart.beat(0.0)
+    assert heart.faults == (Fault.LIDAR_GAPS,)
 
 
 def test_statistics_are_logged_now_and_then(caplog: pytest.LogCaptureFixture) -> None:

@@ -189,3 +189,6 @@ def test_a_recording_is_made_beside(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert len((out / "trajectory.tum").read_text().splitlines()) > 50
+    compared = json.loads((out / "summary.json").read_text())["recorded_run"]
+    assert compared["cycles"] > 50
+    assert compared["differ"] == 0, compared["first_difference"]

@@ -64,6 +64,19 @@ def test_a_failure_to_load_is_raised_not_swallowed(monkeypatch: pytest.MonkeyPat
         asyncio.run(warm_up())
 
 
+def test_a_machine_on_which_nothing_can_be_kept_gets_a_clear_refusal() -> None:
+    code = "from daemon.cli import main; raise SystemExit(main(['run', '--set', 'modbus.port=0']))"
+    nowhere = {"NUMBA_CACHE_DIR": "/proc/nowhere", "HOME": "/proc/nowhere", "TMPDIR": "/proc/nowhere"}
+    environment = {key: value for key, value in os.environ.items() if key not in ("XDG_CACHE_HOME", "CACHE_DIRECTORY")}
+    command = [sys.executable, "-c", f"import tempfile; tempfile.tempdir = '/proc/nowhere'; {code}"]
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment | nowhere, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 1
+    assert "no writable directory for compiled kernels; set NUMBA_CACHE_DIR to one" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_stop_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
     monkeypatch.setattr(warmup, "load", lambda: release.wait(30.0) and Warmth(False, 0.0))
