@@ -98,6 +98,8 @@ def make_scene(options: Options, t_mono: float) -> Scene:
         scene = SimulatedScene(scenario, held=options.hold)
         asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, scene.release)
         return scene
+    if options.hold:
+        raise ValueError("--hold holds a robot in a building; a log goes on by its own clock")
     from hal.replay.carmen import read_carmen
 
     log = read_carmen(options.log)

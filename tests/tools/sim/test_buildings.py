@@ -155,8 +155,8 @@ def test_an_office_scan_costs_at_most_a_fraction_of_its_period() -> None:
     scanner = Scanner(place.world, Sweep(np.radians(np.arange(-540, 541) * 0.25), 0.0, 0.019), UTM_30LX)
     spent = []
     for t in np.linspace(0.0, drive.lap_s, 60):
-        begin = time.perf_counter()
+        begin = time.thread_time()
         pose = drive.pose(np.array([t]))[0]
         scanner.measure(float(t), drive.pose, crowd.legs(float(t), pose), Posture(0.3, *drive.tilt(float(t))))
-        spent.append(time.perf_counter() - begin)
+        spent.append(time.thread_time() - begin)
     assert np.median(spent) < 8e-3

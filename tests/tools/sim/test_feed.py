@@ -107,6 +107,7 @@ def test_targets() -> None:
         (["--odometry", "here"], "expected udp://HOST:PORT"),
         (["--faults", "/nonexistent/faults.toml"], "No such file"),
         (["--log", "/nonexistent/log.clf"], "/nonexistent/log.clf"),
+        (["--log", "/nonexistent/log.clf", "--hold"], "a log goes on by its own clock"),
     ],
 )
 def test_bad_arguments_are_explained(words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]) -> None:
