@@ -114,6 +114,8 @@ FOREIGN: Final = {
     b"\xfd7zXZ": "an xz archive",
     b"BZh": "a bzip2 archive",
 }
+MOVED_S: Final = 0.005
+"""The passive codec does not know the speed of the line, nor what the driver knew of the sensor's clock."""
 _REMEDY: Final = "unpack it, or turn it into a CARMEN log with `python -m tools.convert IN OUT`"
 
 
@@ -260,7 +262,7 @@ class RecordingSource(Source):
             marks.missing += 1
             return None
         scan = marks.decoded.pop(0)
-        marks.moved += scan.t_mono != mark.t_mono
+        marks.moved += abs(scan.t_mono - mark.t_mono) > MOVED_S
         return replace(scan, seq=mark.seq, t_mono=mark.t_mono, t_sigma=mark.t_sigma)
 
     def _say(self) -> None:

@@ -1,0 +1,226 @@
+"""A recorded run, replayed: the whole daemon in virtual time, its recording, and the same poses to the last bit."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from daemon import cli
+from daemon.budget import FixedBudget
+from daemon.config import Config, LidarConfig, ModbusConfig, Mount
+from daemon.main import Daemon, World
+from daemon.publish.snapshot import Snapshot
+from daemon.record import Recorder
+from daemon.worker import CycleWorker
+from estimator import se2
+from estimator.records import Command, Limits, Order
+from hal.clock import LoopClock, run_virtual
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import URG_04LX, URG_04LX_UG01, LidarModel
+from hal.fake.schedule import FaultSchedule
+from hal.fake.transport import FakeOpener
+from hal.fake.world import Room
+from hal.imu import RawImu
+from hal.odometry import RawOdometry
+from tests.daemon.replay.room import read_tum
+
+USB, SERIAL = "/dev/ttyACM0", "/dev/ttyUSB0"
+SETTINGS = Config(lidar=LidarConfig(device=USB, mount=Mount(0.1, -0.02, 30.0)), modbus=ModbusConfig(port=0))
+
+
+class UnevenBudget(FixedBudget):
+    """Caps that change from cycle to cycle, as measured ones do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._caps = itertools.cycle([Limits(50, 100_000, True), Limits(3, 120, False), Limits(7, 333, True)])
+
+    def limits(self, budget_us: float) -> Limits:
+        return next(self._caps)
+
+
+def configured(device: str) -> Config:
+    return msgspec.structs.replace(SETTINGS, lidar=msgspec.structs.replace(SETTINGS.lidar, device=device))
+
+
+@dataclass
+class Bench:
+    """A recorded daemon with its lidar and its inputs."""
+
+    folder: Path
+    device_name: str = USB
+    snapshots: list[Snapshot] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.clock = LoopClock(self.loop, utc_at_zero=1.7e9)
+        model: LidarModel = URG_04LX_UG01 if self.device_name == USB else URG_04LX
+        self.room = Room(model)
+        self.device = FakeHokuyo(model, self.room)
+        self.opener = FakeOpener(self.clock)
+        self.opener.plug(self.device_name, self.device)
+        self.faults = FaultSchedule({"lidar": self.device})
+        settings = configured(self.device_name)
+        self.recorder = Recorder(self.folder, settings, self.clock)
+        self.daemon = Daemon(settings, self._world(), self.recorder)
+        inbox = self.daemon.cycle.inbox
+        self.put_odometry = self.recorder.on_odometry(inbox.put_odometry)
+        self.put_imu = self.recorder.on_imu(inbox.put_imu)
+
+    def _world(self) -> World:
+        async def warm() -> None:
+            from daemon.warmup import load
+
+            load()
+
+        return World(
+            self.clock,
+            opener=self.opener,
+            make_worker=CycleWorker,
+            make_budget=UnevenBudget,
+            stopwatch=None,
+            warm_up=warm,
+            sinks=(self.snapshots.append,),
+            draw_map_id=lambda: 1,
+        )
+
+    async def drive(self, seconds: float) -> None:
+        """Odometry at 33 Hz and a gyro at 50 Hz, neither in step with the lidar."""
+        start = self.room.pose(np.array([self.loop.time()]))[0]
+        before = 0.0
+        for tick in range(round(seconds * 100)):
+            await asyncio.sleep(0.01)
+            t = self.loop.time()
+            x, y, yaw = se2.between(start, self.room.pose(np.array([t]))[0]).tolist()
+            if tick % 3 == 0:
+                self.put_odometry(RawOdometry(t, t - 0.004, 1.02 * x, y, yaw))
+            if tick % 2 == 0:
+                self.put_imu(RawImu(t, t, (yaw - before) / 0.02))
+                before = yaw
+
+
+def record(folder: Path, scenario: Callable[[Bench], Awaitable[None]], device: str = USB) -> Bench:
+    async def go() -> Bench:
+        bench = Bench(folder, device)
+        stop = asyncio.Event()
+        running = asyncio.create_task(bench.daemon.run(stop))
+        try:
+            await scenario(bench)
+        finally:
+            stop.set()
+            await asyncio.wait_for(running, 10.0)
+        return bench
+
+    return run_virtual(go())
+
+
+def replay(folder: Path, out: Path) -> dict[str, dict[str, object]]:
+    assert cli.main(["replay", str(folder), "--out", str(out)]) == cli.OK
+    summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
+    return summary
+
+
+async def calm(bench: Bench) -> None:
+    await bench.drive(8.0)
+
+
+async def patient(bench: Bench) -> None:
+    """A serial sensor is first looked for at every rate, and then told to talk faster."""
+    await bench.drive(30.0)
+
+
+FAULTS = """
+[[fault]]
+what = "bit_flip"
+share = 0.3
+for = 1.5
+[[fault]]
+what = "set_clock"
+when = 2.0
+[[fault]]
+what = "stall"
+when = 2.3
+for = 0.5
+"""
+
+
+async def eventful(bench: Bench) -> None:
+    """Damage on the line, the plug pulled, a reboot, and orders from a person."""
+    await bench.drive(3.0)
+    bench.faults.load(FAULTS)
+    await bench.drive(3.0)
+    bench.opener.unplug(USB)
+    await bench.drive(2.0)
+    bench.opener.plug(USB, bench.device)
+    await bench.drive(3.0)
+    inbox = bench.daemon.cycle.inbox
+    inbox.put_command(Command(bench.loop.time(), Order.SET_POSE, np.array((5.0, -3.0, 2.0))))
+    await bench.drive(2.0)
+    inbox.put_command(Command(bench.loop.time(), Order.RESET))
+    await bench.drive(2.0)
+    bench.device.power_on()
+    await bench.drive(5.0)
+
+
+@pytest.mark.parametrize(("scenario", "device"), [(calm, USB), (patient, SERIAL), (eventful, USB)])
+def test_the_replay_gives_the_same_poses_to_the_last_bit(
+    tmp_path: Path, scenario: Callable[[Bench], Awaitable[None]], device: str
+) -> None:
+    bench = record(tmp_path / "rec", scenario, device)
+    summary = replay(tmp_path / "rec", tmp_path / "out")
+    assert summary["recorded_run"] == {
+        "cycles": bench.daemon.cycle.cycles,
+        "differ": 0,
+        "first_difference": "",
+    }
+    assert summary["counts"]["scans"] >= bench.daemon.lidar.status.scans > 30
+    assert summary["config"]["lidar"]["mount"] == {"x": 0.1, "y": -0.02, "yaw": 30.0, "inverted": False}  # type: ignore[index]  # plain data
+    stamps, poses = read_tum(tmp_path / "out" / "online.tum")
+    posed = np.array([(1.7e9 + snapshot.t_mono, *snapshot.pose) for snapshot in bench.snapshots if snapshot.pose])
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        told = posed[np.abs(posed[:, 0] - stamp) < 2e-6]  # cycles without a scan may carry the same instant
+        off = np.column_stack([told[:, 1:3] - pose[:2], np.sin(told[:, 3] - pose[2])])
+        assert np.abs(off).max(axis=1).min() < 2e-6
+
+
+def test_a_recording_that_lost_its_end_is_replayed_up_to_there(tmp_path: Path) -> None:
+    bench = record(tmp_path / "rec", calm)
+    (segment,) = (tmp_path / "rec").rglob("*.lumirec")
+    data = segment.read_bytes()
+    segment.write_bytes(data[: len(data) * 2 // 3])
+    summary = replay(tmp_path / "rec", tmp_path / "out")
+    assert summary["recorded_run"]["differ"] == 0
+    assert 40 < summary["recorded_run"]["cycles"] < bench.daemon.cycle.cycles - 10  # type: ignore[operator]  # plain data
+
+
+def test_a_recording_with_a_hole_says_where_it_is_not_the_same_run_any_more(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(tmp_path / "rec", calm)
+    (segment,) = (tmp_path / "rec").rglob("*.lumirec")
+    data = bytearray(segment.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 200] = bytes(200)
+    segment.write_bytes(data)
+    summary = replay(tmp_path / "rec", tmp_path / "out")
+    assert summary["recorded_run"]["differ"] > 0  # type: ignore[operator]  # plain data
+    said = capsys.readouterr().err
+    assert "is damaged" in said
+    assert "cycles differ from the recorded run; cycle" in said
+
+
+def test_a_person_may_replay_with_another_configuration(tmp_path: Path) -> None:
+    record(tmp_path / "rec", calm)
+    arguments = ["--out", str(tmp_path / "out"), "--set", "lidar.mount.yaw=29"]
+    assert cli.main(["replay", str(tmp_path / "rec"), *arguments]) == cli.OK
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["config"]["lidar"]["mount"]["yaw"] == 29.0
+    assert summary["recorded_run"]["differ"] > 0
+    assert summary["log"]["recorded_versions"]["numpy"]
