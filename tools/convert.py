@@ -21,6 +21,7 @@ import gzip
 import math
 import sys
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +32,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+GZIP_MAGIC: Final = b"\x1f\x8b"
 URG_STEP_RAD: Final = 2.0 * math.pi / 1024.0
 URG_FIRST_STEP, URG_FRONT_STEP = 44, 384
 URG_BEAMS, URG_FIELDS, URG_RANGES_AT = 682, 707, 24
@@ -42,6 +44,8 @@ ROVER_HIDDEN_BEAMS: Final = 70
 ROVER_TRUSTED_MM: Final = 4000
 UTM_STEPS: Final = 1440
 DELAY_S: Final = 0.12
+"""First beam to arrival: where wheels and scans of exp1 and exp2 agree best about every turn (0.66 and 0.74 deg RMS
+against 1.70 and 1.82 with the host's stamps)."""
 MOTOR_TOLERANCE: Final = 0.03
 PERIODS_TRIED: Final = 6001
 
@@ -77,7 +81,8 @@ class Scans:
 def read(path: Path) -> Scans:
     """Read any of the known formats; raises `NotConverted`."""
     try:
-        begin = path.open("rb").read(4)
+        with path.open("rb") as file:
+            begin = file.read(4)
     except OSError as error:
         raise NotConverted(f"{path}: {error.strerror}") from error
     if not begin:
@@ -103,16 +108,19 @@ def read_dat(path: Path) -> Scans:
 
 
 def _fields(path: Path) -> Iterator[list[float]]:
-    opened = gzip.open(path, "rt") if path.suffix == ".gz" else path.open()
-    with opened as lines:
+    try:
+        data = path.read_bytes()
+        text = gzip.decompress(data) if data.startswith(GZIP_MAGIC) else data
+    except (EOFError, zlib.error, OSError) as error:
+        raise NotConverted(f"{path}: {error}") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if len(words) != URG_FIELDS:
+            raise NotConverted(f"{path}:{number}: {len(words)} fields; a scan of this format has {URG_FIELDS}")
         try:
-            for number, line in enumerate(lines, start=1):
-                words = line.split()
-                if len(words) != URG_FIELDS:
-                    raise NotConverted(f"{path}:{number}: {len(words)} fields; a scan of this format has {URG_FIELDS}")
-                yield list(map(float, words))
-        except (ValueError, EOFError, OSError) as error:
-            raise NotConverted(f"{path}: {error}; a scan is a line of {URG_FIELDS} numbers") from error
+            yield list(map(float, words))
+        except ValueError as error:
+            raise NotConverted(f"{path}:{number}: {error}") from error
 
 
 def wheel_poses(counts: Array) -> Array:
@@ -129,7 +137,7 @@ def read_npz(path: Path) -> Scans:
     """An ``.npz`` file of UTM-30LX scans; there are no wheels in it."""
     names = ("t_device_s", "range_mm", "angle_min_rad", "angle_increment_rad", "time_increment_s")
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             stamps, ranges, start, step, beam_dt = (np.asarray(data[name]) for name in names)
     except (KeyError, ValueError, zipfile.BadZipFile, OSError) as error:
         raise NotConverted(f"{path}: {error}; expected the arrays {', '.join(names)}") from error
@@ -166,7 +174,7 @@ def _rhythm(stamps: Array) -> tuple[float, float]:
 
 
 def _turns(late: Array) -> Array:
-    """Whole, rising turns nearest to ``late``; where scans arrive in a burst, those before the last are the late ones."""
+    """Whole, rising turns nearest to ``late``; of a burst of arrivals, those before the last are the late ones."""
     turns = np.rint(late)
     for k in range(len(turns) - 2, -1, -1):
         turns[k] = min(turns[k], turns[k + 1] - 1.0)
@@ -186,7 +194,7 @@ def write(path: Path, scans: Scans, source: str) -> None:
     """Write the log, gzipped if the name says so; raises `NotConverted`."""
     text = ("\n".join(_lines(scans, source)) + "\n").encode()
     try:
-        path.write_bytes(gzip.compress(text, mtime=0) if path.suffix == ".gz" else text)
+        path.write_bytes(gzip.compress(text, 5, mtime=0) if path.suffix == ".gz" else text)
     except OSError as error:
         raise NotConverted(f"{path}: {error.strerror}") from error
 
