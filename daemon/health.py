@@ -48,7 +48,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "odometry and laser disagree",
         "wheel slip; if it lasts, check odometry scale and lidar mount",
     ),
-    Fault.LOOP_STALLED: ("the process did not get to run for more than a scan period", "take load off the computer"),
+    Fault.LOOP_STALLED: ("the process did not get to run for two scan periods", "take load off the computer"),
     Fault.OVERRUNS: ("more than 5 % of the cycles exceed their budget", "take load off the computer"),
     Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
     Fault.PUBLISHER_FAILED: (
@@ -61,6 +61,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
 
 WINDOW_S: Final = 10.0
 """Rates are judged over the latest vitals that are at least this far apart, or all there are."""
+STALLED_PERIODS: Final = 2.0
+"""Scan periods by which the loop may be late: the next one would be taken for a silent lidar."""
 FEW: Final = 2
 """Events that are no rate yet: shortly after the start a single one would be a large part of all."""
 
@@ -73,7 +75,7 @@ class Vitals:
         link, error: of the lidar driver. silent: no valid scan for three scan periods.
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the laser.
-        cycles, overruns, jobs_failed: counters. lateness: worst lateness of the loop since the last vitals, seconds.
+        cycles, overruns, jobs_failed: counters. lateness: worst lateness of the loop lately, seconds.
         failed: names of parts that are down at the moment.
     """
 
@@ -135,7 +137,7 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
 
 
 def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
-    if now.lateness > now.period:
+    if now.lateness > STALLED_PERIODS * now.period:
         yield Fault.LOOP_STALLED
     if now.overruns - before.overruns > FEW + 0.05 * (now.cycles - before.cycles):
         yield Fault.OVERRUNS

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 from daemon.health import WINDOW_S, Fault, Vitals, assess, describe
@@ -56,7 +57,8 @@ class Heartbeat:
         self._samples.append(now)
         while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
             self._samples.popleft()
-        self._tell(assess(now, self._samples[0]))
+        worst = max(sample.lateness for sample in self._samples)
+        self._tell(assess(replace(now, lateness=worst), self._samples[0]))
         if len(self._samples) < 2 or now.cycles > self._samples[-2].cycles:
             notify("WATCHDOG=1")
         self._beats += 1

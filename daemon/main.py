@@ -251,10 +251,18 @@ async def _run_until_signal(settings: Config, recorder: Recorder | None) -> None
 def start_log() -> None:
     """Log to stderr: with the journal's priorities where the journal reads it, else with the time of day."""
     handler = logging.StreamHandler(sys.stderr)
-    at = os.fstat(sys.stderr.fileno())
-    journal = os.environ.get("JOURNAL_STREAM") == f"{at.st_dev}:{at.st_ino}"
-    handler.setFormatter(_JournalFormat("%(message)s") if journal else logging.Formatter(TERMINAL_FORMAT))
+    formatter = _JournalFormat("%(message)s") if _to_journal() else logging.Formatter(TERMINAL_FORMAT)
+    handler.setFormatter(formatter)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+def _to_journal() -> bool:
+    """Whether stderr is the journal's own stream and not redirected (systemd.exec(5), JOURNAL_STREAM)."""
+    try:
+        at = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{at.st_dev}:{at.st_ino}"
 
 
 class _JournalFormat(logging.Formatter):

@@ -68,6 +68,6 @@ def as_dict(finding: Finding) -> dict[str, object]:
             "from_deg": round((g.amin - g.afrt) * 360.0 / g.ares, 3),
             "to_deg": round((g.amax - g.afrt) * 360.0 / g.ares, 3),
             "period_s": g.period_s,
-            "range_m": [g.dmin * g.range_unit_m, g.dmax * g.range_unit_m],
+            "range_m": [round(g.dmin * g.range_unit_m, 6), round(g.dmax * g.range_unit_m, 6)],
         }
     return known

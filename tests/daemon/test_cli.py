@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import tomllib
 import types
@@ -12,6 +14,8 @@ import pytest
 from daemon import cli
 from daemon.config import Config
 
+ROOT = Path(__file__).parents[2]
+
 
 def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "robot.toml"
@@ -21,6 +25,19 @@ def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     file.write_text("[modbus]\nport = 'x'\n")
     assert cli.main(["check", str(file)]) == cli.USAGE
     assert capsys.readouterr().err.startswith(f"lumiloop: {file}:2: Expected `int`, got `str` - at `$.modbus.port`")
+
+
+@pytest.mark.parametrize("words", [["check", "robot.toml"], ["--print-config"], ["run", "--print-config"]])
+def test_small_commands_load_neither_numpy_nor_numba(tmp_path: Path, words: list[str]) -> None:
+    (tmp_path / "robot.toml").write_text("name = 'r1'\n")
+    code = (
+        f"import sys\nfrom daemon.cli import main\nassert main({words!r}) == 0\n"
+        "assert not {'numba', 'numpy', 'asyncio'} & set(sys.modules)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_print_config_resolves_file_and_overrides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

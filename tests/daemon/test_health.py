@@ -36,7 +36,7 @@ def test_all_is_well() -> None:
         ({"odometry": False}, Fault.ODOMETRY_SILENT),
         ({"odometry": True, "odometry_jumps": 1}, Fault.ODOMETRY_JUMPS),
         ({"odometry": True, "disagree": True}, Fault.ODOMETRY_DISAGREES),
-        ({"lateness": 0.11}, Fault.LOOP_STALLED),
+        ({"lateness": 0.21}, Fault.LOOP_STALLED),
         ({"overruns": 30}, Fault.OVERRUNS),
         ({"jobs_failed": 1}, Fault.WORKER_FAILED),
         ({"failed": frozenset(["modbus"])}, Fault.PUBLISHER_FAILED),
@@ -49,7 +49,7 @@ def test_each_cause_has_its_fault(change: dict[str, object], fault: Fault) -> No
 
 @pytest.mark.parametrize(
     "change",
-    [{"invalid": 15}, {"missed": 7}, {"overruns": 15}, {"lateness": 0.09}, {"error": DataInvalid("lidar", "once")}],
+    [{"invalid": 15}, {"missed": 7}, {"overruns": 15}, {"lateness": 0.19}, {"error": DataInvalid("lidar", "once")}],
 )
 def test_a_little_of_it_is_no_fault(change: dict[str, object]) -> None:
     assert assess(replace(WELL, **change), BEFORE) == ()  # type: ignore[arg-type]  # test shorthand
@@ -118,6 +118,15 @@ def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: py
         "fault 105: more than 5 % of the lidar's frames are damaged",
         "over: fault 105: more than 5 % of the lidar's frames are damaged",
     ]
+
+
+def test_a_stall_is_said_once_and_over_when_none_has_come_for_a_while(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    heart = Heartbeat(Patient().sample, str)
+    for beat in range(40):
+        heart.beat(0.5 if beat in (5, 8, 12) else 0.001)
+        assert (Fault.LOOP_STALLED in heart.faults) == (5 <= beat <= 22)
+    assert len(caplog.records) == 2
 
 
 def test_what_is_lost_before_the_first_cycle_is_no_fault() -> None:
