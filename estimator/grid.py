@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from estimator import se2
 from estimator.kernel import kernel
-from estimator.localmap import Keyframe
+from estimator.keyframe import Keyframe
 from estimator.records import Array, Beam
 
 LIMIT = 50_000_000
@@ -86,10 +86,11 @@ def extent(keyframes: Sequence[Keyframe], margin: float) -> tuple[Array, Array]:
     """Lower left and upper right corner that hold every keyframe and every surface point."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in keyframes:
-        hit = (k.scan.beam == Beam.HIT) & np.isfinite(k.scan.range_m) & np.isfinite(k.scan.bearing_rad)
-        T = se2.compose(k.T_map_keyframe, k.scan.T_base_lidar)
-        angle, reach = k.scan.bearing_rad[hit] + T[2], k.scan.range_m[hit]
-        for axis, ends in enumerate((reach * np.cos(angle), reach * np.sin(angle))):
+        T = se2.compose(k.T_map_keyframe, k.T_base_lidar)
+        bearing, reach, kind = k.beams()
+        hit = (kind == Beam.HIT) & np.isfinite(reach) & np.isfinite(bearing)
+        angle = bearing[hit] + T[2]
+        for axis, ends in enumerate((reach[hit] * np.cos(angle), reach[hit] * np.sin(angle))):
             low[axis] = min(low[axis], T[axis] + ends.min(initial=0.0))
             high[axis] = max(high[axis], T[axis] + ends.max(initial=0.0))
     return low - margin, high + margin
@@ -115,6 +116,5 @@ def render(keyframes: Sequence[Keyframe], resolution: float) -> Grid:
     cells = np.zeros((rows, columns), np.float32)
     frame = np.array((origin[0], origin[1], resolution))
     for k in keyframes:
-        T_map_lidar = se2.compose(k.T_map_keyframe, k.scan.T_base_lidar)
-        cast_beams(cells, frame, T_map_lidar, (k.scan.bearing_rad, k.scan.range_m, k.scan.beam))
+        cast_beams(cells, frame, se2.compose(k.T_map_keyframe, k.T_base_lidar), k.beams())
     return Grid(origin, resolution, cells)

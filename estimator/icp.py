@@ -99,13 +99,13 @@ def pair_up(
     sums[15], sums[16], sums[17], sums[18] = inliers, pairs, weights, squares
 
 
-@kernel("f8(f8[::1], f8, f8[:, ::1], f8[:, ::1])")
-def trusted(sums: Array, k: float, H: Array, keep: Array) -> float:
+@kernel("void(f8[::1], f8, f8[:, ::1], f8[:, ::1])")
+def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
     """The part of the information that is not the normals' noise, times ``k``, and the projector onto what it holds.
 
-    Returns the number of directions held. A direction counts when its information is more than twice the part that
-    noise alone explains; the test needs no scaling of metres against radians. Only where it fails are directions
-    separated, with yaw in units of the points' mean lever.
+    A direction is held when its information is more than twice the part that noise alone explains; the test needs no
+    scaling of metres against radians. Only where it fails are directions separated, with yaw in units of the points'
+    mean lever.
     """
     M = np.empty((3, 3))
     at = 0
@@ -116,27 +116,26 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> float:
             keep[i, j] = keep[j, i] = 1.0 if i == j else 0.0
             at += 1
     if positive(M):
-        return 3.0
+        return
     lever = np.sqrt(max(sums[5] + sums[11], 1e-9) / max(sums[0] + sums[3], 1e-9))
-    S = np.array((1.0, 1.0, 1.0 / lever))
+    scale = np.array((1.0, 1.0, 1.0 / lever))
     V = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
-            M[i, j] *= S[i] * S[j]
+            M[i, j] *= scale[i] * scale[j]
+            keep[i, j] = 0.0
     eigen3(M, V)
-    held = 0.0
-    P = np.zeros((3, 3))
     for d in range(3):
         if M[d, d] > 0.0:
-            held += 1.0
             for i in range(3):
                 for j in range(3):
-                    P[i, j] += V[i, d] * V[j, d]
+                    keep[i, j] += V[i, d] * V[j, d] * scale[j] / scale[i]
     for i in range(3):
         for j in range(3):
-            keep[i, j] = P[i, j] * S[j] / S[i]
-    H[:] = keep @ H @ keep.T
-    return held
+            M[i, j] = H[i, 0] * keep[j, 0] + H[i, 1] * keep[j, 1] + H[i, 2] * keep[j, 2]
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = keep[i, 0] * M[0, j] + keep[i, 1] * M[1, j] + keep[i, 2] * M[2, j]
 
 
 @kernel("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8, f8)")

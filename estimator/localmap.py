@@ -16,8 +16,8 @@ import numpy.typing as npt
 from estimator import se2
 from estimator.distance_region import Axis, Ints, build_axis, nearest
 from estimator.kernel import kernel
-from estimator.records import Array, Scan
-from estimator.scanpoints import ScanPoints, lines_of
+from estimator.keyframe import Beams, Keyframe
+from estimator.records import Array, Beam
 
 X, Y, NX, NY, SLOPE, WEIGHT, SEEN, STRIKES = range(8)
 """Columns of an element: place, normal towards the sensor, variance of the normal's direction (rad^2), scans averaged,
@@ -26,6 +26,9 @@ number of the update that saw it last, how often it was looked through since."""
 WIDTH = 8
 MARGIN = 0.1
 """Metres, beyond five times the range noise, by which a beam must differ to speak for or against an element."""
+
+SOLID_M, UNPROVED = 0.5, 0.1
+"""A run longer than this is structure; what is smaller (legs of people, of chairs) counts little until seen again."""
 
 ALIKE = 0.94
 """Least cosine between the normals of elements that are merged: 20 deg."""
@@ -38,30 +41,15 @@ class MapSettings:
     Attributes:
         spacing_m: elements closer than this, or than half the beam spacing at their range, are one.
         age: updates an element survives unseen. weight: scans it averages at most.
-        capacity: most elements; the oldest go first. strikes: times looked through until it is dropped.
+        capacity: most elements; the oldest go first. strikes: times it may be looked through per scan
+            averaged.
     """
 
     spacing_m: float = 0.025
     age: int = 10
     weight: float = 10.0
     capacity: int = 6000
-    strikes: float = 2.0
-
-
-@dataclass(slots=True, eq=False)
-class Keyframe:
-    """A scan kept.
-
-    Attributes:
-        T_map_keyframe: follows every correction of the map. T_odom_keyframe: where it was laid, never changes.
-        lines: line elements in the keyframe's base frame. scan: the beams, for the occupancy grid.
-    """
-
-    key: int
-    T_map_keyframe: Array
-    T_odom_keyframe: Array
-    lines: Array
-    scan: Scan
+    strikes: float = 0.3
 
 
 @dataclass(slots=True, eq=False)
@@ -73,11 +61,6 @@ class LocalMap:
     lines: Array
     updates: int = 0
     newest: Keyframe | None = None
-
-
-def keyframe_of(key: int, T_map: Array, T_odom: Array, points: ScanPoints, scan: Scan) -> Keyframe:
-    """Make a keyframe from the scan just matched."""
-    return Keyframe(key, T_map, T_odom, lines_of(points), scan)
 
 
 @kernel(
@@ -131,7 +114,8 @@ def absorb(
         last_x, last_y = x, y
         elements[count, X], elements[count, Y] = x, y
         elements[count, NX], elements[count, NY] = nx, ny
-        elements[count, SLOPE], elements[count, WEIGHT] = fresh[i, 4], 1.0
+        elements[count, SLOPE] = fresh[i, 4]
+        elements[count, WEIGHT] = 1.0 if fresh[i, 5] > SOLID_M else UNPROVED
         elements[count, SEEN], elements[count, STRIKES] = number, 0.0
         count += 1
     return count
@@ -187,40 +171,46 @@ def empty(origin: Array) -> LocalMap:
     return LocalMap(np.empty((0, WIDTH)), build_axis(np.empty((0, 2)), origin), np.empty((0, 4)))
 
 
-def update(local: LocalMap, frame: Keyframe, settings: MapSettings, sigma: float) -> LocalMap:
-    """The map after a keyframe: merged, aged, and indexed around the place of its lidar."""
-    scan, T = frame.scan, frame.T_odom_keyframe
-    number = local.updates + 1
-    count = len(local.elements)
-    elements = np.empty((count + len(frame.lines), WIDTH))
+def update(local: LocalMap, frame: Keyframe, lines: Array, settings: MapSettings, sigma: float) -> LocalMap:
+    """The map after a keyframe with these lines (base frame): merged, aged, indexed around the place of its lidar."""
+    number, count, margin = local.updates + 1, len(local.elements), MARGIN + 5.0 * sigma
+    fresh = lines if local.newest is None else standing(frame, lines, local.newest, margin)
+    elements = np.empty((count + len(fresh), WIDTH))
     elements[:count] = local.elements
-    axis = local.axis
-    beams = len(scan.bearing_rad)
-    step = abs(scan.bearing_rad[-1] - scan.bearing_rad[0]) / (beams - 1) if beams > 1 else 0.0
-    pose = np.concatenate((T, axis.centre, scan.T_base_lidar[:2]))
-    how = (float(number), settings.spacing_m, 0.5 * step, sigma, settings.weight)
-    count = absorb(elements, (axis.rows, axis.label, axis.start, axis.rays), pose, frame.lines, how, count)
+    axis, beams, eye = local.axis, frame.beams(), frame.T_odom_lidar
+    n = len(beams[0])
+    half_beam = 0.5 * abs(float(beams[0][-1] - beams[0][0])) / (n - 1) if n > 1 else 0.0
+    pose = np.concatenate((frame.T_odom_keyframe, axis.centre, frame.T_base_lidar[:2]))
+    how = (float(number), settings.spacing_m, half_beam, sigma, settings.weight)
+    count = absorb(elements, (axis.rows, axis.label, axis.start, axis.rays), pose, fresh, how, count)
     elements = elements[:count]
-    eye = se2.compose(T, scan.T_base_lidar)
     said = np.empty(count, np.int8)
-    look_at(elements, eye, (scan.bearing_rad, scan.range_m, scan.beam), MARGIN + 5.0 * sigma, 1, said)
+    look_at(elements, eye, beams, margin, 1, said)
     elements[said < 0, STRIKES] += 1.0
-    alive = (elements[:, SEEN] > number - settings.age) & (elements[:, STRIKES] < settings.strikes)
-    local = index(elements[alive][-settings.capacity :], eye[:2], number)
-    local.newest = frame
-    return local
+    alive = elements[:, SEEN] > number - settings.age
+    alive &= elements[:, STRIKES] <= settings.strikes * elements[:, WEIGHT]
+    return index(elements[alive][-settings.capacity :], eye[:2], number, frame)
 
 
-def index(elements: Array, origin: Array, number: int) -> LocalMap:
+def standing(frame: Keyframe, lines: Array, before: Keyframe, margin: float) -> Array:
+    """Lines of a keyframe that do not stand where the one before saw nothing: what has just moved in is left out."""
+    points = np.zeros((len(lines), 4))
+    points[:, :2] = se2.apply(frame.T_odom_keyframe, lines[:, :2])
+    said = np.empty(len(points), np.int8)
+    look_at(points, before.T_odom_lidar, before.beams(), margin, 1, said)
+    return lines[said >= 0]
+
+
+def index(elements: Array, origin: Array, number: int, newest: Keyframe | None) -> LocalMap:
     """Order elements on the axis around ``origin``."""
     axis = build_axis(elements[:, :2], origin)
     lines = elements[axis.label, NX : WEIGHT + 1]
     weight = lines[:, 3]
     lines[:, 3] = weight / (weight + 1.0)
-    return LocalMap(elements, axis, lines, number)
+    return LocalMap(elements, axis, lines, number, newest)
 
 
-def contradicted(local: LocalMap, T_odom_lidar: Array, scan: Scan, sigma: float) -> float:
+def contradicted(local: LocalMap, T_odom_lidar: Array, beams: Beams, sigma: float) -> float:
     """Share of the evidence that speaks against a scan being from this pose, of about 400 + 400 samples.
 
     Evidence is of two kinds: elements in view that the scan looks through, and points of the scan that hang in space
@@ -228,21 +218,18 @@ def contradicted(local: LocalMap, T_odom_lidar: Array, scan: Scan, sigma: float)
     """
     margin = MARGIN + 5.0 * sigma
     said = np.empty(len(local.elements), np.int8)
-    beams = (scan.bearing_rad, scan.range_m, scan.beam)
     look_at(local.elements, T_odom_lidar, beams, margin, max(1, len(said) // 400), said)
     there, through = int((said > 0).sum()), int((said < 0).sum())
-    frame = local.newest
-    if frame is None:
-        return 0.0
-    hit = np.flatnonzero(scan.beam == 1)
+    if local.newest is None:
+        return through / max(1, there + through)
+    bearing, distance, kind = beams
+    hit = np.flatnonzero(kind == Beam.HIT)
     hit = hit[:: max(1, len(hit) // 400)]
-    angle = scan.bearing_rad[hit] + T_odom_lidar[2]
+    angle = bearing[hit] + T_odom_lidar[2]
     points = np.zeros((len(hit), 4))
-    points[:, 0] = T_odom_lidar[0] + scan.range_m[hit] * np.cos(angle)
-    points[:, 1] = T_odom_lidar[1] + scan.range_m[hit] * np.sin(angle)
-    eye = se2.compose(frame.T_odom_keyframe, frame.scan.T_base_lidar)
-    beams = (frame.scan.bearing_rad, frame.scan.range_m, frame.scan.beam)
+    points[:, 0] = T_odom_lidar[0] + distance[hit] * np.cos(angle)
+    points[:, 1] = T_odom_lidar[1] + distance[hit] * np.sin(angle)
     said = np.empty(len(points), np.int8)
-    look_at(points, eye, beams, margin, 1, said)
+    look_at(points, local.newest.T_odom_lidar, local.newest.beams(), margin, 1, said)
     agree, hang = int((said > 0).sum()), int((said < 0).sum())
     return (through + hang) / max(1, there + through + agree + hang)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator import icp, se2
+from estimator.keyframe import Beams
 from estimator.localmap import LocalMap, contradicted
-from estimator.records import Array, Scan
+from estimator.records import Array
 from estimator.result import MatchResult, Reason
 
 SURE = 0.8
@@ -50,10 +51,16 @@ class MatchSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What is to be matched: points (n, 2) in the base frame, the scan they came from, the range noise."""
+    """What is to be matched.
+
+    Attributes:
+        xy: (n, 2) points in the base frame at the scan's end. T_base_lidar: mount.
+        beams: the scan they came from, for what it says of free space. noise_m: range noise to reckon with.
+    """
 
     xy: Array
-    scan: Scan
+    T_base_lidar: Array
+    beams: Beams
     noise_m: float
 
 
@@ -95,7 +102,7 @@ def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: Match
     axis, noise = local.axis, view.noise_m
     coarse = settings.coarse if len(view.xy) > settings.dense else 1
     tail = (cap, settings.gate_m, settings.scale * noise, noise, settings.settled, coarse)
-    eye = view.scan.T_base_lidar
+    eye = view.T_base_lidar
     how = np.array((eye[0], eye[1], *tail))
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = prior.T - centre
@@ -164,7 +171,7 @@ def plausible(
         return False
     if best.share > SURE and not wide:
         return True
-    return contradicted(local, se2.compose(T, view.scan.T_base_lidar), view.scan, view.noise_m) <= against
+    return contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m) <= against
 
 
 def known_axes(H: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Where the base is going: prediction from odometry, gyro or constant velocity, to the instant of each record.
+"""The prediction: from odometry, gyro or constant velocity, to the instant of each record.
 
 Odometry says what happened up to its own stamp. When a scan is newer, the pose is carried ahead by the velocity, and
 that carry (``ahead``) is taken back as soon as odometry for the same stretch arrives; so no motion is counted twice,
@@ -7,6 +7,7 @@ whatever the order and the quality of the stamps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,9 +15,13 @@ import numpy as np
 from estimator import se2
 from estimator.records import Array, Imu, Odometry
 
-DOUBT_LEARNING, SURPRISE_CAP, DOUBT_CAP = 0.03, 10.0, 100.0
 LONGEST_CARRY_S = 0.5
 """Beyond this a velocity says nothing any more; the pose is held and the uncertainty grows instead."""
+
+GYRO_RAD = 5e-4
+"""Error of a gyro reading's turn: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
+
+DOUBT_LEARNING, SURPRISE_CAP, DOUBT_CAP = 0.03, 10.0, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +30,8 @@ class MotionNoise:
 
     Attributes:
         slip: of a travelled metre, m. skid: m of sideways error per radian turned. turn: rad per radian turned.
-        drift: rad per metre travelled. floor_m, floor_rad: per prediction, encoder steps and stamp jitter.
+        drift: rad per metre travelled.
+        floor_m, floor_rad: random walk of odometry over 0.2 s (encoder steps, stamp jitter).
         acceleration, angular_acceleration: what constant velocity does not know, m/s^2 and rad/s^2.
     """
 
@@ -35,64 +41,112 @@ class MotionNoise:
     drift: float = 0.02
     floor_m: float = 0.004
     floor_rad: float = 0.004
-    acceleration: float = 1.5
-    angular_acceleration: float = 4.0
+    acceleration: float = 1.0
+    angular_acceleration: float = 2.0
+
+    def acceleration_variance(self) -> Array:
+        """Variance of the acceleration (x, y, yaw)."""
+        linear = self.acceleration**2
+        return np.array((linear, linear, self.angular_acceleration**2))
 
 
 @dataclass(slots=True, eq=False)
 class Motion:
-    """The moving pose.
+    """The moving pose and its uncertainty: the predicted half of a filter.
 
     Attributes:
         t_mono: instant the pose is true for. T_odom_base: the pose.
         P: 3x3 covariance of the pose relative to the local map (odom-aligned axes).
-        velocity: (v_x, v_y, yaw rate) in the base frame.
+        velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
+        t_felt: instant up to which the velocity's variance has grown.
         ahead: motion already applied beyond the last odometry. odometry: whether any has arrived.
+        doubt: factor on the noise's variance, learned.
     """
 
-    t_mono: float = -np.inf
+    t_mono: float = -math.inf
     T_odom_base: Array = field(default_factory=se2.identity)
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
     velocity: Array = field(default_factory=lambda: np.zeros(3))
+    velocity_variance: Array = field(default_factory=lambda: np.ones(3))
+    t_felt: float = -math.inf
     ahead: Array = field(default_factory=se2.identity)
     odometry: bool = False
     doubt: float = 1.0
 
 
-def move(motion: Motion, delta: Array, Q: Array) -> None:
-    """Move the pose by ``delta`` in the base frame, with noise ``Q`` (3x3, base-aligned)."""
+def move(motion: Motion, delta: Array, variance: Array) -> None:
+    """Move the pose by ``delta`` in the base frame, with noise of ``variance`` (x, y, yaw; base-aligned)."""
     T = motion.T_odom_base
-    motion.P = se2.carry(T, delta, motion.P)
     R = se2.rotation(T[2] + 0.5 * delta[2])
-    motion.P += motion.doubt * (R @ Q @ R.T)
+    motion.P = se2.carry(T, delta, motion.P) + (R * (motion.doubt * variance)) @ R.T
     motion.T_odom_base = se2.compose(T, delta)
 
 
-def odometry_noise(delta: Array, noise: MotionNoise) -> Array:
-    """Covariance of an odometry increment."""
-    way, turned = float(np.hypot(delta[0], delta[1])), abs(float(delta[2]))
-    along = noise.slip * way + noise.skid * turned
-    yaw = noise.turn * turned + noise.drift * way
-    return np.diag((along**2 + noise.floor_m**2, (0.5 * along) ** 2 + noise.floor_m**2, yaw**2 + noise.floor_rad**2))
-
-
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
-    """Replace what was carried ahead by what the wheels say."""
+    """Replace what was carried ahead by what the wheels say. An increment that is no number is passed over."""
+    if not np.isfinite(record.delta).all():
+        return
     motion.odometry = True
-    delta = se2.between(motion.ahead, record.delta)
-    move(motion, delta, odometry_noise(record.delta, noise))
     dt = record.t_end - record.t_begin
-    if dt > 1e-3:
-        motion.velocity = se2.log(record.delta) / dt
+    variance = odometry_variance(record.delta, dt, noise)
+    move(motion, se2.between(motion.ahead, record.delta), variance)
+    feel(motion, record.delta, (record.t_begin, record.t_end), motion.doubt * variance, noise)
     motion.ahead = se2.identity()
     motion.t_mono = max(motion.t_mono, record.t_end)
 
 
-def on_imu(motion: Motion, record: Imu) -> None:
-    """Turn rate from the gyro."""
+def odometry_variance(delta: Array, dt: float, noise: MotionNoise) -> Array:
+    """Variance (x, y, yaw) of an odometry increment over ``dt``."""
+    x, y, yaw = delta.tolist()
+    way, turned, share = math.hypot(x, y), abs(yaw), min(1.0, max(dt, 0.02) / 0.2)
+    along = noise.slip * way + noise.skid * turned
+    heading = noise.turn * turned + noise.drift * way
+    floor = share * noise.floor_m**2
+    return np.array((along**2 + floor, 0.25 * along**2 + floor, heading**2 + share * noise.floor_rad**2))
+
+
+def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: Array, noise: MotionNoise) -> None:
+    """Update the velocity by a motion ``delta`` made over an interval: a scalar Kalman filter for each component.
+
+    A mean over the interval is taken for its end, which adds half the interval's worth of unknown acceleration.
+    """
+    begin, end = interval
+    dt = end - begin
+    if not 1e-3 < dt < LONGEST_CARRY_S:
+        return
+    unknown = noise.acceleration_variance()
+    late = min(max(0.0, end - motion.t_felt), LONGEST_CARRY_S)
+    P = motion.velocity_variance + unknown * late * late
+    R = variance / (dt * dt) + unknown * (0.25 * dt * dt)
+    gain = P / (P + R)
+    motion.velocity = motion.velocity + gain * (se2.log(delta) / dt - motion.velocity)
+    motion.velocity_variance = (1.0 - gain) * P
+    motion.t_felt = max(motion.t_felt, end)
+
+
+def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
+    """Turn by what the gyro says over its interval, move on at the velocity; odometry replaces the motion later."""
     dt = record.t_end - record.t_begin
-    if dt > 0.0 and np.isfinite(record.dyaw):
-        motion.velocity = np.array((motion.velocity[0], motion.velocity[1], record.dyaw / dt))
+    if not (0.0 < dt < LONGEST_CARRY_S and math.isfinite(record.dyaw)):
+        return
+    carry_to(motion, record.t_begin, noise)
+    motion.velocity = np.array((motion.velocity[0], motion.velocity[1], record.dyaw / dt))
+    motion.velocity_variance[2] = (GYRO_RAD / dt) ** 2
+    carry_to(motion, record.t_end, noise)
+
+
+def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
+    """Bring the pose to ``t_mono`` at constant velocity; an instant in the past changes nothing."""
+    dt = t_mono - motion.t_mono
+    if not dt > 0.0:
+        return
+    if math.isfinite(dt):
+        dt = min(dt, LONGEST_CARRY_S)
+        delta = se2.exp(motion.velocity * dt)
+        variance = (motion.velocity_variance + noise.acceleration_variance() * (dt * dt)) * (dt * dt)
+        move(motion, delta, variance)
+        motion.ahead = se2.compose(motion.ahead, delta)
+    motion.t_mono = t_mono
 
 
 def learn(motion: Motion, correction: Array, known: bool) -> float:
@@ -106,23 +160,3 @@ def learn(motion: Motion, correction: Array, known: bool) -> float:
         seen = motion.doubt * min(surprise, SURPRISE_CAP)
         motion.doubt = min(max(1.0, motion.doubt + DOUBT_LEARNING * (seen - motion.doubt)), DOUBT_CAP)
     return max(1.0, surprise / 3.0)
-
-
-def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
-    """Bring the pose to ``t_mono`` at constant velocity."""
-    dt = t_mono - motion.t_mono
-    if not dt > 0.0:
-        return
-    if np.isfinite(dt):
-        dt = min(dt, LONGEST_CARRY_S)
-        delta = se2.exp(motion.velocity * dt)
-        move(motion, delta, carry_noise(dt, noise))
-        motion.ahead = se2.compose(motion.ahead, delta)
-    motion.t_mono = t_mono
-
-
-def carry_noise(dt: float, noise: MotionNoise) -> Array:
-    """Covariance of a carry: unknown accelerations over ``dt``."""
-    xy = noise.floor_m + noise.acceleration * dt * dt
-    yaw = noise.floor_rad + noise.angular_acceleration * dt * dt
-    return np.diag((xy**2, xy**2, yaw**2))

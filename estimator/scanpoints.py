@@ -24,26 +24,24 @@ class ScanPoints:
     """Surface points of one scan in the base frame at the scan's end.
 
     Attributes:
-        xy: (n, 2) metres, in order of measurement. beam: (n,) index of the beam each came from.
-        origin: (x, y) of the lidar in the base frame.
-        spacing_rad: angle between neighbouring beams. sigma_m: one-sigma range noise.
+        xy: (n, 2) metres, in order of measurement. origin: (x, y) of the lidar in the base frame.
+        turned_rad: yaw turned from the first to the last beam. sigma_m: one-sigma range noise.
     """
 
     xy: Array
-    beam: npt.NDArray[np.int64]
     origin: Array
-    spacing_rad: float
+    turned_rad: float
     sigma_m: float
 
 
-@kernel("i8(Tuple((f8[::1], f8[::1], u1[::1], f8[::1])), f8[::1], f8[::1], f8, f8, Tuple((f8[:, ::1], i8[::1])))")
+@kernel("i8(Tuple((f8[::1], f8[::1], u1[::1], f8[::1])), f8[::1], f8[::1], f8, f8, f8[:, ::1])")
 def place_beams(
     beams: tuple[Array, Array, npt.NDArray[np.uint8], Array],
     T_base_lidar: Array,
     twist: Array,
     far: float,
     quality: float,
-    out: tuple[Array, npt.NDArray[np.int64]],
+    xy: Array,
 ) -> int:
     """Keep the beams that pass the filter and carry each from its own instant to the scan's end; count of points.
 
@@ -51,7 +49,6 @@ def place_beams(
     ``(n - 1 - i) / (n - 1)`` of it before the end.
     """
     bearing, distance, kind, intensity = beams
-    xy, index = out
     n = len(bearing)
     mx, my, myaw = T_base_lidar[0], T_base_lidar[1], T_base_lidar[2]
     moving = twist[0] != 0.0 or twist[1] != 0.0 or twist[2] != 0.0
@@ -74,7 +71,6 @@ def place_beams(
             x, y = u + c * x - s * y, v + s * x + c * y
         xy[kept, 0] = x
         xy[kept, 1] = y
-        index[kept] = i
         kept += 1
     return kept
 
@@ -83,12 +79,10 @@ def points_of(scan: Scan, motion: Array, far: float, quality: float) -> ScanPoin
     """Filter, deskew with ``motion`` (base motion from the first to the last beam) and mount a scan."""
     n = len(scan.bearing_rad)
     xy = np.empty((n, 2))
-    index = np.empty(n, np.int64)
     intensity = NO_INTENSITY if scan.intensity is None else scan.intensity
     beams = (scan.bearing_rad, scan.range_m, scan.beam, intensity)
-    kept = place_beams(beams, scan.T_base_lidar, se2.log(motion), far, quality, (xy, index))
-    spacing = abs(float(scan.bearing_rad[-1] - scan.bearing_rad[0])) / (n - 1) if n > 1 else 0.0
-    return ScanPoints(xy[:kept], index[:kept], np.ascontiguousarray(scan.T_base_lidar[:2]), spacing, scan.sigma_m)
+    kept = place_beams(beams, scan.T_base_lidar, se2.log(motion), far, quality, xy)
+    return ScanPoints(xy[:kept], np.ascontiguousarray(scan.T_base_lidar[:2]), float(motion[2]), scan.sigma_m)
 
 
 @kernel("f8(f8[:, ::1], i8, i8, Tuple((f8, f8, f8, f8)))")
@@ -118,13 +112,26 @@ def offset_on_line(xy: Array, low: int, high: int, at: tuple[float, float, float
     return (v0 * (m2 * m4 - m3 * m3) - m1 * (v1 * m4 - m3 * v2) + m2 * (v1 * m3 - m2 * v2)) / det
 
 
+@kernel("void(f8[:, ::1], i8)")
+def measure_runs(lines: Array, count: int) -> None:
+    """Write into column 5 how far apart the ends of each unbroken run of lines are."""
+    begin = 0
+    for i in range(1, count + 1):
+        if i < count and (lines[i, 0] - lines[i - 1, 0]) ** 2 + (lines[i, 1] - lines[i - 1, 1]) ** 2 < GAP * GAP:
+            continue
+        dx, dy = lines[i - 1, 0] - lines[begin, 0], lines[i - 1, 1] - lines[begin, 1]
+        lines[begin:i, 5] = np.sqrt(dx * dx + dy * dy)
+        begin = i
+
+
 @kernel("i8(f8[:, ::1], f8[::1], f8, f8, f8[:, ::1])")
 def fit_lines(xy: Array, origin: Array, sigma: float, reach: float, lines: Array) -> int:
     """Total-least-squares line through each point's neighbours along the scan; the number of lines found.
 
-    A row of ``lines`` is the point moved onto its line (x, y), the normal towards the sensor (x, y) and the variance of
-    the normal's direction in rad^2. Neighbours lie within ``reach`` or 2.5 beam spacings, whichever is more: a metric
-    window where beams are dense, a fixed count where they are sparse. A point whose neighbours are no line is left out.
+    A row of ``lines`` is the point moved onto its line (x, y), the normal towards the sensor (x, y), the variance of
+    the normal's direction in rad^2, and the extent of the unbroken run it belongs to in m. Neighbours lie within
+    ``reach``, or are the next two beams on either side: a metric window where beams are dense, a fixed count where they
+    are sparse. A point whose neighbours are no line is left out.
     """
     n = len(xy)
     found = 0
@@ -177,11 +184,12 @@ def fit_lines(xy: Array, origin: Array, sigma: float, reach: float, lines: Array
         lines[found, 3] = ny
         lines[found, 4] = slope
         found += 1
+    measure_runs(lines, found)
     return found
 
 
 def lines_of(points: ScanPoints, reach: float = 0.12) -> Array:
-    """Line elements (n, 5) of a scan in the base frame: see :func:`fit_lines`."""
-    lines = np.empty((len(points.xy), 5))
+    """Line elements (n, 6) of a scan in the base frame: see :func:`fit_lines`."""
+    lines = np.empty((len(points.xy), 6))
     found = fit_lines(points.xy, points.origin, points.sigma_m, reach, lines)
     return lines[:found]

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from estimator import se2
-from estimator.localmap import Keyframe, LocalMap, MapSettings
+from estimator.keyframe import Keyframe
+from estimator.localmap import LocalMap, MapSettings
 from estimator.matching import MatchSettings
 from estimator.motion import Motion, MotionNoise
 from estimator.records import Array
+
+Place = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,14 +24,18 @@ class Settings:
     Attributes:
         far_m: L of the paper's quality filter; ranges beyond it are not used.
         quality: Q of the filter; a beam whose intensity is lower is not used (only where a scan has intensities).
-        keyframe_m, keyframe_rad: a keyframe is laid after this much motion.
-        history: keep the pose of keyframes whose scan has been dropped; for replay, which needs them once at the end.
+        keyframe_m, keyframe_rad: a keyframe is laid after this much motion, or where fewer than ``keyframe_share`` of
+            the beams still fit the map.
+        keep: keyframes kept per half metre square and eighth of a turn.
+        history: keep the pose of keyframes whose scan has been let go; for replay, which needs them once at the end.
     """
 
     far_m: float = 80.0
     quality: float = 0.0
     keyframe_m: float = 0.25
     keyframe_rad: float = 0.26
+    keyframe_share: float = 0.7
+    keep: int = 2
     history: bool = False
     map: MapSettings = field(default_factory=MapSettings)
     matching: MatchSettings = field(default_factory=MatchSettings)
@@ -39,26 +47,34 @@ class State:
     """All of it; made by :func:`new_state`, changed only by `step`.
 
     Attributes:
+        fused: the filter whose pose is published. A second one, of lights and odometry without laser, stands beside it
+            as an independent witness where there are lights; the same records predict both.
         T_map_odom: absolute correction. T_map_start: keyframe 0, where the robot was switched on.
-        keyframes: by ID, with their scans..
+        keyframes: by ID, with their scans. places: their IDs by half metre square and eighth of a turn.
+        retired: T_map_keyframe of those let go, where history is kept.
         anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, covariance of its place in the map.
-        next_key: ID of the next keyframe. jumps: see `StepResult`.
+        next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
+            not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
         t_scan, T_odom_scan: instant and pose of the latest scan.
     """
 
     settings: Settings
-    motion: Motion = field(default_factory=Motion)
+    fused: Motion = field(default_factory=Motion)
     T_map_odom: Array = field(default_factory=se2.identity)
     T_map_start: Array = field(default_factory=se2.identity)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    places: dict[Place, list[int]] = field(default_factory=dict)
+    retired: dict[int, Array] = field(default_factory=dict)
     local: LocalMap | None = None
     anchor: int = 0
     T_odom_anchor: Array = field(default_factory=se2.identity)
     P_anchor: Array = field(default_factory=lambda: np.zeros((3, 3)))
     next_key: int = 1
+    since_keyframe: int = 0
+    failures: int = 0
     jumps: int = 0
     noise_m: float = 0.0
-    t_scan: float = -np.inf
+    t_scan: float = -math.inf
     T_odom_scan: Array = field(default_factory=se2.identity)
 
 

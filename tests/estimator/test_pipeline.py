@@ -50,7 +50,7 @@ def drive(state: State, *, odometry: bool, n: int = 300) -> tuple[list[Array], l
 
 @pytest.mark.parametrize("odometry", [True, False])
 def test_follows_the_robot(odometry: bool) -> None:
-    state = new_state(Settings())
+    state = new_state(Settings(history=True))
     truth, results = drive(state, odometry=odometry)
     error = np.array([se2.between(T, r.T_odom_base) for T, r in zip(truth, results, strict=True)])
     assert np.abs(error[:, :2]).max() < 0.02
@@ -90,7 +90,7 @@ def test_bad_scans_say_why_and_move_nothing(kind: str, fresh: bool) -> None:
     truth = [np.zeros(3)]
     if not fresh:
         truth, _ = drive(state, odometry=True, n=30)
-    before = state.motion.T_odom_base.copy()
+    before = state.fused.T_odom_base.copy()
     records: list[Record] = [bad(kind)]
     if not fresh:
         records.insert(0, Odometry(1.45, 16.0, np.zeros(3)))
@@ -110,7 +110,7 @@ def test_bad_scans_say_why_and_move_nothing(kind: str, fresh: bool) -> None:
 def test_set_pose_moves_the_map_and_counts_a_jump() -> None:
     state = new_state(Settings())
     drive(state, odometry=True, n=60)
-    before = state.motion.T_odom_base.copy()
+    before = state.fused.T_odom_base.copy()
     wanted = np.array((10.0, -3.0, 1.0))
     result = step(state, [Command(3.1, Order.SET_POSE, wanted)], UNLIMITED)
     np.testing.assert_allclose(se2.compose(result.T_map_odom, result.T_odom_base), wanted, atol=1e-9)

@@ -1,0 +1,52 @@
+"""What a person or a PLC may order: set the pose, or forget the map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from estimator import se2
+from estimator.mapping import NOTHING
+from estimator.records import Array, Command, Order
+from estimator.state import State
+
+JUMP_M, JUMP_RAD = 0.05, math.radians(1.0)
+
+
+def obey(state: State, command: Command) -> None:
+    """SET_POSE moves the whole map so that the robot stands there; RESET forgets the map and begins at that pose.
+
+    A map of this session has no other tie to the world than what it is told, so it moves as one piece. A pose that is
+    no number is ignored; RESET without a pose begins at the origin. ``T_odom_base`` stays as it is.
+    """
+    T_map_base = command.T_map_base
+    if T_map_base is not None and not np.isfinite(T_map_base).all():
+        return
+    if command.order is Order.RESET:
+        forget(state)
+        T_map_base = se2.identity() if T_map_base is None else T_map_base
+    if T_map_base is not None:
+        place(state, T_map_base)
+
+
+def forget(state: State) -> None:
+    """Drop the map; the pose now hangs on the start."""
+    state.keyframes, state.places, state.retired, state.local = {}, {}, {}, None
+    state.P_anchor, state.fused.P = NOTHING.copy(), NOTHING.copy()
+    state.anchor, state.T_odom_anchor, state.failures = 0, state.fused.T_odom_base, 0
+    state.T_map_start = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+
+
+def place(state: State, T_map_base: Array) -> None:
+    """Move the map frame so that the robot's pose is ``T_map_base``, and everything in the map with the robot."""
+    was = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    T_map_odom = se2.compose(T_map_base, se2.inverse(state.fused.T_odom_base))
+    moved = se2.compose(T_map_odom, se2.inverse(state.T_map_odom))
+    state.T_map_start = se2.compose(moved, state.T_map_start)
+    state.retired = {key: se2.compose(moved, T) for key, T in state.retired.items()}
+    for frame in state.keyframes.values():
+        frame.T_map_keyframe = se2.compose(moved, frame.T_map_keyframe)
+    x, y, yaw = se2.between(was, T_map_base).tolist()
+    state.jumps += int(math.hypot(x, y) > JUMP_M or abs(yaw) > JUMP_RAD)
+    state.T_map_odom = T_map_odom
