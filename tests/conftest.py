@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+ROOT = Path(__file__).parents[1]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -22,3 +26,17 @@ def log_root() -> Path:
     if not path.is_dir():
         pytest.fail(f"LUMILOOP_DATA={root} is not a folder")
     return path
+
+
+@pytest.fixture(scope="session")
+def warm_kernels() -> None:
+    """Compile the kernels of this tree once, before anything is judged against the wall clock."""
+    command = [sys.executable, "-c", "from daemon.warmup import load; load()"]
+    subprocess.run(command, cwd=ROOT, check=True, timeout=240)
+
+
+@pytest.fixture(autouse=True)
+def compiled_before_the_clock_runs(request: pytest.FixtureRequest) -> None:
+    """Tests of real processes in real time start warm, whichever test happens to come first."""
+    if request.node.get_closest_marker("realtime") or request.node.get_closest_marker("system"):
+        request.getfixturevalue("warm_kernels")
