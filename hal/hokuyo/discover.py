@@ -17,7 +17,8 @@ def candidates() -> list[str]:
     """Device files to try for ``auto``, most likely first, each real device once.
 
     The stable name made by the udev rule, then ports whose USB vendor is HOKUYO, then serial adapters. A CDC-ACM port
-    that names another vendor is left alone: it is somebody else's microcontroller.
+    that names another vendor is left alone: it is somebody else's microcontroller. Whatever is behind a serial adapter
+    gets to hear a QT at every line rate; where it must not, name the sensor's device file instead of ``auto``.
     """
     found = [
         *_existing(_DEV / "lumiloop", "lidar"),

@@ -132,12 +132,13 @@ class HokuyoDriver:
         """Make ready for another try on the same port; False: it has to be opened anew."""
         self._status.link = Link.OPENING
         self._status.resyncs += 1
-        if isinstance(error, AbnormalState) or self._faults % _REBOOT_EVERY == 0:
-            identity = session.identity
-            if isinstance(error, AbnormalState) or (identity is not None and identity.facts.may("RB")):
-                await session.reboot()
+        identity = session.identity
+        assert identity is not None
+        turn_of_reboot = self._faults > 0 and self._faults % _REBOOT_EVERY == 0
+        if isinstance(error, AbnormalState) or (turn_of_reboot and identity.facts.may("RB")):
+            await session.reboot()
             return False
-        if self._faults >= _REOPEN_FROM:
+        if self._faults >= _REOPEN_FROM or isinstance(error, DeviceRefused):
             return False
         await asyncio.sleep(self._pause())
         if session.baud:
@@ -145,8 +146,7 @@ class HokuyoDriver:
         await session.settle()
         if self._faults >= _RESET_FROM:
             await session.reset()
-        assert session.identity is not None
-        await self._suit_rate(session, session.identity)
+        await self._suit_rate(session, identity)
         return True
 
     async def _find(self) -> Session:
@@ -181,7 +181,11 @@ class HokuyoDriver:
             if self._serial and serial != self._serial:
                 raise DeviceRefused(device, f"is sensor {serial}, not {self._serial}", f'set device = "{AUTO}"')
             await self._suit_rate(session, identity)
-        except BaseException:
+        except asyncio.CancelledError:
+            await session.quiet()
+            session.line.close()
+            raise
+        except HalError:
             session.line.close()
             raise
         self._geometry = identity.geometry
@@ -206,9 +210,11 @@ class HokuyoDriver:
         if wanted != session.baud and (self._baud or wanted > session.baud):
             try:
                 await session.set_rate(wanted)
-            except DeviceFault:
+            except (DeviceFault, DeviceRefused) as error:
                 self._rate_cap = max([rate for rate in BAUD_RATES if rate < wanted], default=BAUD_RATES[0])
-                raise
+                if isinstance(error, DeviceFault):
+                    raise
+                await self._suit_rate(session, identity)  # this side cannot do that rate: the next lower one
         self._rate_found = session.baud
 
     def _describe(self, device: str, session: Session, identity: Identity) -> None:
@@ -233,8 +239,11 @@ class HokuyoDriver:
         dialect += f", {request.cluster} steps together" if request.stride > 1 else ""
         dialect += f", every {request.skip + 1}. revolution" if request.skip else ""
         self._status.dialect = dialect
-        await session.start(request, follower.take, lambda: follower.has_scans)
-        await follower.watch()
+        try:
+            await session.start(request, follower.take, lambda: follower.has_scans)
+            await follower.watch()
+        finally:
+            session.line.on_frame = None
 
     async def _choose(self, session: Session, identity: Identity, speed: float) -> ScanRequest:
         """The stream to ask for; a mode with intensities is proved by one scan first, and dropped if it fails."""

@@ -41,6 +41,7 @@ _AFTER_RESET_S: Final = 1.0
 _AFTER_RATE_S: Final = 0.15
 _AFTER_REBOOT_S: Final = 2.0
 _POWER_CYCLE: Final = "switch its power off and on"
+_NO_ANSWER: Final = "is it a HOKUYO, powered, its cable right?"
 
 
 class AbnormalState(DeviceFault):
@@ -98,7 +99,8 @@ class Session:
             if reply is not None:
                 return reply
         heard = "only unreadable bytes come" if self.line.dropped_bytes else "nothing answers"
-        raise DeviceFault(self.device, heard, "is it a HOKUYO, powered, at this line rate?")
+        remedy = "is another client connected? it serves one" if self.device.startswith("tcp:") else _NO_ANSWER
+        raise DeviceFault(self.device, heard, remedy)
 
     async def find_rate(self, first: int = 0) -> None:
         """Find the rate of an RS-232 line: ``first``, then every rate SCIP knows.
@@ -108,13 +110,16 @@ class Session:
         """
         rates: Sequence[int] = [first, *scip.BAUD_RATES] if first else scip.BAUD_RATES
         for rate in dict.fromkeys(rates):
-            self.line.port.set_baud(rate)
+            try:
+                self.line.port.set_baud(rate)
+            except DeviceRefused:  # this side cannot do it
+                continue
             before = self.line.recognised
             reply = await self._try(scip.QT, _LISTEN_19200_S if rate <= 19200 else _LISTEN_RS232_S)
             if reply is not None or self.line.recognised > before:
                 self.baud = rate
                 return
-        raise DeviceFault(self.device, "nothing answers at any line rate", "is it a HOKUYO, powered, its cable right?")
+        raise DeviceFault(self.device, "nothing answers at any line rate", _NO_ANSWER)
 
     async def reset(self) -> None:
         """Default speed, clock at zero, laser off; keeps the line rate where the model allows.
@@ -168,6 +173,8 @@ class Session:
                 if reply.status == scip.ACCEPTED:
                     return parse_text(reply, strict=frame != seen)  # twice the same: the firmware sums differently
                 problem = f"answer {reply.status}"
+                if reply.status in scip.DENIED:  # some firmware grants QT in time adjustment, and stays there
+                    await self._try(scip.TM_LEAVE, _TEXT_S)
                 await self.settle()
             except BadFrame as error:
                 problem, seen = str(error), frame
@@ -179,8 +186,11 @@ class Session:
         """Raise or lower the rate of an RS-232 line; a sensor that refuses stays where it is.
 
         Raises:
+            DeviceRefused: this side cannot do that rate; the sensor has not been asked.
             DeviceFault: it accepted and is not to be found at the new rate.
         """
+        self.line.port.set_baud(baud)
+        self.line.port.set_baud(self.baud)
         reply = await self._try(scip.baud_command(baud), _TEXT_S)
         if reply is None or reply.status != scip.ACCEPTED:
             return

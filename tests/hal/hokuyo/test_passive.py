@@ -118,3 +118,55 @@ def test_recorded_dialogue_with_a_real_sensor(log_root: Path) -> None:
         codes, counts = np.unique(scan_seen.code, return_counts=True)
         assert dict(zip(codes.tolist(), counts.tolist(), strict=True)) == {VALID: 581, 0: 94, 7: 6, 10: 1}
         assert scan_seen.geometry.amax == 725
+
+
+def test_single_scans_refusals_and_nonsense_parameters() -> None:
+    listener = PassiveHokuyo()
+    assert listener.feed(encoder.text("PP", [("MODL", "toaster")]), 0.0) == []
+    assert "toaster" not in str(listener.geometry)
+    assert "expected a number" in str(listener.status.error)
+    listener.feed(UTM, 0.0)
+    listener.feed(UTM, 0.5)  # the same again changes nothing
+    (scan,) = listener.feed(encoder.scan("GD0000000201", 4000, "0CB1Dh7D`", "00"), 1.0)
+    assert scan.ranges.tolist() == [1234, 5432, 30000]
+    assert listener.feed(encoder.answer("GD0000000201", "10") + encoder.answer("MD0000000201000", "00"), 1.1) == []
+    assert listener.status.invalid == 0
+    assert listener.status.dialect == "SCIP 2 capture GD"
+
+
+def test_noise_between_frames_is_a_resynchronisation() -> None:
+    listener = PassiveHokuyo()
+    listener.feed(UTM + frame(0), 1.0)
+    listener.feed(b"\x55" * 400, 1.01)
+    assert listener.status.resyncs == 1
+    listener.feed(b"\n\n", 1.02)
+    assert len(listener.feed(frame(1), 1.025)) == 1
+
+
+def test_a_stamp_that_does_not_continue_the_clock_is_not_guessed_at() -> None:
+    listener = PassiveHokuyo()
+    listener.feed(UTM, 0.0)
+    for k in range(30):
+        assert len(listener.feed(frame(k), 1.0 + 0.025 * k)) == 1
+    assert listener.feed(frame(5000), 1.75) == []
+    assert listener.status.invalid == 1
+    assert len(listener.feed(frame(31), 1.775)) == 1
+
+
+def test_two_character_distances_saturate() -> None:
+    listener = PassiveHokuyo()
+    listener.feed(UTM, 0.0)
+    (scan,) = listener.feed(encoder.scan("MS0000000201000", 1, "CBoooo"), 1.0)
+    assert scan.ranges.tolist() == [1234, 0, 0]
+    assert scan.code.tolist() == [VALID, 4095, 4095]
+
+
+def test_echoes_are_kept_apart() -> None:
+    listener = PassiveHokuyo()
+    listener.feed(UTM, 0.0)
+    steps = [[(1000,), (5,), (2000,)], [(3000,)], [(70000,), (400,)]]
+    (scan,) = listener.feed(encoder.scan("ND0000000201000", 1, encoder.payload(steps)), 1.0)
+    assert scan.ranges.tolist() == [1000, 3000, 0]
+    assert scan.code.tolist() == [VALID, VALID, 70000]
+    assert scan.echoes is not None
+    assert scan.echoes.tolist() == [[0, 2000, 0], [0, 0, 0], [400, 0, 0]]

@@ -1,0 +1,354 @@
+"""The session against a sensor that says exactly what a script tells it to, word by word."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from hal.clock import LoopClock, run_virtual
+from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
+from hal.hokuyo.line import Line
+from hal.hokuyo.payload import ScanRequest
+from hal.hokuyo.session import AbnormalState, Session, explain_status
+from hal.port import MemoryPort, memory_pair
+from tests.hal.hokuyo import encoder
+
+OK = "00"
+
+
+class Scripted:
+    """Answers each command with the next of its replies; the last one repeats. None is silence, bytes go verbatim."""
+
+    def __init__(self, **replies: list[str | bytes | None]) -> None:
+        self.replies = {name.replace("_", "."): list(said) for name, said in replies.items()}
+        self.heard: list[str] = []
+        self.bauds: list[int] = []
+
+    def plug(self, port: MemoryPort) -> None:
+        self.port = port
+        port.start(self._hear, lambda error: None)
+
+    def _hear(self, data: bytes, _t: float) -> None:
+        for line in data.split(b"\n"):
+            if line:
+                self._answer(line.decode())
+
+    def _answer(self, line: str) -> None:
+        self.heard.append(line)
+        self.bauds.append(self.port.peer_baud)
+        said = self.replies.get(line) or self.replies.get(line[:2]) or [None]
+        reply = said.pop(0) if len(said) > 1 else said[0]
+        if isinstance(reply, bytes):
+            self.port.write(reply)
+        elif reply is not None:
+            self.port.write(encoder.answer(line, reply))
+
+
+def with_session(script: Scripted, body: Callable[[Session], Awaitable[None]], baud: int = 0) -> None:
+    async def main() -> None:
+        ours, theirs = memory_pair(LoopClock(asyncio.get_running_loop()), "/dev/x")
+        script.plug(theirs)
+        ours.set_baud(baud)
+        await body(Session(Line(ours), baud))
+
+    run_virtual(main())
+
+
+GOOD = {"VV": [encoder.text("VV", encoder.VV_UTM)], "PP": [encoder.text("PP", encoder.PP_UTM)]}
+
+
+class TestSettle:
+    def run(self, script: Scripted) -> None:
+        with_session(script, lambda session: session.settle())
+
+    def test_idle(self) -> None:
+        script = Scripted(QT=[OK])
+        self.run(script)
+        assert script.heard == ["QT"]
+
+    def test_qt_ignored_twice(self) -> None:
+        script = Scripted(QT=[None, None, OK])
+        self.run(script)
+        assert script.heard == ["QT"] * 3
+
+    @pytest.mark.parametrize("status", ["0E", "10"])
+    def test_time_adjustment(self, status: str) -> None:
+        script = Scripted(QT=[status, OK], TM2=[OK])
+        self.run(script)
+        assert script.heard == ["QT", "TM2", "QT"]
+
+    @pytest.mark.parametrize("answer", [b"QT\nE\n\n", b"QT\n0\n\n"])
+    @pytest.mark.parametrize("switch", [b"SCIP2.0\n0\n\n", b"SCIP2.0\n0Ee\n\n", None])
+    def test_scip_1(self, answer: bytes, switch: bytes | None) -> None:
+        script = Scripted(QT=[answer, OK], SCIP2_0=[switch])
+        self.run(script)
+        assert script.heard == ["QT", "SCIP2.0", "QT"]
+
+    def test_a_damaged_reply_is_asked_for_again(self) -> None:
+        script = Scripted(QT=[b"QT\n00Q\n\n", OK])
+        self.run(script)
+        assert script.heard == ["QT", "QT"]
+
+    def test_frames_of_a_running_stream_are_passed_over(self) -> None:
+        frame = encoder.scan("MD0000000201000", 1, "0CB1Dh7D`")
+        script = Scripted(QT=[frame[7:] + frame + frame + encoder.answer("QT", OK)])
+        self.run(script)
+        assert script.heard == ["QT"]
+
+    def test_mute(self) -> None:
+        with pytest.raises(DeviceFault, match=r"/dev/x: nothing answers .*HOKUYO"):
+            self.run(Scripted())
+
+    def test_noise(self) -> None:
+        with pytest.raises(DeviceFault, match="only unreadable bytes come"):
+            self.run(Scripted(QT=[b"\x80" * 300]))
+
+    def test_abnormal(self) -> None:
+        with pytest.raises(AbnormalState, match=r"0L.*power off and on"):
+            self.run(Scripted(QT=["0L"]))
+
+    def test_never_idle(self) -> None:
+        with pytest.raises(DeviceFault, match="does not become idle, QT answers 0E"):
+            self.run(Scripted(QT=["0E"], TM2=["0E"]))
+        with pytest.raises(DeviceFault, match=r"does not become idle, QT answers as SCIP 1\.1"):
+            self.run(Scripted(QT=[b"QT\nE\n\n"]))
+
+    def test_port_lost(self) -> None:
+        script = Scripted(QT=[None])
+
+        async def body(session: Session) -> None:
+            asyncio.get_running_loop().call_later(0.1, script.port.close)
+            with pytest.raises(DeviceMissing):
+                await session.settle()
+            with pytest.raises(DeviceMissing):
+                await session.settle()
+
+        with_session(script, body)
+
+
+class TestReset:
+    def test_before_anything_is_known_only_rs(self) -> None:
+        script = Scripted(RS=[None, OK], QT=[OK])
+        with_session(script, lambda session: session.reset())
+        assert script.heard == ["RS", "RS", "QT"]
+
+    def test_a_model_that_has_rt_keeps_its_rate(self) -> None:
+        script = Scripted(RT=[OK], QT=[OK], **GOOD)
+
+        async def body(session: Session) -> None:
+            await session.identify()
+            await session.reset()
+
+        with_session(script, body)
+        assert "RT" in script.heard
+        assert "RS" not in script.heard
+
+    def test_rs_on_a_serial_line_means_finding_the_rate_again(self) -> None:
+        script = Scripted(RS=[OK], QT=[None, None, OK])
+
+        async def body(session: Session) -> None:
+            await session.reset()
+            assert session.baud == 57600
+
+        with_session(script, body, baud=115200)
+
+    def test_no_answer(self) -> None:
+        with pytest.raises(DeviceFault, match="does not answer a reset"):
+            with_session(Scripted(), lambda session: session.reset())
+
+    def test_reboot_is_a_pair_and_never_raises(self) -> None:
+        script = Scripted(RB=["01", OK])
+
+        async def body(session: Session) -> None:
+            began = asyncio.get_running_loop().time()
+            await session.reboot()
+            assert script.heard == ["RB", "RB"]
+            assert asyncio.get_running_loop().time() - began < 4.0
+            script.port.close()
+            await asyncio.sleep(0)
+            await session.reboot()
+
+        with_session(script, body)
+
+
+class TestIdentify:
+    def test_good(self) -> None:
+        script = Scripted(**GOOD, II=[encoder.text("II", [("STAT", "Sensor works well.")])])
+
+        async def body(session: Session) -> None:
+            who = await session.identify()
+            assert (who.geometry.serial, session.health) == ("H0900001", "Sensor works well.")
+
+        with_session(script, body)
+        assert script.heard == ["VV", "PP", "II"]
+
+    def test_without_ii(self) -> None:
+        async def body(session: Session) -> None:
+            await session.identify()
+            assert session.health == ""
+
+        with_session(Scripted(**GOOD, QT=[OK]), body)
+
+    def test_left_in_time_adjustment_by_firmware_that_grants_qt_there(self) -> None:
+        script = Scripted(VV=["0E", *GOOD["VV"]], PP=GOOD["PP"], TM2=[OK], QT=[OK])
+        with_session(script, lambda session: session.identify())  # type: ignore[arg-type, return-value]  # result unused
+        assert script.heard[:3] == ["VV", "TM2", "QT"]
+
+    def test_damaged_once(self) -> None:
+        damaged = GOOD["PP"][0].replace(b"1080", b"1081")
+        script = Scripted(VV=GOOD["VV"], PP=[damaged, *GOOD["PP"]])
+
+        async def body(session: Session) -> None:
+            assert (await session.identify()).geometry.amax == 1080
+
+        with_session(script, body)
+        assert script.heard.count("PP") == 2
+
+    def test_the_same_wrong_sum_twice_is_the_firmwares_own_way(self) -> None:
+        odd = GOOD["VV"][0].replace(b"SERI:H0900001;" + GOOD["VV"][0].rstrip()[-1:], b"SERI:H0900001;0")
+        script = Scripted(VV=[odd], PP=GOOD["PP"])
+
+        async def body(session: Session) -> None:
+            assert (await session.identify()).geometry.serial == "H0900001"
+
+        with_session(script, body)
+        assert script.heard.count("VV") == 2
+
+    def test_never_readable(self) -> None:
+        replies: list[str | bytes | None] = [GOOD["VV"][0].replace(b"H0900001", b"H090000%d" % i) for i in range(2, 9)]
+        with pytest.raises(DeviceFault, match="VV: checksum"):
+            with_session(Scripted(VV=replies), lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+
+    def test_no_lidar(self) -> None:
+        script = Scripted(VV=GOOD["VV"], PP=[encoder.text("PP", [("MODL", "Coffee machine")])])
+        with pytest.raises(DeviceRefused, match="PP says DMIN='', expected a number"):
+            with_session(script, lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+
+
+class TestRate:
+    def test_accepted(self) -> None:
+        script = Scripted(SS=[OK], **GOOD)
+
+        async def body(session: Session) -> None:
+            await session.set_rate(250000)
+            assert session.baud == 250000
+
+        with_session(script, body, baud=19200)
+        assert script.heard == ["SS250000", "VV"]
+        assert script.bauds == [19200, 250000]
+
+    @pytest.mark.parametrize("status", ["02", "04", "0F", None])
+    def test_refused(self, status: str | None) -> None:
+        async def body(session: Session) -> None:
+            await session.set_rate(250000)
+            assert session.baud == 19200
+
+        with_session(Scripted(SS=[status]), body, baud=19200)
+
+    def test_lost_on_the_way(self) -> None:
+        with pytest.raises(DeviceFault, match="lost after changing to 250000"):
+            with_session(Scripted(SS=[OK]), lambda session: session.set_rate(250000), baud=19200)
+
+    def test_an_adapter_that_cannot_do_it_is_found_out_before_the_sensor_changes(self) -> None:
+        script = Scripted(SS=[OK], QT=[OK])
+
+        async def body(session: Session) -> None:
+            port = session.line.port
+            assert isinstance(port, MemoryPort)
+            plain = port.set_baud
+
+            def limited(baud: int) -> None:
+                if baud > 115200:
+                    raise DeviceRefused("/dev/x", f"cannot do {baud} bit/s")
+                plain(baud)
+
+            port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
+            with pytest.raises(DeviceRefused):
+                await session.set_rate(250000)
+            assert script.heard == []
+            assert port.baud == 19200
+            await session.find_rate(750000)
+            assert session.baud == 19200
+
+        with_session(script, body, baud=19200)
+
+    def test_any_frame_betrays_the_right_rate(self) -> None:
+        """A sensor that streams may take long to say so; a frame of its stream is answer enough."""
+        frame = encoder.scan("MD0000000201000", 1, "0CB1Dh7D`")
+        script = Scripted(QT=[None, None, frame])
+
+        async def body(session: Session) -> None:
+            await session.find_rate()
+            assert session.baud == 57600
+
+        with_session(script, body)
+
+    def test_no_rate(self) -> None:
+        script = Scripted()
+        with pytest.raises(DeviceFault, match="nothing answers at any line rate"):
+            with_session(script, lambda session: session.find_rate(250000))
+        assert script.bauds == [250000, 19200, 38400, 57600, 115200, 500000, 750000]
+
+
+class TestStart:
+    request = ScanRequest("MD", 0, 2)
+    line = "MD0000000201000"
+
+    def start(self, script: Scripted, scans: bool = False) -> list[bytes]:
+        frames: list[bytes] = []
+
+        async def body(session: Session) -> None:
+            await session.start(self.request, lambda frame, t: frames.append(frame), lambda: scans and bool(frames))
+            await asyncio.sleep(0.1)
+
+        with_session(script, body)
+        return frames
+
+    def test_acknowledged(self) -> None:
+        data = encoder.scan(self.line, 1, "0CB1Dh7D`")
+        script = Scripted(MD=[encoder.answer(self.line, OK) + data])
+        assert self.start(script) == [data[:-2]]
+        assert script.heard == [self.line]
+
+    def test_acknowledgement_lost_but_data_come(self) -> None:
+        script = Scripted(MD=[encoder.scan(self.line, 1, "0CB1Dh7D`")])
+        assert len(self.start(script, scans=True)) == 1
+        assert script.heard == [self.line]
+
+    def test_no_answer_at_all(self) -> None:
+        with pytest.raises(DeviceFault, match="does not acknowledge MD"):
+            self.start(Scripted())
+
+    @pytest.mark.parametrize(
+        ("status", "kind", "words"),
+        [
+            ("04", DeviceRefused, "does not accept the range"),
+            ("10", DeviceFault, "not now"),
+            ("0L", AbnormalState, "error state"),
+            ("60", DeviceFault, "hardware trouble"),
+            ("30", DeviceFault, "checking itself"),
+            ("0A", DeviceFault, "MD answers 0A"),
+        ],
+    )
+    def test_refusals(self, status: str, kind: type[HalError], words: str) -> None:
+        with pytest.raises(kind, match=words):
+            self.start(Scripted(MD=[status]))
+
+    def test_the_sensors_own_words_go_with_the_error(self) -> None:
+        assert "Trouble!! Error No. =[00->33]" in str(
+            explain_status("/dev/x", "MD", "50", "Trouble!! Error No. =[00->33]")
+        )
+
+
+def test_quiet_never_takes_long_and_never_raises() -> None:
+    async def body(session: Session) -> None:
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        await session.quiet()
+        assert loop.time() - began == pytest.approx(0.1)
+        session.line.close()
+        await session.quiet()
+
+    with_session(Scripted(), body)
