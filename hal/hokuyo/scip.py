@@ -78,6 +78,7 @@ def decode_number(chars: bytes) -> int:
     return value
 
 
+_STATUS = re.compile(rb"[0-9][0-9A-Z]")  # stricter than the sum, which does not see bits 6 and 7
 _TAG = re.compile(rb"[A-Za-z0-9 ._+@]{0,16}\Z")
 
 
@@ -183,7 +184,7 @@ def parse_reply(frame: bytes) -> Reply:
     body = b"" if second < 0 else frame[second + 1 :] + b"\n"
     if len(line) == 1 and line.isalnum():
         return Reply(frame[:first], line.decode("ascii"), body, legacy=True)
-    if len(line) != 3 or not line.isascii() or not line[:2].isalnum():
+    if len(line) != 3 or not _STATUS.match(line):
         raise BadFrame(Flaw.STATUS, repr(line[:8]))
     if checksum(line[:2]) != line[2]:
         raise BadFrame(Flaw.SUM, f"status {line!r}")
