@@ -210,6 +210,18 @@ def test_no_odometry_is_lost_when_cycles_are_late() -> None:
     assert bench.snapshots[-1].odom[0] == pytest.approx(2.999, abs=0.02)
 
 
+def test_odometry_that_jumps_is_no_witness_until_its_window_has_filled_again() -> None:
+    async def jump(bench: Bench) -> None:
+        await bench.drive(0, 50, odometry=True)
+        assert bench.cycle.observer.witnesses.agree() is True
+        bench.cycle.inbox.put_odometry(replace(raw_odometry(4.96), x=50.0))
+        await asyncio.sleep(2 * PERIOD)
+
+    bench = on_bench(jump, odometry=True)
+    assert bench.cycle.odometry.jumps == 1
+    assert bench.cycle.observer.witnesses.agree() is None
+
+
 def test_an_empty_cycle_makes_no_step() -> None:
     async def idle(bench: Bench) -> None:
         await asyncio.sleep(1.0)

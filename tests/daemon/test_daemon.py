@@ -56,6 +56,7 @@ class Bench:
     world: Callable[[LidarModel], Room] = Room
     stopwatch: Callable[[], float] | None = None
     snapshots: list[Snapshot] = field(default_factory=list)
+    left: Sensor | None = None
 
     def __post_init__(self) -> None:
         self.loop = asyncio.get_running_loop()
@@ -124,6 +125,7 @@ def run_daemon(scenario: Callable[[Bench], Awaitable[None]], **options: object) 
         finally:
             stop.set()
             await asyncio.wait_for(running, 10.0)
+            bench.left = bench.device.state
         return bench
 
     return run_virtual(go())
@@ -154,7 +156,7 @@ def test_the_laser_is_switched_off_on_the_way_out() -> None:
         await bench.until(State.MAPPING, 3.0)
         assert bench.device.state is Sensor.MULTI
 
-    assert run_daemon(scenario).device.state is Sensor.IDLE
+    assert run_daemon(scenario).left is Sensor.IDLE, "before the daemon says that it has ended"
 
 
 def test_with_odometry_two_witnesses_agree() -> None:

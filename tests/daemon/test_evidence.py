@@ -1,0 +1,155 @@
+"""From step results to evidence: what a good match is, what nothing has witnessed, who has fallen silent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from daemon.evidence import ENOUGH_INLIERS, ODOMETRY_SILENT_S, OPENING_S, Observer, good
+from daemon.state import VAGUE_M, Evidence
+from estimator.records import Array, Command, Odometry, Order, Record
+from estimator.result import MatchResult, Reason, StepResult
+from hal.lidar import LidarStatus, Link
+
+STREAMING = LidarStatus(link=Link.STREAMING)
+SURE = np.diag((1e-6, 1e-6, 1e-6))
+GUESS = np.diag(((2 * VAGUE_M) ** 2, 1e-4, 1e-4))
+
+
+def match(
+    inliers: int = 600, reason: Reason = Reason.CONVERGED, known: tuple[int, int, int] = (1, 1, 1)
+) -> MatchResult:
+    zero = np.zeros(3)
+    axes = np.array(known, dtype=float)
+    return MatchResult(zero, np.eye(3), inliers, 682, 5, 0.01, axes, zero, reason)
+
+
+def step(found: MatchResult | None, P: Array = SURE, t_mono: float = 0.0, x: float = 0.0) -> StepResult:
+    zero = np.zeros(3)
+    return StepResult(
+        t_mono=t_mono,
+        T_odom_base=np.array((x, 0.0, 0.0)),
+        T_map_odom=zero,
+        covariance=P,
+        velocity=zero,
+        known_axes=np.ones(3) if found is None else found.known_axes,
+        match=found,
+        keyframe=-1,
+        loop=None,
+        anchor=0,
+        T_anchor_base=zero,
+        jumps=0,
+    )
+
+
+class Watch:
+    """An observer and a time that goes on by itself."""
+
+    def __init__(self, odometry: bool = False) -> None:
+        self.observer = Observer(0.0, odometry)
+        self.t = 0.0
+
+    def see(self, result: StepResult | None, *records: Record, status: LidarStatus = STREAMING) -> Evidence:
+        self.t += 0.1
+        self.observer.on_scan(self.t)
+        return self.observer.evidence(self.t, 0.1, status, records, result)
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (match(), True),
+        (match(reason=Reason.ITERATION_CAP), True),
+        (match(reason=Reason.REJECTED), False),
+        (match(reason=Reason.TOO_FEW_PAIRS), False),
+        (match(inliers=round(682 * ENOUGH_INLIERS) + 1), True),
+        (match(inliers=round(682 * ENOUGH_INLIERS) - 1), False),
+        (replace(match(), T_odom_base=np.array((np.nan, 0, 0))), False),
+    ],
+)
+def test_a_good_match_is_a_result_that_enough_of_the_scan_took_part_in(found: MatchResult, expected: bool) -> None:
+    assert good(found) is expected
+
+
+def test_the_first_scan_has_nothing_to_match_against() -> None:
+    evidence = Watch().see(step(match(reason=Reason.NO_MAP)))
+    assert (evidence.match, evidence.mapped) == (None, False)
+
+
+def test_drift_from_scan_to_scan_is_no_uncertainty_of_the_place() -> None:
+    watch = Watch()
+    for i in range(200):
+        evidence = watch.see(step(match(), SURE * (1 + 1000 * i)))
+    assert (evidence.sigma_m, evidence.sigma_rad) == (0.0, 0.0)
+
+
+def test_a_guess_stays_one_although_later_scans_fit_the_map_laid_upon_it() -> None:
+    watch = Watch()
+    watch.see(step(match()))
+    watch.see(step(match(reason=Reason.TOO_FEW_PAIRS), GUESS))
+    for _ in range(50):
+        evidence = watch.see(step(match(), GUESS + SURE))
+    assert evidence.sigma_m == pytest.approx(2 * VAGUE_M, rel=1e-2)
+    assert watch.see(step(match(), SURE)).sigma_m == 0.0, "the estimate itself has become certain again"
+
+
+def test_what_odometry_bridged_is_drift_not_a_guess() -> None:
+    watch = Watch(odometry=True)
+    watch.see(step(match()))
+    watch.observer.on_odometry(watch.t)
+    assert watch.see(step(match(known=(0, 1, 1)), GUESS)).sigma_m > VAGUE_M
+    watch.observer.on_odometry(watch.t)
+    assert watch.see(step(match(), GUESS)).sigma_m == 0.0
+
+
+@pytest.mark.parametrize("order", list(Order))
+def test_an_order_ends_the_doubt(order: Order) -> None:
+    watch = Watch()
+    watch.see(step(match()))
+    assert watch.see(step(match(), GUESS)).sigma_m > VAGUE_M
+    evidence = watch.see(step(match(), GUESS), Command(watch.t, order))
+    assert (evidence.ordered, evidence.sigma_m) == (True, 0.0)
+
+
+def test_a_corridor_does_not_witness_the_motion() -> None:
+    """The pose takes the free axis from the wheels; agreement would be an echo of them."""
+    watch = Watch(odometry=True)
+    for i in range(60):
+        t = watch.t
+        wheels = Odometry(t, t + 0.1, np.array((0.05, 0.0, 0.0)))
+        watch.observer.on_odometry(t)
+        known = (1, 1, 1) if i < 40 else (0, 1, 1)
+        evidence = watch.see(step(match(known=known), t_mono=t + 0.1, x=0.05 * (i + 1)), wheels)
+        if i == 39:
+            assert evidence.agree is True
+    assert evidence.agree is None
+
+
+def test_configured_odometry_falls_silent_after_a_second() -> None:
+    observer = Observer(0.0, odometry=True)
+    assert observer.odometry_ok(0.5) is True, "it may still come"
+    assert observer.odometry_ok(ODOMETRY_SILENT_S + 0.1) is False
+    observer.on_odometry(5.0)
+    assert observer.odometry_ok(5.9) is True
+    assert Observer(0.0, odometry=False).odometry_ok(100.0) is None
+
+
+def test_odometry_that_nobody_configured_counts_once_it_has_come() -> None:
+    observer = Observer(0.0, odometry=False)
+    observer.on_odometry(1.0)
+    assert (observer.odometry_ok(1.5), observer.odometry_ok(3.0)) == (True, False)
+
+
+def test_a_lidar_is_unreachable_when_its_driver_says_so_or_takes_too_long() -> None:
+    observer = Observer(0.0, odometry=False)
+    opening, waiting = LidarStatus(link=Link.OPENING), LidarStatus(link=Link.WAITING)
+    assert not observer.evidence(1.0, 0.1, opening, (), None).unreachable
+    assert observer.evidence(1.0, 0.1, waiting, (), None).unreachable
+    assert observer.evidence(OPENING_S + 1.0, 0.1, opening, (), None).unreachable
+    observer.on_scan(12.0)
+    late = observer.evidence(12.31, 0.1, opening, (), None)
+    assert not late.unreachable
+    assert late.silence is not None
+    assert late.silence > 3.0
