@@ -1,0 +1,39 @@
+"""The real process with `--record`: killed at any moment, its recording replays to the poses it published."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from daemon import cli
+from daemon.publish.snapshot import State
+from tests.daemon.test_process import fake_lidar, running
+
+
+@pytest.mark.realtime
+def test_a_killed_run_is_repeated_to_the_last_bit(tmp_path: Path) -> None:
+    """Measured budgets, a worker thread, a real tty: nothing of that may matter to the replay."""
+    link, folder = tmp_path / "lidar", tmp_path / "recordings"
+    with fake_lidar(link), running(link, "--record", str(folder)) as daemon:
+        daemon.until(30.0, "state", State.TRACKING)
+        time.sleep(3.0)
+        daemon.process.kill()
+        daemon.process.wait(10.0)
+    assert cli.main(["replay", str(folder), "--out", str(tmp_path / "out")]) == cli.OK
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    compared = summary["recorded_run"]
+    assert compared["differ"] == 0, compared["first_difference"]
+    assert compared["cycles"] > 3.0 / 0.025 / 4
+    assert summary["config"]["lidar"]["device"] == str(link)
+
+
+@pytest.mark.realtime
+def test_a_folder_that_cannot_be_written_stops_the_start(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with fake_lidar(tmp_path / "lidar"), running(tmp_path / "lidar", "--record", str(tmp_path / "file")) as daemon:
+        _, said = daemon.process.communicate(timeout=20.0)
+        assert daemon.process.returncode == cli.FAILED
+        assert "file: cannot be recorded into: Not a directory (free space, or name a folder" in said

@@ -1,0 +1,54 @@
+"""``python -m tests.logs.bless --reason TEXT [NAME ...]``: make today's trajectories the golden ones.
+
+Prints by how much each differs from the one before. Commit the files together with the change that moved them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.logs import golden
+from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, replayed
+
+
+def bless(entry: Entry, root: Path | None, reason: str) -> str:
+    """Write one golden file; returns what changed, for people."""
+    with tempfile.TemporaryDirectory() as folder:
+        trajectory = ledger_of(replayed(entry, root, Path(folder))).final()
+    before = golden.FOLDER / f"{entry.name}.txt"
+    moved = "new"
+    if before.exists():
+        old = golden.load(entry.name)
+        if old.facts.get("digest") == golden.digest(trajectory):
+            return f"{entry.name}: unchanged"
+        moved = f"moved by up to {golden.largest_difference(old, trajectory, entry.every):.6f} m"
+    golden.save(entry.name, trajectory, entry.every, golden.facts_of(trajectory, entry.sha256, reason))
+    return f"{entry.name}: {moved}"
+
+
+def main() -> int:
+    """The command; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.logs.bless", description=__doc__.split("\n")[0])
+    parser.add_argument("--reason", required=True, help="why the trajectories have changed; kept in the files")
+    parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
+    args = parser.parse_args()
+    unknown = sorted(set(args.name) - set(BY_NAME))
+    if unknown:
+        parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
+    data = os.environ.get("LUMILOOP_DATA")
+    for entry in ENTRIES:
+        if args.name and entry.name not in args.name:
+            continue
+        if entry.source and not data:
+            sys.stdout.write(f"{entry.name}: left as it is, LUMILOOP_DATA does not name the folder of real logs\n")
+            continue
+        sys.stdout.write(bless(entry, Path(data) if data else None, args.reason) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

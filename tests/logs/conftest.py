@@ -1,0 +1,28 @@
+"""Replays of real logs, each run once however many tests look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon.replay import Outcome
+from tests.logs.catalog import BY_NAME, replayed
+
+Replayed = Callable[[str], Outcome]
+
+
+@pytest.fixture(scope="session")
+def outcome_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Replayed:
+    """The replay of a log by its name; skips where the folder of real logs is not set."""
+    known: dict[str, Outcome] = {}
+
+    def get(name: str) -> Outcome:
+        if name not in known:
+            entry = BY_NAME[name]
+            root: Path | None = request.getfixturevalue("log_root") if entry.source else None
+            known[name] = replayed(entry, root, tmp_path_factory.mktemp(name))
+        return known[name]
+
+    return get

@@ -1,0 +1,98 @@
+"""Golden trajectories: small text files that say where the robot was, when replay was last blessed, and why.
+
+A change of the estimator changes them; the change is then looked at, and blessed in the same commit with its reason.
+The file holds one pose in many and a digest of all. Kernels compiled for another processor round differently, so the
+tight tolerance counts only where versions and processor are those of the blessing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import llvmlite.binding
+import numpy as np
+import numpy.typing as npt
+
+from daemon.results import Trajectory, tum
+from daemon.versions import versions
+
+Array = npt.NDArray[np.float64]
+
+FOLDER: Final = Path(__file__).parent / "golden"
+TIGHT_M: Final = 1e-6
+LOOSE_M: Final = 1.0
+"""Elsewhere: enough to notice a robot that has got lost, too little to notice a change."""
+
+
+@dataclass(frozen=True)
+class Golden:
+    """A blessed trajectory: facts of the blessing, stamps (n,), poses (n, 3)."""
+
+    facts: dict[str, str]
+    stamps: Array
+    poses: Array
+
+
+def environment() -> str:
+    """Whatever may change the last bits of a result."""
+    found = versions()
+    parts = ("python", "numpy", "numba", "llvmlite", "scipy", "machine")
+    return " ".join(f"{part}={found[part]}" for part in parts) + f" cpu={llvmlite.binding.get_host_cpu_name()}"
+
+
+def facts_of(trajectory: Trajectory, sha256: str, reason: str) -> dict[str, str]:
+    """What is written above the poses."""
+    return {
+        "log": sha256 or "made by tests/daemon/replay/room.py",
+        "reason": reason,
+        "environment": environment(),
+        "poses": str(len(trajectory.stamps)),
+        "digest": digest(trajectory),
+    }
+
+
+def digest(trajectory: Trajectory) -> str:
+    """Of the whole trajectory as it is written, so to 1e-6 m."""
+    return hashlib.sha256(tum(trajectory)).hexdigest()
+
+
+def thinned(trajectory: Trajectory, every: int) -> tuple[Array, Array]:
+    """One pose in ``every``, and the last one."""
+    chosen = np.unique(np.append(np.arange(0, len(trajectory.stamps), every), len(trajectory.stamps) - 1))
+    return trajectory.stamps[chosen], trajectory.poses[chosen]
+
+
+def save(name: str, trajectory: Trajectory, every: int, facts: dict[str, str]) -> Path:
+    """Write a golden file."""
+    stamps, poses = thinned(trajectory, every)
+    lines = [f"# {key}: {value}" for key, value in facts.items()]
+    lines += [f"{t:.6f} {x:.6f} {y:.6f} {yaw:.6f}" for t, (x, y, yaw) in zip(stamps, poses.tolist(), strict=True)]
+    FOLDER.mkdir(exist_ok=True)
+    path = FOLDER / f"{name}.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def load(name: str) -> Golden:
+    """Read a golden file."""
+    path = FOLDER / f"{name}.txt"
+    facts = {}
+    for line in path.read_text().splitlines():
+        if line.startswith("# "):
+            key, _, value = line[2:].partition(": ")
+            facts[key] = value
+    rows = np.loadtxt(path, comments="#", ndmin=2)
+    return Golden(facts, rows[:, 0], rows[:, 1:])
+
+
+def largest_difference(golden: Golden, trajectory: Trajectory, every: int) -> float:
+    """Metres (a radian counts as a metre) between the blessed poses and these; infinite where the stamps differ."""
+    stamps, poses = thinned(trajectory, every)
+    if len(stamps) != len(golden.stamps) or np.abs(stamps - golden.stamps).max() > 2e-6:
+        return float("inf")
+    off = poses - golden.poses
+    turn = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    return float(np.maximum(np.hypot(off[:, 0], off[:, 1]), np.abs(turn)).max())

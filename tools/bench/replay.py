@@ -1,0 +1,66 @@
+"""Replay of real logs: accuracy against relations found by hand, and speed against the drive itself.
+
+Needs ``LUMILOOP_DATA``. Speed is of one process on one core, reading and results left out; the peer is real time.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from daemon.config import Config
+from daemon.replay import Outcome, replay
+from tools import convert
+from tools.figures import Figure, bounded
+from tools.relations import SPLIT_S, Errors, evaluate, read_relations
+
+COMMAND: Final = "LUMILOOP_DATA=... python -m tools.bench replay"
+
+
+def run() -> list[Figure]:
+    """Replay the logs and judge them.
+
+    Raises:
+        RuntimeError: LUMILOOP_DATA does not name the folder of real logs.
+    """
+    data = os.environ.get("LUMILOOP_DATA")
+    if not data:
+        raise RuntimeError("LUMILOOP_DATA does not name the folder of real logs (see docs/data.md)")
+    return [*_intel(Path(data) / "intel"), *_utm(Path(data) / "utm30lx" / "scans.npz")]
+
+
+def _intel(folder: Path) -> list[Figure]:
+    outcome = replay(folder / "intel.clf.gz", Config(), given=False)
+    relations = read_relations(folder / "intel.relations")
+    final, online = outcome.rerun.ledger.final(), outcome.rerun.ledger.online()
+    figures = _accuracy("intel, at the end", evaluate(final.stamps, final.poses, relations))
+    figures += _accuracy("intel, as published", evaluate(online.stamps, online.poses, relations))
+    figures.append(Figure("intel, T_map_odom jumps", outcome.rerun.ledger.jumps, "", command=COMMAND))
+    figures.append(bounded("intel, replay speed", _speed(outcome), "x real time", ">= 100", COMMAND))
+    figures.append(Figure("intel, reading the log", outcome.seconds["read"], "s", command=COMMAND))
+    return figures
+
+
+def _accuracy(name: str, errors: Errors) -> list[Figure]:
+    local, whole = errors.within(SPLIT_S), errors.beyond(SPLIT_S)
+    return [
+        bounded(f"{name}: translation within 30 s", local.translation_m.mean(), "m", "<= 0.022", COMMAND),
+        bounded(f"{name}: rotation within 30 s", local.rotation_deg.mean(), "deg", "<= 0.55", COMMAND),
+        Figure(f"{name}: translation beyond 30 s", whole.translation_m.mean(), "m", command=COMMAND),
+        Figure(f"{name}: rotation beyond 30 s", whole.rotation_deg.mean(), "deg", command=COMMAND),
+    ]
+
+
+def _utm(source: Path) -> list[Figure]:
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "utm.log"
+        convert.write(log, convert.read(source), source.name)
+        outcome = replay(log, Config(), given=False)
+    speed = _speed(outcome)
+    return [bounded("utm30lx, 1081 beams at 40 Hz, replay speed", speed, "x real time", ">= 8", COMMAND)]
+
+
+def _speed(outcome: Outcome) -> float:
+    return (outcome.rerun.t_mono - outcome.rerun.t_first) / outcome.seconds["run"]
