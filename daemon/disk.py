@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hal.errors import DeviceRefused
-from hal.replay.recording import Kind, pack_frame, pack_head, segment_name
+from hal.replay.recording import LONGEST, Kind, pack_frame, pack_head, segment_name
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class SegmentWriter:
         """Take one record; returns at once."""
         frame = pack_frame(kind, channel, t_mono, payload)
         with self._lock:
-            if self._waiting + len(frame) > BACKLOG_BYTES or self._stop.is_set():
+            if self._waiting + len(frame) > BACKLOG_BYTES or len(payload) > LONGEST or self._stop.is_set():
                 self.lost += 1
                 return
             self._ready.append(frame)

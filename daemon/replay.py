@@ -32,6 +32,17 @@ PROGRESS_S: Final = 1.0
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
 
 
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What of the configuration a person has asked for: a whole ``file``, and single ``keys`` (dotted paths)."""
+
+    file: bool = False
+    keys: tuple[str, ...] = ()
+
+
+NOTHING_GIVEN: Final = Given()
+
+
 @dataclass(slots=True)
 class Outcome:
     """What a run over a log has come to; ``stopped`` says why it ended before the log did, empty otherwise."""
@@ -52,7 +63,8 @@ def command(args: argparse.Namespace, write: Callable[[Folder, Outcome], None]) 
     """Replay ``args.log``, let ``write`` put results into ``args.out``, and say how it went; returns the exit code."""
     try:
         folder = Folder(args.out)
-        outcome = replay(args.log, args.settings, given=args.config is not None or bool(args.set))
+        keys = tuple(override.partition("=")[0].strip() for override in args.set)
+        outcome = replay(args.log, args.settings, Given(args.config is not None, keys))
         write(folder, outcome)
     except (HalError, OutputRefused) as error:
         return cli.fail(str(error))
@@ -61,18 +73,19 @@ def command(args: argparse.Namespace, write: Callable[[Folder, Outcome], None]) 
     return _verdict(outcome)
 
 
-def replay(path: Path, config: Config, given: bool) -> Outcome:
+def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN) -> Outcome:
     """Run a log through the pipeline.
 
     Args:
         path: the log.
         config: resolved configuration.
-        given: it was given by a person; otherwise a log that knows its own (lidar mount, or all of it) counts.
+        given: what of it a person has asked for; what nobody asked for is taken from a log that knows it.
 
     Raises:
         HalError: the log cannot be opened; what goes wrong later ends the run and is said in `Outcome.stopped`.
     """
     begun = time.perf_counter()
+    _say(f"replay: reading {path}")
     source = open_log(path)
     used = config_for(source, config, given)
     outcome = Outcome(source, used, Rerun(source, used))
@@ -89,22 +102,31 @@ def replay(path: Path, config: Config, given: bool) -> Outcome:
     return outcome
 
 
-def config_for(source: Source, config: Config, given: bool) -> Config:
-    """The configuration that counts: the person's, else the recording's, with the log's mount where none was given.
-
-    Raises:
-        HalError: a recording made with keys that this version does not have.
-    """
-    if source.recorded and not given:
+def config_for(source: Source, config: Config, given: Given) -> Config:
+    """The configuration that counts: a person's, else the recording's, with the log's mount where none was given."""
+    if source.recorded and not given.file:
+        tree = dict(source.header.get("config", {}))
         try:
-            return msgspec.convert(source.header.get("config"), Config)
-        except msgspec.ValidationError:
-            source.report.notes.append("the recording's configuration is of another version: the built-in one is used")
-    if source.mount is None or config.lidar.mount != Mount():
+            return msgspec.convert(_laid_over(tree, msgspec.to_builtins(config), given.keys), Config)
+        except msgspec.ValidationError as error:
+            source.report.notes.append(f"the recording's configuration is not of this version ({error}): not used")
+    asked = any(key.startswith("lidar.mount") for key in given.keys) or config.lidar.mount != Mount()
+    if source.mount is None or asked:
         return config
     x, y, yaw = source.mount
     lidar = msgspec.structs.replace(config.lidar, mount=Mount(x=x, y=y, yaw=math.degrees(yaw)))
     return msgspec.structs.replace(config, lidar=lidar)
+
+
+def _laid_over(tree: dict[str, Any], config: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """``tree`` with the values that ``config`` has for ``keys`` (dotted paths)."""
+    for key in keys:
+        branch, chosen = tree, config
+        *parents, last = key.split(".")
+        for parent in parents:
+            branch, chosen = branch.setdefault(parent, {}), chosen[parent]
+        branch[last] = chosen[last]
+    return tree
 
 
 def _play(rerun: Rerun, source: Source) -> None:

@@ -7,6 +7,7 @@ resolves. Lines that cannot be used are skipped and counted with their numbers; 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -182,8 +183,8 @@ def _note_file(path: Path, number: int, torn: Torn, parsed: _Parsed, report: Log
 
 def _usable(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
     """Drop old-style scans whose beam count neither is the log's usual one nor says its own geometry."""
-    counts = [line.setup.count for line in lasers]
-    usual = max(set(counts), key=counts.count, default=0)
+    counts = Counter(line.setup.count for line in lasers)
+    usual = counts.most_common(1)[0][0] if counts else 0
     used: list[LaserLine] = []
     for index, line in enumerate(lasers):
         if line.setup.count == usual or beam_rule(line.setup)[2]:

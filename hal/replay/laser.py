@@ -20,6 +20,8 @@ _KNOWN_FOV_DEG: Final = {
     682: (-119.53125, 360.0 / 1024.0),  # URG-04LX: steps 44 to 725, front 384
     761: (-95.0, 0.25),  # UXM-30LX
 }
+FINEST_RAD: Final = 1e-4
+"""Least angle between beams that is believed."""
 _PILE_SHARE: Final = 1e-4
 _PILE_HEIGHT: Final = 10.0
 _PILE_DEPTH_M: Final = 1.0
@@ -32,7 +34,7 @@ def beam_rule(setup: LaserSetup) -> tuple[float, float, bool]:
     180 deg from -90 deg with whole fractions of a degree, so an odd number spans the half circle and an even number
     lacks the last beam: 180 and 181 are 1.0 deg, 360 and 361 are 0.5 deg. ``sure`` is False where that is a guess.
     """
-    if math.isfinite(setup.start) and setup.resolution > 0.0:
+    if abs(setup.start) <= 2.0 * math.pi and FINEST_RAD <= setup.resolution <= math.pi:
         return setup.start, _step(setup), True
     if setup.count in _KNOWN_FOV_DEG:
         start, step = _KNOWN_FOV_DEG[setup.count]

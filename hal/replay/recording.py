@@ -169,7 +169,7 @@ class Recording:
         Raises:
             DeviceRefused: a segment cannot be read.
         """
-        number = None
+        number = -1
         for path in self.segments:
             data = _load(path)
             header, at = _read_head(data)
@@ -179,9 +179,9 @@ class Recording:
             if header.get("recording") != self.header.get("recording"):
                 report.notes.append(f"{path.name}: belongs to another recording, left out")
                 continue
-            if number is not None and header.get("segment") != number + 1:
+            if header.get("segment") != number + 1:
                 report.notes.append(f"{path.name}: the segment before it is missing")
-            number = header.get("segment")
+            number = int(header.get("segment", number))
             yield from _frames(path.name, data, at, report)
 
 

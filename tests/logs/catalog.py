@@ -75,7 +75,7 @@ def prepared(entry: Entry, root: Path | None, folder: Path) -> Path:
 
 def replayed(entry: Entry, root: Path | None, folder: Path) -> Outcome:
     """The log through the pipeline as a stranger's: no configuration, no recorded caps."""
-    outcome = replay(prepared(entry, root, folder), Config(), given=False)
+    outcome = replay(prepared(entry, root, folder), Config())
     assert not outcome.stopped
     return outcome
 

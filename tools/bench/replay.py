@@ -32,7 +32,7 @@ def run() -> list[Figure]:
 
 
 def _intel(folder: Path) -> list[Figure]:
-    outcome = replay(folder / "intel.clf.gz", Config(), given=False)
+    outcome = replay(folder / "intel.clf.gz", Config())
     relations = read_relations(folder / "intel.relations")
     final, online = outcome.rerun.ledger.final(), outcome.rerun.ledger.online()
     figures = _accuracy("intel, at the end", evaluate(final.stamps, final.poses, relations))
@@ -57,7 +57,7 @@ def _utm(source: Path) -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "utm.log"
         convert.write(log, convert.read(source), source.name)
-        outcome = replay(log, Config(), given=False)
+        outcome = replay(log, Config())
     speed = _speed(outcome)
     return [bounded("utm30lx, 1081 beams at 40 Hz, replay speed", speed, "x real time", ">= 8", COMMAND)]
 

@@ -19,7 +19,7 @@ from daemon.budget import FixedBudget
 from daemon.config import Config, LidarConfig, Mask, ModbusConfig, Mount
 from daemon.cycle import CycleRecord
 from daemon.main import Daemon, World
-from daemon.replay import replay
+from daemon.replay import Given, replay
 from daemon.worker import CycleWorker
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
@@ -152,7 +152,7 @@ def through_pty(scans: convert.Scans, model: LidarModel, lidar: LidarConfig, lin
 def from_log(path: Path, scans: convert.Scans, lidar: LidarConfig) -> list[Array]:
     """T_odom_base of every scan, by replay of the converted log with its stamps cut to milliseconds."""
     convert.write(path, scans, "test")
-    outcome = replay(path, Config(lidar=lidar), given=True)
+    outcome = replay(path, Config(lidar=lidar), Given(file=True))
     return [np.array(row.odom) for row in outcome.rerun.ledger.rows]
 
 

@@ -221,6 +221,7 @@ def test_a_person_may_replay_with_another_configuration(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path / "out"), "--set", "lidar.mount.yaw=29"]
     assert cli.main(["replay", str(tmp_path / "rec"), *arguments]) == cli.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["config"]["lidar"]["mount"]["yaw"] == 29.0
+    assert summary["config"]["lidar"]["mount"] == {"x": 0.1, "y": -0.02, "yaw": 29.0, "inverted": False}
+    assert summary["config"]["lidar"]["device"] == USB  # what nobody asked for is as recorded
     assert summary["recorded_run"]["differ"] > 0
     assert summary["log"]["recorded_versions"]["numpy"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import math
@@ -10,8 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import cli
+from daemon import cli, warmup
+from daemon.budget import FixedBudget
+from daemon.config import Config, ModbusConfig
+from daemon.cycle import CycleRecord
+from daemon.main import Daemon, World
+from daemon.worker import CycleWorker
+from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceFault
+from hal.replay.carmen import read_carmen
+from hal.replay.player import LogPlayer
 from tests.daemon.replay.room import Drive, carmen, drive, read_tum, relative
 
 RESULTS = {"trajectory.tum", "online.tum", "map.pgm", "map.yaml", "map.png", "loops.csv", "summary.json", "timing.json"}
@@ -103,6 +112,40 @@ def test_the_map_has_walls_where_the_room_has_them(out: Path, run: Drive) -> Non
     assert np.quantile(distance, 0.95) < 0.08
 
 
+def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: Path) -> None:
+    """The player under the virtual loop, through daemon and pacemaker, against the replay's own drive of the cycle."""
+    player = LogPlayer(read_carmen(log))
+    poses: list[tuple[float, float, float]] = []
+
+    def keep(record: CycleRecord) -> None:
+        if record.scan is not None:
+            assert record.snapshot.pose is not None
+            poses.append(record.snapshot.pose)
+
+    async def main() -> None:
+        async def warm() -> None:
+            warmup.load()
+
+        clock = LoopClock(asyncio.get_running_loop())
+        world = World(
+            clock, make_lidar=lambda config, clock, opener: player.lidar, make_worker=CycleWorker,
+            make_budget=FixedBudget, stopwatch=None, warm_up=warm, draw_map_id=lambda: 1,
+        )  # fmt: skip
+        daemon = Daemon(Config(modbus=ModbusConfig(port=0)), world)
+        daemon.cycle.parts.tap = keep
+        stop = asyncio.Event()
+        running = asyncio.create_task(daemon.run(stop))
+        await player.odometry.run(daemon.cycle.inbox.put_odometry)
+        await asyncio.sleep(1.0)
+        stop.set()
+        await running
+
+    run_virtual(main())
+    _, replayed = read_tum(out / "online.tum")
+    assert np.array(poses)[:, :2] == pytest.approx(replayed[:, :2], abs=1e-6)
+    assert np.abs(np.sin(np.array(poses)[:, 2] - replayed[:, 2])).max() < 1e-6
+
+
 def test_map_export_writes_the_same_map_alone(log: Path, out: Path, tmp_path: Path) -> None:
     assert cli.main(["map", "export", str(log), "--out", str(tmp_path)]) == cli.OK
     assert {file.name for file in tmp_path.iterdir()} == {"map.pgm", "map.yaml", "map.png"}
@@ -122,9 +165,10 @@ def test_the_logs_mount_counts_unless_a_person_gives_one(tmp_path: Path, run: Dr
     log.write_text("\n".join(moved[:3]) + "\n")
     assert cli.main(["replay", str(log), "--out", str(tmp_path / "a")]) == cli.OK
     assert summary_of(tmp_path / "a")["config"]["lidar"]["mount"]["x"] == pytest.approx(0.3, abs=1e-5)  # type: ignore[index]  # plain data
-    given = ["--set", "lidar.mount.x=0.1"]
-    assert cli.main(["replay", str(log), "--out", str(tmp_path / "b"), *given]) == cli.OK
-    assert summary_of(tmp_path / "b")["config"]["lidar"]["mount"]["x"] == 0.1  # type: ignore[index]  # plain data
+    for number in (0.1, 0.0):
+        given = ["--set", f"lidar.mount.x={number}"]
+        assert cli.main(["replay", str(log), "--out", str(tmp_path / "b"), *given]) == cli.OK
+        assert summary_of(tmp_path / "b")["config"]["lidar"]["mount"]["x"] == number  # type: ignore[index]  # plain data
 
 
 def test_stamps_that_run_backwards_stay_in_the_results(

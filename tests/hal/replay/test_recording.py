@@ -57,7 +57,9 @@ def test_written_and_read(tmp_path: Path) -> None:
     assert frames == FRAMES
     assert report.used == {"rx": 20}
     assert not report.sentences()
-    assert read(tmp_path / segment_name(1))[0] == FRAMES[12:]  # each segment can be read alone
+    alone, report = read(tmp_path / segment_name(1))
+    assert alone == FRAMES[12:]
+    assert report.sentences() == ["000001.lumirec: the segment before it is missing"]
 
 
 def test_the_format_is_what_its_description_says() -> None:
