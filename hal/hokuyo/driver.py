@@ -1,8 +1,8 @@
 """The HOKUYO driver: finds the sensor, streams, and comes back from everything a sensor or a cable can do.
 
-What it does about trouble grows with every failure since the last valid scan: the stream is restarted (QT), the sensor
+What it does about trouble grows with every failure since scans last came: the stream is restarted (QT), the sensor
 is reset (RT or RS), the port is opened anew, the sensor is rebooted (RB, where the model has it), and again from the
-port on. Only a valid scan sets that back: a sensor that can be opened but never delivers must not look healthy
+port on. Only valid scans set that back: a sensor that can be opened but never delivers must not look healthy
 (Hokuyo-aut/urg_node2 pull request 5). Waits grow from 0.2 to 5 s, and it never gives up.
 """
 
@@ -32,9 +32,11 @@ log = logging.getLogger(__name__)
 AUTO: Final = "auto"
 _USB_BAUD: Final = 115200  # without meaning there, but a tty has to be given one
 _PAUSE_S: Final = (0.2, 5.0)
-_RESET_FROM = 2  # failures since the last valid scan
-_REOPEN_FROM = 3
-_REBOOT_EVERY = 4
+_RESET_FROM: Final = 2  # failures since the last run of valid scans
+_REOPEN_FROM: Final = 3
+_REBOOT_EVERY: Final = 4
+_GOOD_RUN: Final = 10  # valid scans of one stream
+_CALM_S: Final = 30.0  # of streaming, after which a problem is news again
 
 
 class HokuyoDriver:
@@ -78,6 +80,7 @@ class HokuyoDriver:
         self._rate_cap = max(BAUD_RATES)
         self._rate_found = 0
         self._told: set[str] = set()
+        self._loss_told = False
         self._random = random.Random(device + serial)
 
     @property
@@ -260,12 +263,20 @@ class HokuyoDriver:
         return stream_request(identity, intensity=False, bytes_per_s=speed)
 
     def _passing(self, on_scan: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
+        """Hands scans on; a run of them, not a single one, says that trouble is over (a stuck sensor sends one)."""
+        began, count = self._clock.now(), 0
+
         def pass_on(scan: RawScan) -> None:
-            self._faults = self._attempts = 0
+            nonlocal count
+            count += 1
             self._status.link = Link.STREAMING
-            if self._told:
+            if count == _GOOD_RUN:
+                self._faults = self._attempts = 0
+                if self._loss_told:
+                    self._loss_told = False
+                    log.info("%s: lidar %s delivers again", self._status.extra["device"], scan.geometry.model)
+            if self._told and scan.t_rx - began > _CALM_S:
                 self._told.clear()
-                log.info("%s: lidar %s delivers again", self._status.extra["device"], scan.geometry.model)
             on_scan(scan)
 
         return pass_on
@@ -273,13 +284,14 @@ class HokuyoDriver:
     # trouble
 
     def _note(self, error: HalError) -> None:
-        """Keep the error for the status; log each kind of problem once until scans come again."""
+        """Keep the error for the status; log each kind of problem once until scans have come for a while."""
         self._status.error = error
         self._attempts += 1
         if not isinstance(error, (DeviceMissing, DeviceRefused)):
             self._faults += 1
         if error.problem not in self._told:
             self._told.add(error.problem)
+            self._loss_told = True
             log.warning("lidar lost: %s", error)
 
     def _pause(self) -> float:

@@ -87,7 +87,7 @@ BYTES += [
 
 STAMPS = [
     Case("stamp repeated once", "what = 'frozen_stamp'; every = 10", ("invalid",), gap=0.06),
-    Case("frozen_stamp", "what = 'frozen_stamp'", ("invalid", "~its clock stands"), RESTART),
+    Case("frozen_stamp", "what = 'frozen_stamp'", ("invalid", "~its clock stands"), REOPEN),
     Case("stamp_jump back once", "what = 'stamp_jump'; by_ms = -5000; count = 1", ("invalid",), gap=0.06),
     Case("stamp_jump ahead once", "what = 'stamp_jump'; by_ms = 40000; count = 1", ("invalid",), gap=0.06),
     Case("stamp_jump back", "what = 'stamp_jump'; by_ms = -5000", ("clock_resets",), gap=0.06),
@@ -150,7 +150,7 @@ STATES = [
 WORDS = [
     Case("off", "what = 'off'", ("reconnects", "~."), REOPEN, unit=Unit(clock_ms=7_000_000)),
     Case("off of a serial line", "what = 'off'", ("resyncs", "~."), 12.0, model=replace(URG_04LX, rpm=600)),
-    Case("stuck", "what = 'stuck'", ("invalid", "~its clock stands"), RESTART),
+    Case("stuck", "what = 'stuck'", ("invalid", "~its clock stands"), REOPEN),
     Case("slow", "what = 'slow'", (), 0.15, gap=0.06),
     Case("delayed", "what = 'delayed'", (), 0.4, gap=0.35),
     Case("intermittent", "what = 'intermittent'", ("missed",), gap=0.4),

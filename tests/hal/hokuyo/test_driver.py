@@ -115,6 +115,7 @@ class TestWaiting:
                 before = bench.clock.now()
                 await bench.more(1, 2.0, driver)
                 assert bench.clock.now() - before < 2.0
+                await bench.more(20, 2.0, driver)
                 assert [record.levelname for record in caplog.records][2:3] == ["WARNING"]
                 assert caplog.records[-1].levelname == "INFO"
 
@@ -301,6 +302,45 @@ class TestWords:
             assert "RB" in words
 
         on_fake(body, UST_10LX)
+
+    def test_a_sensor_that_sends_one_scan_and_hangs_is_reset_and_told_of_once(
+        self, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        async def body(bench: Bench) -> None:
+            words = heard(bench)
+            async with bench.running(bench.driver()):
+                bench.order('[[fault]]\nwhat = "stuck"')
+                await asyncio.sleep(120.0)
+                assert len(bench.scans) > 5  # the first of every stream looks good
+                assert words.index("RT") < words.index("RB")
+                assert len(words) < 600
+                assert len(caplog.records) < 4
+                assert bench.faults is not None
+                bench.faults.clear()
+                await asyncio.sleep(60.0)
+                assert "delivers again" in caplog.records[-1].message
+
+        with caplog.at_level(logging.INFO, "hal"):
+            on_fake(body, UST_10LX)
+
+    def test_a_loose_contact_does_not_fill_the_log(self, caplog: pytest.LogCaptureFixture) -> None:
+        async def body(bench: Bench) -> None:
+            driver = bench.driver()
+            async with bench.running(driver):
+                for _ in range(40):
+                    await asyncio.sleep(5.0)
+                    bench.order('[[fault]]\nwhat = "hangup"\nfor = 0.3')
+                await asyncio.sleep(5.0)
+                assert driver.status.reconnects == 40
+                assert len(caplog.records) <= 4
+                await asyncio.sleep(60.0)
+                before = len(caplog.records)
+                bench.order('[[fault]]\nwhat = "hangup"\nfor = 0.3')
+                await asyncio.sleep(5.0)
+                assert len(caplog.records) > before
+
+        with caplog.at_level(logging.INFO, "hal"):
+            on_fake(body)
 
     def test_error_state_is_answered_with_a_reboot(self) -> None:
         async def body(bench: Bench) -> None:
