@@ -132,13 +132,17 @@ def order_points(points: Array, cx: float, cy: float, out: tuple[Array, Ints, In
         sort_rows(rows, label, start[s], start[s + 1])
 
 
-@kernel("Tuple((i8, f8))(f8[:, ::1], i8, i8, f8, f8, Tuple((f8, i8, f8)))")
+@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8, i8, f8, f8, Tuple((f8, i8, f8, f8)))")
 def nearest_on_axis(
-    rows: Array, lo: int, hi: int, qx: float, qy: float, best: tuple[float, int, float]
-) -> tuple[int, float]:
-    """Walk rows [lo, hi) from the query's distance to both ends; ``best`` is (r_q, row, squared distance)."""
-    rq, row, d2 = best
-    a, b = lo, hi
+    rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[float, int, float, float]
+) -> tuple[int, float, float]:
+    """Walk the axis of rows [low, high) from the query's distance to both ends.
+
+    ``best`` is (r_q, row, d2, e2): the query's own distance, the best row so far, its squared distance, and a bound that
+    no other row comes closer than. Returns the last three, brought up to date.
+    """
+    rq, row, d2, e2 = best
+    a, b = low, high
     while a < b:
         m = (a + b) >> 1
         if rows[m, 2] < rq:
@@ -147,15 +151,17 @@ def nearest_on_axis(
             b = m
     up, down = a, a - 1
     while True:
-        du = rows[up, 2] - rq if up < hi else np.inf
-        dd = rq - rows[down, 2] if down >= lo else np.inf
+        du = rows[up, 2] - rq if up < high else np.inf
+        dd = rq - rows[down, 2] if down >= low else np.inf
         if du <= dd:
             if du * du >= d2:
+                e2 = min(e2, du * du)
                 break
             i = up
             up += 1
         else:
             if dd * dd >= d2:
+                e2 = min(e2, dd * dd)
                 break
             i = down
             down -= 1
@@ -163,9 +169,12 @@ def nearest_on_axis(
         dy = rows[i, 1] - qy
         d = dx * dx + dy * dy
         if d < d2:
+            e2 = min(e2, d2)
             d2 = d
             row = i
-    return row, d2
+        else:
+            e2 = min(e2, d)
+    return row, d2, e2
 
 
 @kernel("f8(f8[:, ::1], i8, f8, f8, f8)")
@@ -178,52 +187,63 @@ def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float
     return cross * cross
 
 
-@kernel("Tuple((i8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)")
-def nearest(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: float) -> tuple[int, float]:
-    """Row nearest to the query (relative to the centre) and its squared distance; row -1 if none within ``bound2``."""
+@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)")
+def nearest(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: float) -> tuple[int, float, float]:
+    """Row nearest to the query (relative to the centre), its squared distance, and a bound for all others' (squared).
+
+    Row -1 and ``bound2`` if none is nearer than that. The bound makes a safe radius: until the query has moved by half
+    the difference of the two distances, its nearest row cannot change.
+    """
     r2 = qx * qx + qy * qy
     rq = np.sqrt(r2)
     sectors = len(start) - 1
     home = min(sectors - 1, int(turn_of(qx, qy) * 0.25 * sectors)) if sectors > 1 else 0
-    row, d2 = nearest_on_axis(rows, start[home], start[home + 1], qx, qy, (rq, -1, bound2))
-    left = home + 1
-    right = home - 1
+    row, d2, e2 = nearest_on_axis(rows, start[home], start[home + 1], qx, qy, (rq, -1, bound2, np.inf))
+    left = right = home
     todo = sectors - 1
-    open_left = open_right = True
-    while todo > 0 and (open_left or open_right):
+    open_left = open_right = todo > 0
+    while open_left or open_right:
         if open_left:
-            s = left % sectors
-            if ray_distance2(rays, s, qx, qy, r2) >= d2:
+            left = left + 1 if left + 1 < sectors else 0
+            ray2 = ray_distance2(rays, left, qx, qy, r2)
+            if ray2 >= d2:
+                e2 = min(e2, ray2)
                 open_left = False
             else:
-                row, d2 = nearest_on_axis(rows, start[s], start[s + 1], qx, qy, (rq, row, d2))
-                left += 1
+                row, d2, e2 = nearest_on_axis(rows, start[left], start[left + 1], qx, qy, (rq, row, d2, e2))
                 todo -= 1
-        if open_right and todo > 0:
-            s = right % sectors
-            if ray_distance2(rays, s + 1, qx, qy, r2) >= d2:
+                open_left = todo > 0
+                open_right = open_right and todo > 0
+        if open_right:
+            ray2 = ray_distance2(rays, right, qx, qy, r2)
+            right = right - 1 if right > 0 else sectors - 1
+            if ray2 >= d2:
+                e2 = min(e2, ray2)
                 open_right = False
             else:
-                row, d2 = nearest_on_axis(rows, start[s], start[s + 1], qx, qy, (rq, row, d2))
-                right -= 1
+                row, d2, e2 = nearest_on_axis(rows, start[right], start[right + 1], qx, qy, (rq, row, d2, e2))
                 todo -= 1
-    return row, d2
+                open_right = todo > 0
+                open_left = open_left and todo > 0
+    return row, d2, e2
 
 
-@kernel("void(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, Tuple((i8[::1], f8[::1])))")
-def nearest_all(rows: Array, start: Ints, rays: Array, queries: Array, bound2: float, out: tuple[Ints, Array]) -> None:
+@kernel("void(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, Tuple((i8[::1], f8[::1], f8[::1])))")
+def nearest_all(
+    rows: Array, start: Ints, rays: Array, queries: Array, bound2: float, out: tuple[Ints, Array, Array]
+) -> None:
     """:func:`nearest` for queries of shape (m, 2) relative to the centre."""
-    row, d2 = out
+    row, d2, e2 = out
     for i in range(len(queries)):
-        row[i], d2[i] = nearest(rows, start, rays, queries[i, 0], queries[i, 1], bound2)
+        row[i], d2[i], e2[i] = nearest(rows, start, rays, queries[i, 0], queries[i, 1], bound2)
 
 
 def query_axis(axis: Axis, queries: Array, bound: float = np.inf) -> tuple[Ints, Array]:
     """Label of the nearest reference point and its distance for each query (m, 2); -1 and ``bound`` where none."""
     row = np.empty(len(queries), np.int64)
-    d2 = np.empty(len(queries))
+    d2, e2 = np.empty(len(queries)), np.empty(len(queries))
     local = np.ascontiguousarray(queries - axis.centre)
-    nearest_all(axis.rows, axis.start, axis.rays, local, bound * bound, (row, d2))
+    nearest_all(axis.rows, axis.start, axis.rays, local, bound * bound, (row, d2, e2))
     found = np.append(axis.label, -1)[row]
     return found, np.sqrt(d2)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator import motion, se2
+from estimator.linear3 import invert3
 from estimator.records import Array, Scan
 from estimator.result import MatchResult, Reason
 from estimator.state import State
@@ -26,7 +27,7 @@ def fuse(state: State, match: MatchResult) -> None:
         learn_noise(state, match)
         moving.T_odom_base = match.T_odom_base
         P = moving.P * motion.learn(moving, match.correction, bool(match.known_axes.all()))
-        moving.P = se2.invert(se2.invert(P) + match.information)
+        moving.P = invert3(invert3(P) + match.information)
         if state.t_scan > -np.inf:
             made = se2.between(state.T_odom_scan, moving.T_odom_base)
             motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * np.diag(moving.P), state.settings.noise)

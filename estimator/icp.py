@@ -25,78 +25,93 @@ INLIERS, PAIRS, WEIGHTS, SQUARES, SETTLED, LENGTH2 = range(15, 21)
 """Places in the sums behind the normal equations."""
 
 
+Reference = tuple[Array, Ints, Array, Array]
+"""Rows, start and rays of the axis, and per row normal x, y, variance of the normal's direction, weight."""
+
+Memory = tuple[Ints, Ints, Array]
+"""Per query: its partner (a row, or -1); the row found when last sought; where the query was then (x, y) and how far,
+squared, it may move until another row can be nearest."""
+
+
 @kernel(
-    "void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[::1], Tuple((f8, f8, i8)),"
-    " f8[::1])"
+    "void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, i8,"
+    " Tuple((i8[::1], i8[::1], f8[:, ::1])))"
 )
-def pair_up(
+def pair_up(xy: Array, reference: Reference, T: Array, gate2: float, stride: int, memory: Memory) -> None:
+    """Step 1 of Sect. 4.2: the nearest row within the gate for every ``stride``-th point at pose ``T``.
+
+    A point that has not left its safe radius keeps its row without being looked up.
+    """
+    rows, start, rays, _ = reference
+    partner, found, safe = memory
+    c, s = np.cos(T[2]), np.sin(T[2])
+    for i in range(0, len(xy), stride):
+        px = c * xy[i, 0] - s * xy[i, 1] + T[0]
+        py = s * xy[i, 0] + c * xy[i, 1] + T[1]
+        row = found[i]
+        if row >= 0 and (px - safe[i, 0]) ** 2 + (py - safe[i, 1]) ** 2 < safe[i, 2]:
+            d2 = (px - rows[row, 0]) ** 2 + (py - rows[row, 1]) ** 2
+            partner[i] = row if d2 < gate2 else -1
+            continue
+        row, d2, e2 = nearest(rows, start, rays, px, py, gate2)
+        partner[i] = found[i] = row
+        safe[i, 0], safe[i, 1] = px, py
+        safe[i, 2] = 0.25 * (np.sqrt(e2) - np.sqrt(d2)) ** 2
+
+
+@kernel("void(f8[:, ::1], Tuple((f8[:, ::1], f8[:, ::1], i8[::1])), f8[::1], Tuple((f8, f8, f8)), i8, f8[::1])")
+def sum_up(
     xy: Array,
-    reference: tuple[Array, Ints, Array, Array],
+    pairs: tuple[Array, Array, Ints],
     T: Array,
-    eye: Array,
-    how: tuple[float, float, int],
+    how: tuple[float, float, float],
+    stride: int,
     sums: Array,
 ) -> None:
-    """One pass: nearest neighbours at pose ``T`` and the sums of the normal equations over the pairs.
+    """Step 2 of Sect. 4.2: the normal equations of point-to-line over the pairs.
 
-    ``reference``: the axis' rows, start and rays, and per row normal x, y and the variance of the normal's direction.
-    ``eye``: the lidar in the base frame. ``how``: robust scale, squared gate, stride through the points.
-    ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient, inliers, pairs, robust weights and
-    squares (m^2, scaled to what they would be as range noise).
+    ``pairs``: rows, lines and each point's partner. ``how``: lidar in the base frame (x, y), robust scale. ``sums``: 6
+    of the information, 6 of its expected noise part, 3 of the gradient, inliers, pairs, robust weights and squares
+    (m^2, scaled to what they would be as range noise).
     """
-    rows, start, rays, lines = reference
-    scale, gate2, stride = how
+    rows, lines, partner = pairs
     c, s = np.cos(T[2]), np.sin(T[2])
-    ex, ey = c * eye[0] - s * eye[1] + T[0], s * eye[0] + c * eye[1] + T[1]
-    k = 1.0 / (scale * scale)
+    ex, ey = c * how[0] - s * how[1] + T[0], s * how[0] + c * how[1] + T[1]
+    k = 1.0 / (how[2] * how[2])
     h00 = h01 = h02 = h11 = h12 = h22 = 0.0
     n00 = n01 = n02 = n11 = n12 = n22 = 0.0
-    g0 = g1 = g2 = inliers = pairs = weights = squares = 0.0
+    g0 = g1 = g2 = inliers = count = weights = squares = 0.0
     for i in range(0, len(xy), stride):
-        ux = c * xy[i, 0] - s * xy[i, 1]
-        uy = s * xy[i, 0] + c * xy[i, 1]
-        px = ux + T[0]
-        py = uy + T[1]
-        row, _ = nearest(rows, start, rays, px, py, gate2)
+        row = partner[i]
         if row < 0:
             continue
+        ux, uy = c * xy[i, 0] - s * xy[i, 1], s * xy[i, 0] + c * xy[i, 1]
+        px, py = ux + T[0], uy + T[1]
         nx, ny = lines[row, 0], lines[row, 1]
         facing = nx * (ex - px) + ny * (ey - py)
         if facing <= 0.0:
             continue  # seen from behind: the other side of a thin wall
         cos2 = facing * facing / ((ex - px) ** 2 + (ey - py) ** 2)
         p = 1.0 / (GRAZE + (1.0 - GRAZE) * cos2)  # precision in units of the range noise
-        pairs += 1.0
         e = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
         w = 1.0 / (1.0 + p * k * e * e)
-        if w > 0.2:
-            inliers += 1.0
+        count += 1.0
+        inliers += 1.0 if w > 0.2 else 0.0
         weights += w
         p *= lines[row, 3]
         squares += w * p * e * e
         w *= p
-        turn = ny * ux - nx * uy
-        along = nx * ux + ny * uy
-        h00 += w * nx * nx
-        h01 += w * nx * ny
-        h02 += w * nx * turn
-        h11 += w * ny * ny
-        h12 += w * ny * turn
-        h22 += w * turn * turn
+        turn, along = ny * ux - nx * uy, nx * ux + ny * uy
+        h00, h01, h02 = h00 + w * nx * nx, h01 + w * nx * ny, h02 + w * nx * turn
+        h11, h12, h22 = h11 + w * ny * ny, h12 + w * ny * turn, h22 + w * turn * turn
         v = w * lines[row, 2]
-        n00 += v * ny * ny
-        n01 -= v * nx * ny
-        n02 -= v * ny * along
-        n11 += v * nx * nx
-        n12 += v * nx * along
-        n22 += v * along * along
-        g0 += w * nx * e
-        g1 += w * ny * e
-        g2 += w * turn * e
+        n00, n01, n02 = n00 + v * ny * ny, n01 - v * nx * ny, n02 - v * ny * along
+        n11, n12, n22 = n11 + v * nx * nx, n12 + v * nx * along, n22 + v * along * along
+        g0, g1, g2 = g0 + w * nx * e, g1 + w * ny * e, g2 + w * turn * e
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = h00, h01, h02, h11, h12, h22
     sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = n00, n01, n02, n11, n12, n22
     sums[12], sums[13], sums[14] = g0, g1, g2
-    sums[15], sums[16], sums[17], sums[18] = inliers, pairs, weights, squares
+    sums[15], sums[16], sums[17], sums[18] = inliers, count, weights, squares
 
 
 @kernel("void(f8[::1], f8, f8[:, ::1], f8[:, ::1])")
@@ -154,7 +169,7 @@ def first_scale(xy: Array, eye: Array, L1: Array, last: float, gate: float) -> f
 )
 def iterate(
     xy: Array,
-    reference: tuple[Array, Ints, Array, Array],
+    reference: Reference,
     T: Array,
     L1: Array,
     how: Array,
@@ -178,6 +193,7 @@ def iterate(
     eye = how[:2]
     last = how[4]
     scale = first_scale(xy, eye, L1, last, how[3])
+    memory = (np.full(len(xy), -1), np.full(len(xy), -1), np.zeros((len(xy), 3)))
     damping = 1.0
     count = 0
     sums[SETTLED] = 0.0
@@ -185,7 +201,9 @@ def iterate(
         count += 1
         stride = int(how[7]) if scale > 2.0 * last else 1
         k = stride / (how[5] * how[5])
-        pair_up(xy, reference, T, eye, (scale, min(how[3], max(6.0 * scale, 0.1)) ** 2, stride), sums)
+        gate = min(how[3], max(6.0 * scale, 0.1))
+        pair_up(xy, reference, T, gate * gate, stride, memory)
+        sum_up(xy, (reference[0], reference[3], memory[0]), T, (how[0], how[1], scale), stride, sums)
         trusted(sums, k, H, keep)
         for i in range(3):
             b[i] = 0.0

@@ -7,6 +7,9 @@ import numpy as np
 from estimator.kernel import kernel
 from estimator.records import Array
 
+TINY = 1e-9
+"""What is added to a diagonal: less than any uncertainty that matters (0.03 mm), and keeps an inverse finite."""
+
 
 @kernel("f8(f8[:, ::1], f8[::1], f8[::1])")
 def solve3(A: Array, b: Array, x: Array) -> float:
@@ -60,3 +63,31 @@ def eigen3(A: Array, V: Array) -> None:
                 for k in range(3):
                     x, y = V[k, p], V[k, q]
                     V[k, p], V[k, q] = c * x - s * y, s * x + c * y
+
+
+@kernel("f8[:, ::1](f8[:, ::1])")
+def invert3(A: Array) -> Array:
+    """Inverse of a symmetric positive matrix; a little is added to its diagonal first, so that there always is one.
+
+    Turns covariance into information and back. Scaled to a unit diagonal, because metres and radians may differ widely.
+    """
+    B = np.empty((3, 3))
+    scale = np.empty(3)
+    for i in range(3):
+        scale[i] = 1.0 / np.sqrt(max(A[i, i], 0.0) + TINY)
+    for i in range(3):
+        for j in range(3):
+            B[i, j] = A[i, j] * scale[i] * scale[j]
+        B[i, i] = 1.0
+    out = np.empty((3, 3))
+    out[0, 0] = B[1, 1] * B[2, 2] - B[1, 2] * B[1, 2]
+    out[1, 1] = B[0, 0] * B[2, 2] - B[0, 2] * B[0, 2]
+    out[2, 2] = B[0, 0] * B[1, 1] - B[0, 1] * B[0, 1]
+    out[0, 1] = out[1, 0] = B[0, 2] * B[1, 2] - B[0, 1] * B[2, 2]
+    out[0, 2] = out[2, 0] = B[0, 1] * B[1, 2] - B[0, 2] * B[1, 1]
+    out[1, 2] = out[2, 1] = B[0, 1] * B[0, 2] - B[0, 0] * B[1, 2]
+    det = max(B[0, 0] * out[0, 0] + B[0, 1] * out[0, 1] + B[0, 2] * out[0, 2], TINY)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] *= scale[i] * scale[j] / det
+    return out

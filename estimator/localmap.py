@@ -91,7 +91,7 @@ def absorb(
         ny = s * fresh[i, 2] + c * fresh[i, 3]
         r = np.sqrt((fresh[i, 0] - pose[5]) ** 2 + (fresh[i, 1] - pose[6]) ** 2)
         near = max(spacing, half_beam * r)
-        row, _ = nearest(rows, start, rays, x - pose[3], y - pose[4], near * near)
+        row, _, _ = nearest(rows, start, rays, x - pose[3], y - pose[4], near * near)
         if row >= 0:
             j = label[row]
             e = elements[j, NX] * (x - elements[j, X]) + elements[j, NY] * (y - elements[j, Y])

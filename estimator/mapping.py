@@ -9,9 +9,10 @@ import numpy as np
 from estimator import keyframe, localmap, se2
 from estimator.fusion import covariance, noise_of
 from estimator.keyframe import Keyframe
+from estimator.lines import lines_of
 from estimator.records import Array, Scan
 from estimator.result import MatchResult
-from estimator.scanpoints import ScanPoints, lines_of
+from estimator.scanpoints import ScanPoints
 from estimator.state import State
 
 PATIENCE = 3

@@ -8,9 +8,13 @@ import numpy as np
 
 from estimator import icp, se2
 from estimator.keyframe import Beams
+from estimator.linear3 import invert3
 from estimator.localmap import LocalMap, contradicted
 from estimator.records import Array
 from estimator.result import MatchResult, Reason
+
+VAGUE = np.diag((4.0, 4.0, 33.0))
+"""Information of a pose known to 0.5 m and 10 deg."""
 
 SURE = 0.8
 """Share of fitting beams beyond which a good prediction needs no further evidence."""
@@ -34,7 +38,7 @@ class MatchSettings:
 
     gate_m: float = 0.5
     scale: float = 2.5
-    settled: float = 0.1
+    settled: float = 0.2
     min_points: int = 10
     tracking: tuple[float, float] = (0.35, 0.35)
     searching: tuple[float, float] = (0.6, 0.1)
@@ -176,8 +180,8 @@ def plausible(
 
 def known_axes(H: Array) -> Array:
     """1 for each of x, y, yaw that the information brings from 0.5 m and 10 deg to 10 cm and 2 deg, else 0."""
-    P = np.linalg.inv(H + np.diag((4.0, 4.0, 33.0)))
-    return np.asarray(np.diag(P) < np.array((0.01, 0.01, 0.0012)), dtype=np.float64)
+    P = invert3(H + VAGUE)
+    return np.array((P[0, 0] < 0.01, P[1, 1] < 0.01, P[2, 2] < 0.0012), dtype=np.float64)
 
 
 def no_match(T_pred: Array, queries: int, reason: Reason) -> MatchResult:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimator import se2
+from estimator.linear3 import invert3
 from estimator.records import Array, Imu, Odometry
 
 LONGEST_CARRY_S = 0.5
@@ -44,10 +45,9 @@ class MotionNoise:
     acceleration: float = 1.0
     angular_acceleration: float = 2.0
 
-    def acceleration_variance(self) -> Array:
+    def acceleration_variance(self) -> tuple[float, float, float]:
         """Variance of the acceleration (x, y, yaw)."""
-        linear = self.acceleration**2
-        return np.array((linear, linear, self.angular_acceleration**2))
+        return self.acceleration**2, self.acceleration**2, self.angular_acceleration**2
 
 
 @dataclass(slots=True, eq=False)
@@ -114,13 +114,13 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
     dt = end - begin
     if not 1e-3 < dt < LONGEST_CARRY_S:
         return
-    unknown = noise.acceleration_variance()
     late = min(max(0.0, end - motion.t_felt), LONGEST_CARRY_S)
-    P = motion.velocity_variance + unknown * late * late
-    R = variance / (dt * dt) + unknown * (0.25 * dt * dt)
-    gain = P / (P + R)
-    motion.velocity = motion.velocity + gain * (se2.log(delta) / dt - motion.velocity)
-    motion.velocity_variance = (1.0 - gain) * P
+    made = se2.log(delta)
+    for axis, unknown in enumerate(noise.acceleration_variance()):
+        P = float(motion.velocity_variance[axis]) + unknown * late * late
+        gain = P / (P + float(variance[axis]) / (dt * dt) + unknown * (0.25 * dt * dt))
+        motion.velocity[axis] += gain * (float(made[axis]) / dt - float(motion.velocity[axis]))
+        motion.velocity_variance[axis] = (1.0 - gain) * P
     motion.t_felt = max(motion.t_felt, end)
 
 
@@ -143,7 +143,7 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
     if math.isfinite(dt):
         dt = min(dt, LONGEST_CARRY_S)
         delta = se2.exp(motion.velocity * dt)
-        variance = (motion.velocity_variance + noise.acceleration_variance() * (dt * dt)) * (dt * dt)
+        variance = (motion.velocity_variance + np.array(noise.acceleration_variance()) * (dt * dt)) * (dt * dt)
         move(motion, delta, variance)
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono
@@ -155,7 +155,7 @@ def learn(motion: Motion, correction: Array, known: bool) -> float:
     Noise figures are those of a good robot. Where wheels slip or stamps jitter, matches keep correcting the prediction
     by more than its deviation says, and ``doubt`` scales the noise of the predictions to come.
     """
-    surprise = float(correction @ se2.invert(motion.P) @ correction) / 3.0
+    surprise = float(correction @ invert3(motion.P) @ correction) / 3.0
     if known:
         seen = motion.doubt * min(surprise, SURPRISE_CAP)
         motion.doubt = min(max(1.0, motion.doubt + DOUBT_LEARNING * (seen - motion.doubt)), DOUBT_CAP)

@@ -11,6 +11,7 @@ from estimator.commands import obey
 from estimator.fusion import covariance, fuse, noise_of
 from estimator.grid import Grid
 from estimator.keyframe import unturned
+from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_keyframe, update_map
 from estimator.matching import Prior, View
 from estimator.records import Array, Command, Imu, Limits, Odometry, Record, Scan
@@ -77,7 +78,7 @@ def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> 
     thin = max(1, -(-count // max(1, limits.points)))
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
     view = View(np.ascontiguousarray(points.xy[::thin]), scan.T_base_lidar, beams, noise_of(state, scan))
-    prior = Prior(T_pred, se2.invert(state.fused.P))
+    prior = Prior(T_pred, invert3(state.fused.P))
     return matching.match(view, state.local, prior, limits.icp_iterations, state.settings.matching)
 
 
@@ -89,7 +90,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         T_odom_base=moving.T_odom_base,
         T_map_odom=state.T_map_odom,
         covariance=covariance(state),
-        velocity=moving.velocity,
+        velocity=moving.velocity.copy(),
         known_axes=np.ones(3) if match is None else match.known_axes,
         match=match,
         keyframe=keyframe,

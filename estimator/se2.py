@@ -79,8 +79,3 @@ def carry(T_a_b: Array, T_b_c: Array, P_b: Array) -> Array:
     x, y, _ = (compose(T_a_b, T_b_c) - T_a_b).tolist()
     F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
     return np.asarray(F @ P_b @ F.T)
-
-
-def invert(A: Array) -> Array:
-    """Covariance from information, or back; a little is added to the diagonal so that a certain axis stays finite."""
-    return np.asarray(np.linalg.inv(A + 1e-9 * np.eye(3)), dtype=np.float64)
