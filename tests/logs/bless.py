@@ -25,7 +25,9 @@ def bless(entry: Entry, root: Path | None, reason: str) -> str:
         old = golden.load(entry.name)
         if old.facts.get("digest") == golden.digest(trajectory):
             return f"{entry.name}: unchanged"
-        moved = f"moved by up to {golden.largest_difference(old, trajectory, entry.every):.6f} m"
+        far = golden.largest_difference(old, trajectory, entry.every)
+        step = golden.largest_difference(old, trajectory, entry.every, motion=True)
+        moved = f"moved by up to {far:.6f} m, from one kept pose to the next by up to {step:.6f} m"
     golden.save(entry.name, trajectory, entry.every, golden.facts_of(trajectory, entry.sha256, reason))
     return f"{entry.name}: {moved}"
 
