@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
@@ -12,32 +14,16 @@ from daemon.cycle import CycleRecord
 from daemon.results import Trajectory
 from estimator import se2
 from estimator.records import Array
-from estimator.result import Loop
+from estimator.result import Loop, StepResult
 
-Pose = tuple[float, float, float]
-
-
-@dataclass(slots=True)
-class Row:
-    """One scan's outcome.
-
-    Attributes:
-        stamp: of the log, seconds, at the instant the pose is true for.
-        online: T_map_base as published. odom: T_odom_base. anchor, T_anchor_base: as in `StepResult`.
-        final: T_map_base once its anchor is gone, None while the anchor still says where it is.
-    """
-
-    stamp: float
-    online: Pose
-    odom: Pose
-    anchor: int
-    T_anchor_base: Array
-    final: Pose | None = None
+_FIELDS: Final = 11
+_STAMP, _ANCHOR = 0, 1
+_ONLINE, _ODOM, _ON_ANCHOR = slice(2, 5), slice(5, 8), slice(8, 11)
 
 
 @dataclass(slots=True)
 class Ledger:
-    """Rows in the order of the log, and counts.
+    """One row a scan, in the order of the log, and counts. A row is 88 bytes: a day at 40 Hz fits into memory.
 
     Attributes:
         cycles, keyframes, matched: counts. outcomes: how often each reason of a match came. states: of the snapshot.
@@ -45,7 +31,6 @@ class Ledger:
         jumps: of T_map_odom. dropped: scans that a later one replaced before a cycle took them.
     """
 
-    rows: list[Row] = field(default_factory=list)
     cycles: int = 0
     keyframes: int = 0
     matched: int = 0
@@ -56,6 +41,12 @@ class Ledger:
     corrected_rad: float = 0.0
     jumps: int = 0
     dropped: int = 0
+    _rows: array[float] = field(default_factory=lambda: array("d"))
+    _settled: list[Array] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        """Scans that gave a pose."""
+        return len(self._rows) // _FIELDS
 
     def take(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
         """Take in one cycle; ``stamp`` is the log's for the latest scan, which was measured at ``t_mono``."""
@@ -67,59 +58,70 @@ class Ledger:
             return
         self.jumps = result.jumps
         if record.limits is not None:
-            self.keyframes += result.keyframe >= 0
-            if result.loop is not None:
-                self.loops.append((stamp, result.loop))
-        if record.scan is None or pose is None:
-            return
+            self._count(result, stamp)
+        if record.scan is not None and pose is not None:
+            at = stamp + (result.t_mono - t_mono)
+            odom, on_anchor = result.T_odom_base.tolist(), result.T_anchor_base.tolist()
+            self._rows.extend((at, result.anchor, *pose, *odom, *on_anchor))
+
+    def _count(self, result: StepResult, stamp: float) -> None:
+        self.keyframes += result.keyframe >= 0
+        if result.loop is not None:
+            self.loops.append((stamp, result.loop))
         if result.match is not None:
             self.outcomes[result.match.reason.name] += 1
             self.matched += result.match.ok
             dx, dy, dyaw = result.match.correction.tolist()
             self.corrected_m = max(self.corrected_m, math.hypot(dx, dy))
             self.corrected_rad = max(self.corrected_rad, abs(dyaw))
-        x, y, yaw = result.T_odom_base.tolist()
-        at = stamp + (result.t_mono - t_mono)
-        self.rows.append(Row(at, pose, (x, y, yaw), result.anchor, result.T_anchor_base))
 
     def settle(self, keyframes: dict[int, Array]) -> None:
-        """Fix every pose by its anchor's present place: the map is about to be thrown away, or the log has ended."""
-        for row in self.rows:
-            if row.final is None and row.anchor in keyframes:
-                x, y, yaw = se2.compose(keyframes[row.anchor], row.T_anchor_base).tolist()
-                row.final = (x, y, yaw)
+        """Fix every pose by its anchor's present place: the map is about to be thrown away, or the log has ended.
+
+        A pose whose anchor is not among ``keyframes`` stays as it was published.
+        """
+        rows = self._table()[sum(map(len, self._settled)) :]
+        final = rows[:, _ONLINE].copy()
+        for i, row in enumerate(rows):
+            place = keyframes.get(int(row[_ANCHOR]))
+            if place is not None:
+                final[i] = se2.compose(place, row[_ON_ANCHOR])
+        self._settled.append(final)
 
     def online(self) -> Trajectory:
         """T_map_base of every scan as it was published."""
-        return self._trajectory([row.online for row in self.rows])
+        rows = self._table()
+        return Trajectory(rows[:, _STAMP], rows[:, _ONLINE])
 
     def final(self) -> Trajectory:
-        """T_map_base of every scan by what is known at the end; as published where its anchor is not known."""
-        return self._trajectory([row.final or row.online for row in self.rows])
+        """T_map_base of every scan by what was known when it was settled; as published where it was not yet."""
+        rows = self._table()
+        settled = np.concatenate([*self._settled, np.empty((0, 3))])
+        return Trajectory(rows[:, _STAMP], np.concatenate([settled, rows[len(settled) :, _ONLINE]]))
+
+    def odom(self) -> Array:
+        """T_odom_base of every scan, (n, 3)."""
+        return self._table()[:, _ODOM]
 
     def largest_step(self) -> tuple[float, float, float]:
         """Largest step of T_odom_base between two scans: metres, radians, and the stamp after the one in metres."""
-        poses = self._odom()
+        poses = self.odom()
         if len(poses) < 2:
             return 0.0, 0.0, 0.0
         steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
         turns = np.abs(wrap(np.diff(poses[:, 2])))
-        return float(steps.max()), float(turns.max()), self.rows[int(steps.argmax()) + 1].stamp
+        return float(steps.max()), float(turns.max()), float(self._table()[int(steps.argmax()) + 1, _STAMP])
 
     def way(self) -> tuple[float, float]:
         """Length of T_odom_base's path in metres, and all it has turned in radians."""
-        poses = self._odom()
+        poses = self.odom()
         return (
             float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
             float(np.abs(wrap(np.diff(poses[:, 2]))).sum()),
         )
 
-    def _odom(self) -> Array:
-        return np.array([row.odom for row in self.rows], dtype=np.float64).reshape(-1, 3)
-
-    def _trajectory(self, poses: list[Pose]) -> Trajectory:
-        stamps = np.array([row.stamp for row in self.rows], dtype=np.float64)
-        return Trajectory(stamps, np.array(poses, dtype=np.float64).reshape(-1, 3))
+    def _table(self) -> Array:
+        return np.array(self._rows, dtype=np.float64).reshape(-1, _FIELDS)
 
 
 def wrap(angles: Array) -> Array:

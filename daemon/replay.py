@@ -138,7 +138,7 @@ def _play(rerun: Rerun, source: Source) -> None:
             shown = now
             speed = (rerun.t_mono - rerun.t_first) / (now - begun)
             part = 100 * source.done // max(1, source.total)
-            _say(f"replay: {part} %, {len(rerun.ledger.rows)} scans, {speed:.0f} x real time")
+            _say(f"replay: {part} %, {len(rerun.ledger)} scans, {speed:.0f} x real time")
 
 
 def _say(text: str) -> None:
@@ -158,14 +158,14 @@ def _verdict(outcome: Outcome) -> int:
         sys.stderr.write("\r\x1b[K")
     for sentence in source.report.sentences():
         sys.stderr.write(f"replay: {source.path}: {sentence}\n")
-    if not rerun.ledger.rows:
+    if not len(rerun.ledger):
         return cli.fail(f"{source.path}: {source.kind} without a scan that gave a pose")
     if rerun.comparison.differ:
         first = rerun.comparison.first
         sys.stderr.write(f"replay: {rerun.comparison.differ} cycles differ from the recorded run; {first}\n")
     log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
     speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
-    sys.stderr.write(f"replay: {len(rerun.ledger.rows)} poses, {speed}\n")
+    sys.stderr.write(f"replay: {len(rerun.ledger)} poses, {speed}\n")
     return cli.OK
 
 
@@ -216,7 +216,7 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
         "stopped": outcome.stopped,
         "counts": {
             "scans": source.status.scans,
-            "poses": len(ledger.rows),
+            "poses": len(ledger),
             "cycles": ledger.cycles,
             "dropped": ledger.dropped,
             "odometry": rerun.readings,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from array import array
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -75,7 +76,7 @@ class Comparison:
 class Timing:
     """Measured seconds; the only thing about a replay that is not repeatable."""
 
-    cycles: list[float] = field(default_factory=list)
+    cycles: array[float] = field(default_factory=lambda: array("d"))
     steps: float = 0.0
 
 

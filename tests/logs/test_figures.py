@@ -45,7 +45,7 @@ def test_intel_never_jumps(outcome_of: Replayed) -> None:
     outcome = outcome_of("intel")
     ledger = ledger_of(outcome)
     assert ledger.jumps == 0
-    poses = np.array([row.odom for row in ledger.rows])
+    poses = ledger.odom()
     readings = [e for e in read_carmen(outcome.source.path).events(0.0) if isinstance(e, RawOdometry)]
     wheels = np.array([(e.x, e.y, e.yaw) for e in readings])
     assert len(poses) == len(wheels)
@@ -62,7 +62,7 @@ def test_intel_never_jumps(outcome_of: Replayed) -> None:
 def test_replay_is_faster_than_the_drive(outcome_of: Replayed) -> None:
     """A hundred times real time is the figure, by the benchmark on an idle machine; here with fourfold slack."""
     outcome = outcome_of("intel")
-    assert len(ledger_of(outcome).rows) == 13631
+    assert len(ledger_of(outcome)) == 13631
     assert 2690.0 / outcome.seconds["run"] >= 100.0 / 4
 
 
@@ -71,6 +71,6 @@ def test_replay_is_faster_than_the_drive(outcome_of: Replayed) -> None:
 def test_every_scan_has_its_pose(name: str, outcome_of: Replayed) -> None:
     outcome = outcome_of(name)
     ledger = ledger_of(outcome)
-    assert len(ledger.rows) == outcome.source.status.scans
+    assert len(ledger) == outcome.source.status.scans
     assert ledger.dropped == 0
-    assert ledger.matched >= 0.99 * len(ledger.rows)
+    assert ledger.matched >= 0.99 * len(ledger)

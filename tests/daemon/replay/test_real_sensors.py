@@ -153,7 +153,7 @@ def from_log(path: Path, scans: convert.Scans, lidar: LidarConfig) -> list[Array
     """T_odom_base of every scan, by replay of the converted log with its stamps cut to milliseconds."""
     convert.write(path, scans, "test")
     outcome = replay(path, Config(lidar=lidar), Given(file=True))
-    return [np.array(row.odom) for row in outcome.rerun.ledger.rows]
+    return list(outcome.rerun.ledger.odom())
 
 
 @pytest.fixture(scope="module")
