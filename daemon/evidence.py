@@ -19,6 +19,8 @@ OPENING_S: Final = 10.0
 """A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
 ODOMETRY_SILENT_S: Final = 1.0
 """Odometry that has not arrived for this long is silent."""
+GUESS_S: Final = 0.5
+"""A velocity carries the pose along an axis that nothing shows for this long; after that the pose is a guess there."""
 EARLY: Final = 0.01
 """Part of a scan period by which a timer may be early and still stand for the whole period."""
 
@@ -35,6 +37,8 @@ class Observer:
         self._t_odometry = t_mono
         self._P_complete: Array | None = None
         self._mapped = False
+        self._t_shown = [t_mono] * 3
+        self._guessed = [False] * 3
 
     def odometry_ok(self, t_mono: float) -> bool | None:
         """Whether odometry is arriving; None where none is configured."""
@@ -60,8 +64,10 @@ class Observer:
         for record in records:
             if isinstance(record, Odometry):
                 self.witnesses.on_odometry(record)
-        match = self._match(result)
         ordered = any(isinstance(record, Command) for record in records)
+        match = self._match(result)
+        if match is not None and result is not None:
+            match = self._without_guesses(match, result, t_mono, ordered)
         sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
         silence = self.silence(t_mono, period)
         late = self._t_scan is None and t_mono - self._t_start > OPENING_S
@@ -75,6 +81,7 @@ class Observer:
             sigma_rad=sigma_rad,
             odometry=self.odometry_ok(t_mono),
             agree=self.witnesses.agree(),
+            guessed=any(self._guessed),
             ordered=ordered,
         )
 
@@ -89,6 +96,24 @@ class Observer:
         match = Match(good(found), (x, y, yaw))
         self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(match.known))
         return match
+
+    def _without_guesses(self, match: Match, result: StepResult, t_mono: float, ordered: bool) -> Match:
+        """The match with the axes taken back along which the map itself was laid upon a guess.
+
+        Without odometry, along an axis that no match shows, the pose is only carried on by its last velocity. A
+        keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
+        is the place in the surroundings, not in the map. An order or a loop closure ends that.
+        """
+        if ordered or result.loop is not None:
+            self._guessed = [False] * 3
+            self._t_shown = [t_mono] * 3
+        for axis, known in enumerate(match.known):
+            if (match.good and known) or self.odometry_ok(t_mono):
+                self._t_shown[axis] = t_mono
+            elif result.keyframe >= 0 and t_mono - self._t_shown[axis] > GUESS_S:
+                self._guessed[axis] = True
+        x, y, yaw = (known and not guess for known, guess in zip(match.known, self._guessed, strict=True))
+        return Match(match.good, (x, y, yaw))
 
     def _sigma(
         self, match: Match | None, result: StepResult | None, ordered: bool, odometry: bool | None

@@ -23,8 +23,10 @@ RELOCATED_PROOF_S: Final = 5.0
 FAILED_SCANS: Final = 3
 """Matches in a row that may fail before it is said; one bad scan among people is no news."""
 AXIS_LOST_SCANS: Final = 3
+AXIS_LOST_S: Final = 0.3
 AXIS_FOUND_SCANS: Final = 5
-"""Scans in a row after which an axis changes between known and unknown."""
+"""Scans in a row, over at least this time, after which an axis changes between known and unknown: what moved in a
+tenth of a second is millimetres, and says nothing about the pose."""
 CLEAN_S: Final = 1.0
 """Every axis has to be known for this long before TRACKING is said (again)."""
 DISAGREE_S: Final = 1.0
@@ -113,6 +115,7 @@ class Evidence:
         match: of the scan of this cycle; None without a scan or before there is a map to match against.
         mapped: there is something to match against.
         sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained by motion that nothing has witnessed.
+        guessed: the map itself was laid upon a guess; the place in it stays one until something else tells it.
         odometry: whether it is arriving; None where none is configured.
         agree: whether wheels and laser told the same motion lately; None where that cannot be said.
         places: how many places fit while the place is looked for (0: none yet); None: not looking.
@@ -126,10 +129,15 @@ class Evidence:
     mapped: bool = False
     sigma_m: float = 0.0
     sigma_rad: float = 0.0
+    guessed: bool = False
     odometry: bool | None = None
     agree: bool | None = None
     places: int | None = None
     ordered: bool = False
+
+
+Streak = tuple[int, float]
+"""How many in a row, and when it began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +146,8 @@ class Memory:
 
     Attributes:
         good, good_since: good scans in a row and when the first of them was. failed: failed scans in a row.
-        good_last: when a match was last good. axes: per axis, scans in a row against what is shown.
+        good_last: when a match was last good.
+        axes: per axis, scans in a row that say otherwise than what is shown, and when the first of them did.
         known: the axes as shown. known_since: when the last of them became known.
         disagree_since: None while the witnesses do not disagree.
         doubt: the place itself has to be proved again, because nothing told the motion for a while.
@@ -151,7 +160,7 @@ class Memory:
     good_since: float = 0.0
     good_last: float | None = None
     failed: int = 0
-    axes: tuple[int, int, int] = (0, 0, 0)
+    axes: tuple[Streak, Streak, Streak] = ((0, 0.0), (0, 0.0), (0, 0.0))
     known: tuple[bool, bool, bool] = (False, False, False)
     known_since: float = 0.0
     disagree_since: float | None = None
@@ -184,6 +193,8 @@ def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     if not evidence.mapped:
         return State.MAPPING, Reason.UNPROVED
     if memory.lost and not _proved(memory, evidence):
+        if evidence.guessed:
+            return State.LOST, Reason.UNCERTAIN
         fits = memory.good >= AXIS_FOUND_SCANS
         return (State.RELOCATING, Reason.CONFIRMING) if fits else (State.LOST, Reason.NO_WITNESS)
     return _say_of_pose(memory, evidence)
@@ -198,7 +209,7 @@ def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
             return State.LOST, Reason.NO_WITNESS
         return State.DEGRADED, Reason.MATCH_FAILED
     if not all(memory.known) and (memory.good >= AXIS_FOUND_SCANS or memory.state in HELD):
-        return State.DEGRADED, Reason.AXIS_UNKNOWN
+        return State.DEGRADED, Reason.UNCERTAIN if evidence.guessed else Reason.AXIS_UNKNOWN
     if memory.disagree_since is not None and evidence.t_mono - memory.disagree_since >= DISAGREE_S:
         return State.DEGRADED, Reason.WITNESSES_DISAGREE
     if evidence.odometry is False:
@@ -246,7 +257,7 @@ def _take_failed(memory: Memory) -> Memory:
 
 
 def _take_good(memory: Memory, match: Match, now: float) -> Memory:
-    x, y, yaw = (_count(*axis) for axis in zip(memory.known, memory.axes, match.known, strict=True))
+    x, y, yaw = (_axis(*axis, now) for axis in zip(memory.known, memory.axes, match.known, strict=True))
     known = (x[0], y[0], yaw[0])
     return replace(
         memory,
@@ -260,9 +271,10 @@ def _take_good(memory: Memory, match: Match, now: float) -> Memory:
     )
 
 
-def _count(shown: bool, against: int, seen: bool) -> tuple[bool, int]:
-    """One axis' hysteresis: (shown, scans in a row that say otherwise)."""
+def _axis(shown: bool, streak: Streak, seen: bool, now: float) -> tuple[bool, Streak]:
+    """One axis' hysteresis: what is shown, and the streak of scans that say otherwise."""
     if seen == shown:
-        return shown, 0
-    limit = AXIS_FOUND_SCANS if seen else AXIS_LOST_SCANS
-    return (seen, 0) if against + 1 >= limit else (shown, against + 1)
+        return shown, (0, 0.0)
+    count, since = streak[0] + 1, streak[1] if streak[0] else now
+    changed = count >= AXIS_FOUND_SCANS if seen else count >= AXIS_LOST_SCANS and now - since >= AXIS_LOST_S
+    return (seen, (0, 0.0)) if changed else (shown, (count, since))

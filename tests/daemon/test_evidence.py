@@ -10,7 +10,7 @@ import pytest
 from daemon.evidence import ENOUGH_INLIERS, ODOMETRY_SILENT_S, OPENING_S, Observer, good
 from daemon.state import VAGUE_M, Evidence
 from estimator.records import Array, Command, Odometry, Order, Record
-from estimator.result import MatchResult, Reason, StepResult
+from estimator.result import Loop, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
 
 STREAMING = LidarStatus(link=Link.STREAMING)
@@ -111,6 +111,59 @@ def test_an_order_ends_the_doubt(order: Order) -> None:
     assert watch.see(step(match(), GUESS)).sigma_m > VAGUE_M
     evidence = watch.see(step(match(), GUESS), Command(watch.t, order))
     assert (evidence.ordered, evidence.sigma_m) == (True, 0.0)
+
+
+def after(watch: Watch, seconds: float, found: MatchResult, keyframes: bool) -> Evidence:
+    """Scans at 10 Hz, a keyframe with every second of them."""
+    for i in range(round(seconds * 10)):
+        laid = i if keyframes and i % 2 else -1
+        evidence = watch.see(replace(step(found), keyframe=laid))
+    return evidence
+
+
+def test_a_map_laid_along_an_axis_that_nothing_showed_is_a_guess_for_good() -> None:
+    watch = Watch()
+    after(watch, 1.0, match(), keyframes=True)
+    assert not after(watch, 0.4, match(known=(1, 0, 1)), keyframes=True).guessed, "a velocity carries that far"
+    assert after(watch, 2.0, match(known=(1, 0, 1)), keyframes=True).guessed
+    room = after(watch, 5.0, match(), keyframes=True)
+    assert room.guessed
+    assert room.match is not None
+    assert room.match.known == (True, False, True), "the scans fit, but the place in the map is not known"
+    ordered = watch.see(step(match()), Command(watch.t, Order.SET_POSE))
+    assert not ordered.guessed
+    assert ordered.match is not None
+    assert ordered.match.known == (True, True, True)
+
+
+def test_a_loop_closure_tells_the_place() -> None:
+    watch = Watch()
+    after(watch, 1.0, match(), keyframes=True)
+    assert after(watch, 2.0, match(known=(0, 0, 1)), keyframes=True).guessed
+    assert not watch.see(replace(step(match()), loop=Loop(1, 9, 2, 0.01))).guessed
+
+
+def test_no_keyframe_no_guess() -> None:
+    """A robot that stands in a corridor, or loses its lidar for a while, finds the map as it was."""
+    watch = Watch()
+    after(watch, 1.0, match(), keyframes=True)
+    after(watch, 20.0, match(known=(1, 0, 1)), keyframes=False)
+    room = watch.see(step(match()))
+    assert (room.guessed, room.match and room.match.known) == (False, (True, True, True))
+
+
+def test_failed_matches_that_lay_keyframes_are_a_guess_too() -> None:
+    watch = Watch()
+    after(watch, 1.0, match(), keyframes=True)
+    assert after(watch, 2.0, match(reason=Reason.TOO_FEW_PAIRS, known=(0, 0, 0)), keyframes=True).guessed
+
+
+def test_odometry_shows_the_motion_along_a_corridor() -> None:
+    watch = Watch(odometry=True)
+    for i in range(50):
+        watch.observer.on_odometry(watch.t)
+        evidence = watch.see(replace(step(match(known=(1, 0, 1))), keyframe=i))
+    assert not evidence.guessed
 
 
 def test_a_corridor_does_not_witness_the_motion() -> None:

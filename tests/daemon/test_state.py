@@ -134,15 +134,23 @@ def test_lost_stays_lost_through_a_silence() -> None:
 
 
 def test_an_unobservable_axis_degrades_and_is_named() -> None:
-    memory = run(tracking(), scans(3.0, rules.AXIS_LOST_SCANS - 1, CORRIDOR))
+    memory = run(tracking(), scans(3.0, 3, CORRIDOR))
     assert (memory.state, memory.known) == (State.TRACKING, ALL)
-    memory = judge(memory, seen(3.5, CORRIDOR))
+    memory = judge(memory, seen(3.31, CORRIDOR))
     assert said(memory) == (State.DEGRADED, Reason.AXIS_UNKNOWN)
     assert memory.known == (False, True, True)
     memory = run(memory, scans(4.0, 7))
     assert memory.known == ALL
     assert memory.state is State.DEGRADED
     assert run(memory, scans(4.7, 10)).state is State.TRACKING
+
+
+def test_a_blink_of_an_axis_is_no_news_whatever_the_scan_rate() -> None:
+    quick = [seen(3.0 + 0.025 * i, CORRIDOR) for i in range(11)]
+    assert run(tracking(), quick).known == ALL
+    assert run(tracking(), [*quick, seen(3.301, CORRIDOR)]).known == (False, True, True)
+    slow = [seen(3.0 + 0.5 * i, CORRIDOR) for i in range(2)]
+    assert run(tracking(), slow).known == ALL, "two scans could both be unlucky"
 
 
 def test_a_start_in_a_corridor_is_degraded_not_tracking() -> None:
@@ -166,6 +174,13 @@ def test_uncertainty_degrades_then_loses() -> None:
     vague = judge(tracking(), seen(3.0, sigma_m=1.1 * rules.VAGUE_M))
     assert said(vague) == (State.DEGRADED, Reason.UNCERTAIN)
     assert said(judge(vague, seen(3.1, sigma_rad=1.1 * rules.LOST_RAD))) == (State.LOST, Reason.UNCERTAIN)
+
+
+def test_a_guess_is_degraded_and_called_one_and_after_a_loss_it_is_lost() -> None:
+    memory = run(tracking(), scans(3.0, 30, CORRIDOR, guessed=True))
+    assert said(memory) == (State.DEGRADED, Reason.UNCERTAIN)
+    lost = run(tracking(), scans(3.0, 20, BAD))
+    assert said(run(lost, scans(5.0, 100, CORRIDOR, guessed=True))) == (State.LOST, Reason.UNCERTAIN)
 
 
 def test_looking_for_the_place() -> None:
@@ -199,6 +214,7 @@ evidences = st.lists(
         mapped=st.booleans(),
         sigma_m=st.sampled_from([0.0, 0.0, 0.2, 3.0]),
         sigma_rad=st.sampled_from([0.0, 0.0, 0.2, 3.0]),
+        guessed=st.booleans(),
         odometry=st.sampled_from([None, True, False]),
         agree=st.sampled_from([None, True, False]),
         places=st.sampled_from([None, None, None, 0, 1, 2]),
