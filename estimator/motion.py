@@ -19,6 +19,11 @@ from estimator.records import Array, Imu, Odometry
 LONGEST_CARRY_S = 0.5
 """Beyond this a velocity says nothing any more; the pose is held and the uncertainty grows instead."""
 
+UNSEEN = np.array((0.5, 0.5, 0.5))
+"""One-sigma speed (m/s, m/s, rad/s) of a robot that nobody watches: it may be pushed, or go on at walking pace."""
+LARGEST_TURN = math.pi
+"""No heading is less certain than one that may be any."""
+
 GYRO_RAD = 5e-4
 """Error of a gyro reading's turn: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
 
@@ -141,9 +146,12 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
     if not dt > 0.0:
         return
     if math.isfinite(dt):
-        dt = min(dt, LONGEST_CARRY_S)
+        unseen, dt = max(0.0, dt - LONGEST_CARRY_S), min(dt, LONGEST_CARRY_S)
         delta = se2.exp(motion.velocity * dt)
         variance = (motion.velocity_variance + np.array(noise.acceleration_variance()) * (dt * dt)) * (dt * dt)
+        if unseen > 0.0:
+            variance = variance + (UNSEEN * unseen) ** 2
+            variance[2] = min(float(variance[2]), LARGEST_TURN**2)
         move(motion, delta, variance)
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono

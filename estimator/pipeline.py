@@ -91,7 +91,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         T_map_odom=state.T_map_odom,
         covariance=covariance(state),
         velocity=moving.velocity.copy(),
-        known_axes=np.ones(3) if match is None else match.known_axes,
+        known_axes=np.ones(3) if match is None else known_in_map(state, match),
         match=match,
         keyframe=keyframe,
         loop=None,
@@ -99,6 +99,14 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         T_anchor_base=se2.between(state.T_odom_anchor, moving.T_odom_base),
         jumps=state.jumps,
     )
+
+
+def known_in_map(state: State, match: MatchResult) -> Array:
+    """The axes a match knows, in the map frame: a corridor along x of the odom frame may run along y of the map."""
+    if not match.ok:
+        return match.known_axes
+    R = se2.rotation(state.T_map_odom[2])
+    return matching.known_axes(R @ match.information @ R.T)
 
 
 def keyframe_poses(state: State) -> dict[int, Array]:
