@@ -5,9 +5,12 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.dev-stamp
+PEERS  := $(VENV)/.bench-stamp
 RUN    := $(BIN)/python -W default
 
 .DEFAULT_GOAL := help
+
+
 .PHONY: help venv demo test test-system test-all check bench lock docs clean
 
 help:  ## list the targets
@@ -44,12 +47,16 @@ test-all: check  ## all of it, the long ones included
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m nojit tests/estimator
 	$(BIN)/python -m tools.floors
 
-bench: venv requirements/bench.lock  ## figures as a table and as out/bench/*.json, ratios against peers in the same run
+$(PEERS): $(STAMP) requirements/bench.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
+	@touch $@
+
+bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against peers in the same run
 	$(RUN) -m tools.bench $(ARGS)
 
 docs: venv  ## regenerate the documents that come from code
-	$(RUN) -m tools.docs
+	$(RUN) -m daemon.publish.document docs
+	$(RUN) -m daemon --reference > docs/configuration.md
 
 lock:  ## renew the lock files (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade pyproject.toml -o requirements/core.lock
