@@ -36,7 +36,7 @@ check: venv  ## formatting, lint, strict types
 
 test: check  ## everything quick (no root, <= 12 minutes)
 	$(BIN)/python -m coverage run -m pytest -q -m "not system and not slow" $(ARGS)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m nojit tests/estimator
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m "not jit and not slow" tests/estimator
 	$(BIN)/python -m tools.floors
 
 test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)
@@ -44,7 +44,7 @@ test-system: venv  ## real processes, real ttys, real time, fault and fuzz sampl
 
 test-all: check  ## all of it, the long ones included
 	$(BIN)/python -m coverage run -m pytest -q $(ARGS)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m nojit tests/estimator
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m "not jit and not slow" tests/estimator
 	$(BIN)/python -m tools.floors
 
 $(PEERS): $(STAMP) requirements/bench.lock
