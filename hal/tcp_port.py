@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import os
 import socket
@@ -136,7 +135,5 @@ def _explain(device: str, host: str, error: OSError) -> HalError:
         return DeviceMissing(device, f"host name {host} is not known", "name the sensor by its IP address")
     if error.errno == errno.ECONNREFUSED:
         return DeviceRefused(device, "connection refused", "a sensor serves one client: stop the other, check the port")
-    reason = str(error)
-    with contextlib.suppress(TypeError, ValueError):
-        reason = os.strerror(int(error.errno or 0)) if error.errno else reason
+    reason = os.strerror(error.errno) if error.errno else str(error)
     return DeviceMissing(device, reason, "check power, cable, address and this host's netmask")

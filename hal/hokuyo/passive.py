@@ -1,6 +1,7 @@
 """A listener that never speaks: scans from received bytes alone, for recorded captures.
 
-It runs the same splitter, codec and clock code as the live driver.
+It runs the same splitter, codec and clock code as the live driver, and gives scans the same times where it is told the
+port's name and line rate.
 """
 
 from __future__ import annotations
@@ -85,6 +86,8 @@ class PassiveHokuyo:
     def _scan(self, reply: Reply, t_rx: float) -> RawScan | None:
         single = reply.echo[:1] in b"GH"
         if reply.status != (ACCEPTED if single else DATA):
+            if reply.status == ACCEPTED:
+                self._stream = None  # a stream begins, and the driver knew nothing of older ones either
             return None  # acknowledgement, refusal, or the sensor checking itself
         if self._identity is None:
             self._seq += 1

@@ -68,7 +68,9 @@ def test_bytes_both_ways_and_hang_up(pty: Pty) -> None:
         pty.close()  # unplug
         await until(lambda: lost)
         await asyncio.sleep(0.05)
-        assert [type(error) for error in lost] == [DeviceMissing]  # once, and no spinning
+        assert [type(error) for error in lost] == [DeviceMissing]
+        assert isinstance(port, SerialPort)
+        assert not asyncio.get_running_loop().remove_reader(port._fd)  # a line that hung up is readable for ever
         assert lost[0].device == port.name
         assert lost[0].remedy
         with pytest.raises(DeviceMissing):

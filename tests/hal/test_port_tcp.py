@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 
 import pytest
@@ -103,3 +104,26 @@ def test_names(name: str, parsed: tuple[str, int]) -> None:
 def test_bad_names(name: str) -> None:
     with pytest.raises(DeviceRefused, match=r"expected tcp://host"):
         parse_tcp_name(name)
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "words"),
+    [
+        (socket.gaierror(-2, "Name or service not known"), DeviceMissing, "host name lidar is not known"),
+        (OSError(errno.EHOSTUNREACH, "Connect call failed"), DeviceMissing, "No route to host (check power"),
+        (OSError("Multiple exceptions: a, b"), DeviceMissing, "Multiple exceptions: a, b"),
+        (OSError(errno.ECONNREFUSED, "Connect call failed"), DeviceRefused, "a sensor serves one client"),
+    ],
+)
+def test_connect_errors(error: OSError, kind: type[HalError], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body() -> None:
+        async def fails(*args: object, **kwargs: object) -> None:
+            raise error
+
+        monkeypatch.setattr(asyncio.get_running_loop(), "create_connection", fails)
+        with pytest.raises(kind) as caught:
+            await open_port("tcp://lidar", 0)
+        assert words in str(caught.value)
+        assert caught.value.device == "tcp://lidar"
+
+    asyncio.run(body())

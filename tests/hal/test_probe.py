@@ -49,6 +49,7 @@ def test_who_is_where() -> None:
     assert (b.geometry.serial, b.baud) == ("H2", 115200)
     assert isinstance(c.error, DeviceFault)
     assert "nothing answers" in str(c)
+    assert str(Finding("/dev/x")) == "/dev/x: nothing known"
     assert isinstance(d.error, DeviceMissing)
 
 
@@ -72,6 +73,20 @@ def test_candidates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     (dev / "lumiloop" / "lidar").symlink_to(dev / "ttyACM1")
     assert discover.candidates()[0] == str(dev / "lumiloop" / "lidar")
+
+
+def test_usb_vendor_is_found_above_the_interface(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As sysfs has it: the tty's device is the interface, the vendor stands at the USB device above it."""
+    interface = tmp_path / "devices" / "usb1" / "1-1" / "1-1:1.0"
+    interface.mkdir(parents=True)
+    (interface.parent / "idVendor").write_text("15D1\n")
+    (tmp_path / "ttyACM0").mkdir()
+    (tmp_path / "ttyACM0" / "device").symlink_to(interface)
+    (tmp_path / "ttyS0" / "device" / "a" / "b").mkdir(parents=True)
+    monkeypatch.setattr(discover, "_SYS_TTY", tmp_path)
+    assert discover.usb_vendor("ttyACM0") == "15d1"
+    assert discover.usb_vendor("ttyS0") == ""
+    assert discover.usb_vendor("ttyACM1") == ""
 
 
 def test_nothing_plugged_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

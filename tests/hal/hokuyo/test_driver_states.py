@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hal.errors import DeviceRefused
 from hal.fake.answers import State
 from hal.fake.models import MODELS, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.lidar import VALID, Link
+from hal.port import Port
 from tests.hal.hokuyo.bench import Bench, on_bench, on_fake
 
 BY_HAND = {
@@ -146,5 +148,60 @@ def test_a_slow_line_gets_what_it_can_carry(baud: int, beams: int, period: float
         assert np.allclose(np.diff([scan.t_mono for scan in scans[5:]]), period, rtol=0.01)
         assert bench.fake is not None
         assert bench.fake.counts.lost_in_sensor == 0
+
+    on_fake(body, MODELS["URG-04LX"], device="/dev/ttyUSB7")
+
+
+def test_an_adapter_that_cannot_do_the_rate_wanted() -> None:
+    """The next lower rate both sides can do, and clusters that fit it."""
+
+    async def body(bench: Bench) -> None:
+        real = bench.opener
+
+        async def opener(device: str, baud: int) -> Port:
+            port = await real(device, baud)
+            plain = port.set_baud
+
+            def limited(rate: int) -> None:
+                if rate > 115200:
+                    raise DeviceRefused(device, f"cannot do {rate} bit/s", "choose another line rate")
+                plain(rate)
+
+            port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
+            return port
+
+        bench.opener = opener
+        driver = bench.driver()
+        scans = await bench.deliver(driver, 20, within=20.0)
+        assert driver.status.extra["baud"] == "115200"
+        assert len(scans[0].ranges) == 341
+        assert driver.status.missed == 0
+
+    on_fake(body, MODELS["URG-04LX"], device="/dev/ttyUSB7")
+
+
+def test_a_rate_at_which_the_sensor_is_lost_is_not_tried_again() -> None:
+    """The cable is too bad for 250 kbit/s: the sensor accepts and cannot be understood there."""
+
+    async def body(bench: Bench) -> None:
+        assert bench.fake is not None
+        fake, tries = bench.fake, 0
+        send = fake.receive
+
+        def receive(data: bytes) -> None:
+            nonlocal tries
+            if b"SS250000" in data:
+                tries += 1
+            if fake.baud == 250000:
+                if b"QT" not in data:
+                    return
+                data = b"RS\n" + data  # stands for a person who power-cycles it
+            send(data)
+
+        fake.receive = receive  # type: ignore[method-assign]  # a bad cable
+        driver = bench.driver()
+        await bench.deliver(driver, 20, within=60.0)
+        assert tries == 1
+        assert driver.status.extra["baud"] == "115200"
 
     on_fake(body, MODELS["URG-04LX"], device="/dev/ttyUSB7")
