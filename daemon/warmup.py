@@ -143,4 +143,6 @@ def _progress_line(seconds: float) -> str:
         return ""
     since = time.time() - seconds
     count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
+    if count == 0:
+        return f"still loading the estimator after {seconds:.0f} s"
     return f"compiling: {count} of {kernel_count()} kernels after {seconds:.0f} s"

@@ -25,6 +25,7 @@ from daemon.publish.snapshot import State
 ROOT = Path(__file__).parents[2]
 START_S = 1.5
 RESIDENT_MB = 260.0
+PATIENCE_S = 60.0
 
 pytestmark = pytest.mark.realtime
 
@@ -113,7 +114,7 @@ def test_a_lidar_in_a_pose_out(tmp_path: Path) -> None:
         daemon.until(4 * START_S, "state", State.MAPPING)
         took = time.monotonic() - daemon.begun
         assert took < 4 * START_S, f"first pose after {took:.2f} s"
-        tracking = daemon.until(20.0, "state", State.TRACKING)
+        tracking = daemon.until(PATIENCE_S, "state", State.TRACKING)
         time.sleep(2.0)
         while daemon.reading()["t_mono"] < tracking["t_mono"] + 2.0:  # type: ignore[operator]  # known in TRACKING
             pass
@@ -153,7 +154,7 @@ def test_no_lidar_and_a_taken_port_are_said_and_waited_for(tmp_path: Path) -> No
             assert daemon.until(10.0, "fault", 101, 401)["map_x"] is None
             taken.close()
             with fake_lidar(link):
-                daemon.until(20.0, "state", State.TRACKING)
+                daemon.until(PATIENCE_S, "state", State.TRACKING)
                 code, log, _ = daemon.stop()
     assert code == 0
     assert f"{link}: " in log
@@ -181,7 +182,7 @@ def test_a_wrong_configuration_is_refused_at_once(tmp_path: Path) -> None:
 def test_a_recording_is_made_beside(tmp_path: Path) -> None:
     link, folder = tmp_path / "lidar", tmp_path / "drive"
     with fake_lidar(link), running(link, "--record", str(folder)) as daemon:
-        daemon.until(20.0, "state", State.TRACKING)
+        daemon.until(PATIENCE_S, "state", State.TRACKING)
         code, log, _ = daemon.stop()
         assert code == 0, log
     out = tmp_path / "out"

@@ -51,7 +51,7 @@ def test_the_loop_goes_on_while_the_estimator_is_loaded(monkeypatch: pytest.Monk
         return await warming
 
     assert asyncio.run(asyncio.wait_for(go(), 10.0)).compiled
-    assert f"of {kernel_count()} kernels after" in lines[0]
+    assert lines[0].startswith("still loading the estimator after")
     assert lines[-1].startswith("kernels compiled in 12 s")
 
 
@@ -125,6 +125,16 @@ def test_a_start_loads_nothing_it_does_not_use() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_progress_counts_what_was_compiled_since_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    old = tmp_path / "old.nbc"
+    old.touch()
+    os.utime(old, (time.time() - 1000.0,) * 2)
+    assert warmup._progress_line(10.0) == "still loading the estimator after 10 s"
+    (tmp_path / "new.nbc").touch()
+    assert warmup._progress_line(10.0) == f"compiling: 1 of {kernel_count()} kernels after 10 s"
 
 
 def test_there_are_kernels_to_count() -> None:
