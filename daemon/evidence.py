@@ -37,6 +37,7 @@ class Observer:
         self._t_odometry = t_mono
         self._P_complete: Array | None = None
         self._mapped = False
+        self._unreachable = False
         self._t_shown = [t_mono] * 3
         self._guessed = [False] * 3
 
@@ -51,6 +52,7 @@ class Observer:
     def on_scan(self, t_rx: float) -> None:
         """A valid scan has arrived."""
         self._t_scan = t_rx
+        self._unreachable = False
 
     def on_odometry(self, t_rx: float) -> None:
         """A valid odometry reading has arrived."""
@@ -71,10 +73,11 @@ class Observer:
         sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
         silence = self.silence(t_mono, period)
         late = self._t_scan is None and t_mono - self._t_start > OPENING_S
+        self._unreachable |= status.link is Link.WAITING or late  # until a scan: an attempt more is no news
         return Evidence(
             t_mono=t_mono,
             silence=None if silence is None else silence + EARLY * SILENT_PERIODS,
-            unreachable=status.link is Link.WAITING or late,
+            unreachable=self._unreachable,
             match=match,
             mapped=self._mapped,
             sigma_m=sigma_m,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from daemon import replay
-from daemon.results import Folder, write_map
+from daemon.results import Folder, map_files
 
 
 def main(args: argparse.Namespace) -> int:
@@ -14,4 +14,4 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _write(folder: Folder, outcome: replay.Outcome) -> None:
-    write_map(folder, outcome.rerun.render(), outcome.rerun.ledger.final().poses)
+    folder.write_each(map_files(outcome.rerun.render(), outcome.rerun.ledger.final().poses))

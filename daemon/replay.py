@@ -22,7 +22,7 @@ from daemon import cli
 from daemon.config import Config, Mount
 from daemon.ledger import Ledger
 from daemon.rerun import Rerun
-from daemon.results import Folder, OutputRefused, tum, write_map
+from daemon.results import Folder, OutputRefused, map_files, tum
 from daemon.sources import Source, open_log, sha256_of
 from daemon.versions import versions
 from estimator.grid import Grid
@@ -170,18 +170,22 @@ def _verdict(outcome: Outcome) -> int:
 
 
 def _write_all(folder: Folder, outcome: Outcome) -> None:
-    """Every result; each file is written whole or not at all."""
+    """Every result that there is room for; each file is written whole or not at all."""
     begun = time.perf_counter()
     ledger = outcome.rerun.ledger
-    final = ledger.final()
-    folder.write("trajectory.tum", tum(final))
-    folder.write("online.tum", tum(ledger.online()))
-    folder.write("loops.csv", _loops(ledger))
-    grid = outcome.rerun.render()
-    write_map(folder, grid, final.poses)
-    folder.write("summary.json", _json(summary(outcome, grid)))
-    outcome.seconds["write"] = time.perf_counter() - begun
-    folder.write("timing.json", _json(timing(outcome)))
+    final, grid = ledger.final(), outcome.rerun.render()
+    files = [
+        ("trajectory.tum", tum(final)),
+        ("online.tum", tum(ledger.online())),
+        ("loops.csv", _loops(ledger)),
+        *map_files(grid, final.poses),
+        ("summary.json", _json(summary(outcome, grid))),
+    ]
+    try:
+        folder.write_each(files)
+    finally:
+        outcome.seconds["write"] = time.perf_counter() - begun
+        folder.write("timing.json", _json(timing(outcome)))
 
 
 def _loops(ledger: Ledger) -> bytes:

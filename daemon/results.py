@@ -6,6 +6,7 @@ Each file appears whole or not at all: it is written beside its place and moved 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -75,6 +76,23 @@ class Folder:
                 beside.unlink(missing_ok=True)
             raise OutputRefused(f"cannot write {final}: {error.strerror}; free space or name another folder") from error
 
+    def write_each(self, files: Iterable[tuple[str, bytes]]) -> None:
+        """Put files in place by name; one that cannot be written keeps none of the others away.
+
+        Raises:
+            OutputRefused: for the first that was refused, after all were tried; names the others.
+        """
+        refused: list[tuple[str, OutputRefused]] = []
+        for name, data in files:
+            try:
+                self.write(name, data)
+            except OutputRefused as error:
+                refused.append((name, error))
+        if refused:
+            others = ", ".join(name for name, _ in refused[1:])
+            first = refused[0][1]
+            raise OutputRefused(f"{first}; nor could {others} be written" if others else str(first)) from first
+
 
 def tum(trajectory: Trajectory) -> bytes:
     """TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp (equal stamps in their given order)."""
@@ -119,8 +137,10 @@ def map_yaml(grid: Grid, image: str) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def write_map(folder: Folder, grid: Grid, path: Array) -> None:
-    """Write map.pgm, map.yaml and map.png (with ``path``, positions (n, 2 or more) in m); raises `OutputRefused`."""
-    folder.write("map.pgm", pgm(grid))
-    folder.write("map.yaml", map_yaml(grid, "map.pgm"))
-    folder.write("map.png", encode_png(draw(grid, path)))
+def map_files(grid: Grid, path: Array) -> list[tuple[str, bytes]]:
+    """map.pgm, map.yaml and map.png (with ``path``, positions (n, 2 or more) in m) by name."""
+    return [
+        ("map.pgm", pgm(grid)),
+        ("map.yaml", map_yaml(grid, "map.pgm")),
+        ("map.png", encode_png(draw(grid, path))),
+    ]

@@ -111,7 +111,7 @@ class Evidence:
     Attributes:
         t_mono: now.
         silence: scan periods since the last valid scan; None before the first.
-        unreachable: the driver is backing off and says why.
+        unreachable: the driver has backed off, and said why, since the last valid scan.
         match: of the scan of this cycle; None without a scan or before there is a map to match against.
         mapped: there is something to match against.
         sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained by motion that nothing has witnessed.

@@ -149,10 +149,8 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
         unseen, dt = max(0.0, dt - LONGEST_CARRY_S), min(dt, LONGEST_CARRY_S)
         delta = se2.exp(motion.velocity * dt)
         variance = (motion.velocity_variance + np.array(noise.acceleration_variance()) * (dt * dt)) * (dt * dt)
-        if unseen > 0.0:
-            variance = variance + (UNSEEN * unseen) ** 2
-            variance[2] = min(float(variance[2]), LARGEST_TURN**2)
         move(motion, delta, variance)
+        motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono
 

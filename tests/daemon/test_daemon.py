@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -208,6 +209,28 @@ def test_a_lidar_that_vanishes_and_returns(caplog: pytest.LogCaptureFixture) -> 
     assert len(lost) == 2, "unplugged; no such device: once each"
     assert all(DEVICE in line for line in lost)
     assert sum("delivers again" in r.message for r in caplog.records) == 1
+
+
+@pytest.mark.parametrize("after_s", [0.0, 6.0])
+def test_a_lidar_that_never_answers_does_not_make_the_state_flicker(
+    after_s: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+
+    async def scenario(bench: Bench) -> None:
+        await asyncio.sleep(after_s)
+        bench.faults.load('[[fault]]\nwhat = "silence"\nwhen = 0.0\nfor = 125.0\n')
+        since = len(bench.snapshots)
+        await asyncio.sleep(120.0)
+        said = [(snapshot.state, snapshot.reason) for snapshot in bench.snapshots[since:]]
+        news = [after for before, after in pairwise(said) if before != after]
+        assert len(news) <= 3
+        assert said[-1] == (State.NO_LIDAR, Reason.LIDAR_UNREACHABLE)
+        await asyncio.sleep(20.0)
+        assert bench.last.lidar_ok, "and it has not given up"
+
+    run_daemon(scenario)
+    assert sum("NO_LIDAR" in record.message for record in caplog.records) <= 2
 
 
 def test_a_gap_that_nothing_bridged_is_not_called_tracking_unless_it_is_right() -> None:

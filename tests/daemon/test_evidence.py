@@ -200,6 +200,7 @@ def test_a_lidar_is_unreachable_when_its_driver_says_so_or_takes_too_long() -> N
     opening, waiting = LidarStatus(link=Link.OPENING), LidarStatus(link=Link.WAITING)
     assert not observer.evidence(1.0, 0.1, opening, (), None).unreachable
     assert observer.evidence(1.0, 0.1, waiting, (), None).unreachable
+    assert observer.evidence(1.1, 0.1, opening, (), None).unreachable, "trying again is no news, a scan would be"
     assert observer.evidence(OPENING_S + 1.0, 0.1, opening, (), None).unreachable
     observer.on_scan(12.0)
     late = observer.evidence(12.31, 0.1, opening, (), None)

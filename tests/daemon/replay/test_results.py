@@ -12,7 +12,7 @@ import yaml
 from PIL import Image
 
 from daemon.png import encode_png
-from daemon.results import FREE, OCCUPIED, Folder, OutputRefused, Trajectory, greys, map_yaml, pgm, tum, write_map
+from daemon.results import FREE, OCCUPIED, Folder, OutputRefused, Trajectory, greys, map_files, map_yaml, pgm, tum
 from estimator.grid import Grid
 
 LOGITS = np.array([[4.0, 0.0, -4.0], [-1.4, -1.42, 0.61], [0.63, 10.0, -10.0]], dtype=np.float32)
@@ -39,7 +39,7 @@ def load_like_map_server(folder: Path) -> tuple[np.ndarray, dict[str, object]]:
 
 
 def test_map_server_reads_back_what_the_grid_says(tmp_path: Path) -> None:
-    write_map(Folder(tmp_path / "out"), GRID, np.zeros((0, 2)))
+    Folder(tmp_path / "out").write_each(map_files(GRID, np.zeros((0, 2))))
     cells, facts = load_like_map_server(tmp_path / "out")
     p = GRID.probability
     assert np.array_equal(cells == 100, p > OCCUPIED)
@@ -56,7 +56,7 @@ def test_unknown_stays_unknown_under_the_rule_of_the_readers() -> None:
 
 def test_an_empty_map_is_still_a_map(tmp_path: Path) -> None:
     empty = Grid(np.zeros(2), 0.05, np.zeros((0, 0), np.float32))
-    write_map(Folder(tmp_path), empty, np.zeros((0, 3)))
+    Folder(tmp_path).write_each(map_files(empty, np.zeros((0, 3))))
     cells, _ = load_like_map_server(tmp_path)
     assert cells.tolist() == [[-1]]
     Image.open(tmp_path / "map.png").verify()
@@ -78,7 +78,8 @@ def test_the_picture_shows_walls_free_space_and_the_path(tmp_path: Path) -> None
     logits = np.full((40, 60), -8.0, np.float32)
     logits[:, :20] = 0.0
     logits[0] = 8.0
-    write_map(Folder(tmp_path), Grid(np.array([0.0, 0.0]), 0.1, logits), np.array([(2.5, 1.0), (5.5, 1.0), (5.5, 3.5)]))
+    grid = Grid(np.array([0.0, 0.0]), 0.1, logits)
+    Folder(tmp_path).write_each(map_files(grid, np.array([(2.5, 1.0), (5.5, 1.0), (5.5, 3.5)])))
     picture = np.array(Image.open(tmp_path / "map.png")).astype(int)
     scale = picture.shape[1] // 60
     assert picture.shape == (40 * scale, 60 * scale, 3)
@@ -131,6 +132,24 @@ def test_a_full_disk_keeps_what_was_there(tmp_path: Path, monkeypatch: pytest.Mo
         folder.write("a.txt", b"second")
     assert (tmp_path / "a.txt").read_text() == "first"
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt"]
+
+
+def test_what_has_room_is_written_though_something_else_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = Path.write_bytes
+
+    def nearly_full(self: Path, data: bytes) -> int:
+        if len(data) > 100:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(self, data)
+
+    folder = Folder(tmp_path)
+    monkeypatch.setattr(Path, "write_bytes", nearly_full)
+    files = [("big", bytes(101)), ("small", b"kept"), ("huge", bytes(999)), ("last", b"kept too")]
+    with pytest.raises(OutputRefused, match=r"big: No space left on device.*; nor could huge be written"):
+        folder.write_each(files)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["last", "small"]
 
 
 def test_pgm_head() -> None:
