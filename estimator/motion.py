@@ -26,6 +26,8 @@ LARGEST_TURN = math.pi
 
 GYRO_RAD = 5e-4
 """Error of a gyro reading's turn: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
+GYRO_GATE = 5.0
+"""Deviations beyond which a gyro is not believed: wrong units, or damaged. No robot gains speed like that."""
 
 DOUBT_LEARNING, SURPRISE_CAP, DOUBT_CAP = 0.03, 10.0, 100.0
 
@@ -63,7 +65,7 @@ class Motion:
         t_mono: instant the pose is true for. T_odom_base: the pose.
         P: 3x3 covariance of the pose relative to the local map (odom-aligned axes).
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
-        t_felt: instant up to which the velocity's variance has grown.
+        t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
         ahead: motion already applied beyond the last odometry. odometry: whether any has arrived.
         doubt: factor on the noise's variance, learned.
     """
@@ -74,6 +76,7 @@ class Motion:
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     velocity_variance: Array = field(default_factory=lambda: np.ones(3))
     t_felt: float = -math.inf
+    t_gyro: float = -math.inf
     ahead: Array = field(default_factory=se2.identity)
     odometry: bool = False
     doubt: float = 1.0
@@ -130,13 +133,22 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
 
 
 def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
-    """Turn by what the gyro says over its interval, move on at the velocity; odometry replaces the motion later."""
+    """Turn by what the gyro says over its interval, move on at the velocity; odometry replaces the motion later.
+
+    A rate that the turn rate known so far cannot have become meanwhile is passed over: taken for certain, it would
+    carry the pose to where no scan fits, and the map would be begun anew there.
+    """
     dt = record.t_end - record.t_begin
     if not (0.0 < dt < LONGEST_CARRY_S and math.isfinite(record.dyaw)):
         return
     carry_to(motion, record.t_begin, noise)
-    motion.velocity = np.array((motion.velocity[0], motion.velocity[1], record.dyaw / dt))
-    motion.velocity_variance[2] = (GYRO_RAD / dt) ** 2
+    rate, variance = record.dyaw / dt, (GYRO_RAD / dt) ** 2
+    late = min(max(0.0, record.t_end - max(motion.t_felt, motion.t_gyro)), LONGEST_CARRY_S)
+    expected = float(motion.velocity_variance[2]) + (noise.angular_acceleration * late) ** 2 + variance
+    if (rate - float(motion.velocity[2])) ** 2 <= GYRO_GATE**2 * expected:
+        motion.velocity = np.array((motion.velocity[0], motion.velocity[1], rate))
+        motion.velocity_variance[2] = variance
+        motion.t_gyro = record.t_end
     carry_to(motion, record.t_end, noise)
 
 

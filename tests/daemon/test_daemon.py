@@ -28,6 +28,7 @@ from hal.fake.models import URG_04LX_UG01, LidarModel, Unit
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
+from hal.imu import RawImu
 from hal.odometry import RawOdometry
 
 DEVICE = "/dev/ttyACM0"
@@ -209,6 +210,27 @@ def test_a_lidar_that_vanishes_and_returns(caplog: pytest.LogCaptureFixture) -> 
     assert len(lost) == 2, "unplugged; no such device: once each"
     assert all(DEVICE in line for line in lost)
     assert sum("delivers again" in r.message for r in caplog.records) == 1
+
+
+@pytest.mark.parametrize("odometry", [False, True])
+def test_a_gyro_in_degrees_does_not_mislead(odometry: bool) -> None:
+    async def scenario(bench: Bench) -> None:
+        first = await bench.until(State.MAPPING, 3.0)
+        wheels = asyncio.create_task(bench.send_odometry(60.0)) if odometry else None
+        since = len(bench.snapshots)
+        for _ in range(2000):
+            t = bench.loop.time()
+            before, now = bench.room.pose(np.array([t - 1e-3, t]))
+            rate = math.degrees(se2.between(before, now)[2]) / 1e-3
+            bench.daemon.cycle.inbox.put_imu(RawImu(t, t, rate))
+            await asyncio.sleep(0.01)
+        if wheels is not None:
+            wheels.cancel()
+        tracked = [snapshot for snapshot in bench.snapshots[since:] if snapshot.state is State.TRACKING]
+        assert len(tracked) > 100
+        assert max(bench.off(snapshot, first)[0] for snapshot in tracked) < 0.1
+
+    run_daemon(scenario)
 
 
 @pytest.mark.parametrize("after_s", [0.0, 6.0])
