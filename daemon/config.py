@@ -134,9 +134,6 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         str,
         Meta(description="address of this machine the servers listen on; 0.0.0.0: reachable from every network"),
     ] = "127.0.0.1"
-    state_dir: Annotated[
-        str, Meta(description="directory for what must survive a restart; empty: the service manager's, or none")
-    ] = ""
     lidar: LidarConfig = LidarConfig()
     odometry: OdometryConfig = OdometryConfig()
     cycle: CycleConfig = CycleConfig()

@@ -92,7 +92,7 @@ def write_config(folder: Path, modbus: int, odometry: int) -> Path:
     """The daemon's configuration for this run."""
     path = folder / CONFIG
     path.write_text(
-        f'name = "demo"\nbind = "127.0.0.1"\nstate_dir = "{folder / "state"}"\n\n'
+        f'name = "demo"\nbind = "127.0.0.1"\n\n'
         f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
         f"[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\n"
     )

@@ -118,7 +118,6 @@ configs = st.builds(
     Config,
     name=st.from_regex(r"\A[A-Za-z0-9_.-]{1,32}\Z"),
     bind=st.sampled_from(["127.0.0.1", "0.0.0.0", "::1"]),
-    state_dir=st.text(st.characters(blacklist_categories=["Cs"])),
     lidar=st.builds(
         LidarConfig,
         device=st.text(st.characters(blacklist_categories=["Cs"]), min_size=1),
