@@ -138,8 +138,8 @@ def nearest_on_axis(
 ) -> tuple[int, float, float]:
     """Walk the axis of rows [low, high) from the query's distance to both ends.
 
-    ``best`` is (r_q, row, d2, e2): the query's own distance, the best row so far, its squared distance, and a bound that
-    no other row comes closer than. Returns the last three, brought up to date.
+    ``best`` is (r_q, row, d2, e2): the query's own distance, the best row so far, its squared distance, and a bound
+    that no other row comes closer than. Returns the last three, brought up to date.
     """
     rq, row, d2, e2 = best
     a, b = low, high

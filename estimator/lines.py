@@ -108,8 +108,8 @@ def measure_runs(lines: Array, count: int) -> None:
 def fit_lines(xy: Array, eye: Array, sigma: float, lines: Array) -> int:
     """A line through the surroundings of each point, left out where they are none; the number found.
 
-    A row of ``lines`` is the point moved onto its surface (x, y), the normal towards the ``eye`` (x, y), the variance of
-    the normal's direction in rad^2, and the extent of the unbroken run it belongs to in m.
+    A row of ``lines`` is the point moved onto its surface (x, y), the normal towards the ``eye`` (x, y), the variance
+    of the normal's direction in rad^2, and the extent of the unbroken run it belongs to in m.
     """
     found = 0
     for i in range(len(xy)):

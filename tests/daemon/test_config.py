@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from pathlib import Path
 
@@ -29,6 +30,15 @@ def test_few_options_and_each_one_described() -> None:
     options = configfile.options()
     assert 10 <= len(options) <= 25
     assert [option.path for option in options if not option.description] == []
+
+
+def test_each_option_is_read_by_somebody() -> None:
+    read: set[str] = set()
+    for path in (ROOT / "daemon").rglob("*.py"):
+        if path.name not in ("config.py", "configfile.py"):
+            read |= {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
+    unread = [option.path for option in configfile.options() if option.path.rpartition(".")[2] not in read]
+    assert unread == [], "an option that does nothing is a lie"
 
 
 def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
