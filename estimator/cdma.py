@@ -1,0 +1,173 @@
+"""The light decoder: ADC words in, lamp IDs and received strengths out.
+
+Use::
+
+    decoder = new_decoder(PROFILE_A, clock_ppm=stored)   # None: the sample clock is not known yet
+    epoch = decode(decoder, block)                       # once per block
+    search(decoder, codes=129)                           # once per cycle, as much as the cycle can afford
+
+`decode` follows the lamps that are known; `search` looks for others in slices. Neither reads a clock.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma_block import Sampled
+from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch, LinkFlag, SampleBlock
+from estimator.cdma_follow import SPURIOUS, Decoder, follow
+from estimator.cdma_profile import Profile
+from estimator.cdma_search import BIN, Found, Job
+from estimator.cdma_track import UNTRIED
+
+Array = npt.NDArray[np.float64]
+
+LONGEST: Final = 10
+"""Code periods: no block may be longer."""
+
+CLIP_SHARE: Final = 0.2
+"""Of a block at the rails, beyond which what is left says nothing."""
+
+STORED_PPM: Final = 200.0
+"""A stored sample clock is good to this."""
+
+FULL_ROUND: Final = 8
+"""Sweeps without a confirmed lamp until all sample clocks are tried."""
+
+
+def new_decoder(profile: Profile, clock_ppm: float | None = None) -> Decoder:
+    """A decoder that knows no lamps yet.
+
+    Args:
+        profile: air interface and front end.
+        clock_ppm: stored error of the sample clock, good to 200 ppm; None: search the whole range of the profile.
+
+    Raises:
+        ValueError: a stored clock outside the profile's range.
+    """
+    if clock_ppm is not None and not abs(clock_ppm) <= profile.clock_ppm + STORED_PPM:
+        raise ValueError(f"clock_ppm = {clock_ppm} is outside +-{profile.clock_ppm:g}: delete the stored value")
+    return Decoder(profile, clock_ppm)
+
+
+def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
+    """Follow all known lamps through one block and report them. Blocks must come in order of time."""
+    sampled, flags = _prepare(decoder, block)
+    if sampled is not None:
+        t_middle = 0.5 * (block.t0 + block.t1)
+        decoder.clocks.predict(decoder.tracks.predict(t_middle))
+        more, residual = follow(decoder, block, sampled)
+        flags |= more
+        if flags == BlockFlag.NONE:
+            decoder.mains.learn(sampled.y)
+        decoder.odd = decoder.odd + 1 if flags & (BlockFlag.STALLED | BlockFlag.NOISY) else 0
+        if decoder.odd != 1:  # what one block has left over may be a stall; if the next has it too, it is a lamp
+            _offer(decoder, residual, t_middle)
+    return _epoch(decoder, block, flags)
+
+
+def search(decoder: Decoder, codes: int) -> None:
+    """Look for further lamps: try up to ``codes`` more codes on the block last offered (6 us each with profile A)."""
+    if decoder.search.idle:
+        clocks = _trial_clocks(decoder) if decoder.offered else []
+        if decoder.offered is None:
+            return
+        decoder.search.start(decoder.offered, clocks)
+        decoder.offered = None
+        decoder.barren *= len(clocks) == 1
+    done = decoder.search.step(codes)
+    if done is not None:
+        decoder.barren += 1
+        _take(decoder, *done)
+
+
+def _trial_clocks(decoder: Decoder) -> list[float]:
+    """The known clock alone; all of the range while none is known, and again when the known one confirms no lamp."""
+    tracks, clocks = decoder.tracks, decoder.clocks
+    if clocks.known and decoder.barren < FULL_ROUND:
+        return [clocks.clock]
+    if len(tracks.slots) and decoder.barren < FULL_ROUND:
+        return [clocks.clock]
+    if len(tracks.slots):  # candidates that came to nothing: start from a block without them
+        for slot in tracks.slots:
+            tracks.drop(int(slot))
+        decoder.offered = None
+    reach = round(decoder.profile.clock_ppm * 1e-6 / BIN)
+    return [k * BIN for k in range(-reach, reach + 1)]
+
+
+def _take(decoder: Decoder, job: Job, clock: float, found: list[Found]) -> None:
+    """Make candidates of what a sweep found; the first ever also tell the sample clock."""
+    tracks, clocks = decoder.tracks, decoder.clocks
+    if not found:
+        return
+    decoder.offered = None  # in a block from before, these lamps have not been taken out
+    if not len(tracks.slots) and clock != clocks.clock:
+        clock, phase = decoder.search.refine(job, clock, found[0])
+        clocks.clock, clocks.clock_var = clock, UNTRIED**2
+        tracks.add(found[0].code, phase - job.lag, job.t_middle, found[0].amplitude)
+    for candidate in found:
+        tracks.add(candidate.code, candidate.phase - job.lag, job.t_middle, candidate.amplitude)
+    if not job.again:
+        decoder.search.start(decoder.search.peeled(job, found), [clocks.clock])
+
+
+def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, BlockFlag]:
+    """Words to ADC steps about mid-scale, on the clock's time axis, with what must be left out."""
+    profile = decoder.profile
+    words = np.asarray(block.words, np.float64)
+    n, top = len(words), 2.0**profile.front_end.bits - 1.0
+    if not (np.all(np.isfinite(words)) and block.rate > 0.0 and block.t1 > block.t0):
+        return None, BlockFlag.MALFORMED
+    if not 1.0 <= n / (block.rate * profile.period_s) <= LONGEST:
+        return None, BlockFlag.LENGTH
+    if words.min() < 0.0 or words.max() > top:
+        return None, BlockFlag.MALFORMED
+    if words.min() == words.max():
+        return None, BlockFlag.FLAT
+    clipped = (words <= 0.0) | (words >= top)
+    if np.mean(clipped) > CLIP_SHARE:
+        return None, BlockFlag.SATURATED
+    mask = np.where(clipped, 0.0, 1.0)
+    y = (words - 0.5 * (top + 1.0)) * mask
+    flags, rows = BlockFlag.NONE, decoder.mains.rows(y)
+    if clipped.any():
+        flags, rows = BlockFlag.CLIPPED, decoder.mains.masked(np.arange(n, dtype=float), mask)
+    chips = profile.chip_rate / block.rate * (1.0 + decoder.clocks.clock)
+    at: Array = np.arange(n, dtype=np.float64) - 0.5 * (n - 1)
+    return Sampled(y, at * chips, mask, rows), flags
+
+
+def _offer(decoder: Decoder, residual: Sampled, t_middle: float) -> None:
+    """Leave the block, without the lamps that are seen, to be searched."""
+    tracks, lag = decoder.tracks, float(decoder.clocks.state[0])
+    slots = tracks.slots[~tracks.faint(tracks.slots)]
+    floor = SPURIOUS * float(np.max(tracks.amplitude[slots], initial=0.0))
+    decoder.offered = Job(residual, t_middle, lag, tracks.code[slots], tracks.phase[slots] + lag, floor)
+
+
+def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch:
+    """Report the confirmed lamps, none if the block is of no use."""
+    tracks, lsb = decoder.tracks, decoder.profile.front_end.lsb_a
+    links = tracks.confirmed if not flags & UNUSABLE else np.empty(0, np.int64)
+    code, amplitude, variance = tracks.code[links], tracks.amplitude[links], tracks.amplitude_var[links]
+    twin = np.array([np.count_nonzero(code == c) > 1 for c in code], bool)
+    faint = tracks.faint(links)
+    return LightEpoch(
+        t_begin=block.t0,
+        t_end=block.t1,
+        ids=code,
+        amplitude=amplitude * lsb,
+        variance=variance * lsb**2,
+        flags=faint * int(LinkFlag.FAINT) + twin * int(LinkFlag.TWIN),
+        lamps=tuple(tracks.frames[k] for k in links),
+        block=flags,
+        noise_a=decoder.noise * lsb,
+        clock_ppm=decoder.clock_ppm,
+    )
+
+
+__all__ = ["Decoder", "decode", "new_decoder", "search"]

@@ -1,0 +1,167 @@
+"""One block for the lamps that are known: find its lag, solve it, see whether the bus stalled, bring the tracks up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma_block import Fit, Prior, Sampled
+from estimator.cdma_epoch import BlockFlag, SampleBlock
+from estimator.cdma_mains import Mains
+from estimator.cdma_pieces import side_lobe
+from estimator.cdma_profile import Profile
+from estimator.cdma_search import DOMINANCE, Job, Search
+from estimator.cdma_solve import joint_fit
+from estimator.cdma_stall import judge, mend
+from estimator.cdma_template import Shape, pulse_energy
+from estimator.cdma_track import CLEAR, Clocks, Life, Tracks
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+LEADERS: Final = 3
+"""Strongest lamps that find the lag of a block's time base."""
+
+LAG_VAR: Final = 0.05**2
+"""Chips^2: how well they find it."""
+
+STAMP_MARGIN_S: Final = 120e-6
+"""Lags are looked for so far beyond what the block's two stamps leave open."""
+
+SPURIOUS: Final = 0.01
+"""Of the strongest lamp: below this, errors of the template's shape can look like lamps."""
+
+
+class Decoder:
+    """State of one photodiode's decoder; made by :func:`estimator.cdma.new_decoder`."""
+
+    def __init__(self, profile: Profile, clock_ppm: float | None) -> None:
+        self.profile = profile
+        self.shape = Shape(profile)
+        self.mains = Mains(profile.sample_rate, profile.mains_harmonics)
+        self.clocks = Clocks(profile, clock_ppm)
+        self.tracks = Tracks(profile)
+        self.search = Search(profile)
+        self.search.warm(round(profile.epoch_s * profile.sample_rate), self.clocks.clock)
+        self.offered: Job | None = None
+        self.barren = 0
+        self.odd = 0
+        self.noise = 0.0
+        self.usual_noise = 0.0
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """Error of the sample clock, to be stored; None until a lamp has confirmed it."""
+        return self.clocks.proven * 1e6 if self.clocks.known else None
+
+
+@dataclass(eq=False)
+class _Solved:
+    """A block with the prior and the lag (chips, predicted part included) that its fit started from."""
+
+    block: Sampled
+    prior: Prior
+    lag: float
+    fit: Fit
+
+
+def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[BlockFlag, Sampled]:
+    """Bring all tracks up to this block; returns its flags and what is left of it.
+
+    The tracks must already be predicted to the middle of the block.
+    """
+    tracks, clocks = decoder.tracks, decoder.clocks
+    if not len(tracks.slots):
+        clocks.rest()
+        return BlockFlag.NONE, replace(sampled, y=sampled.clean)
+    excess = max(block.t1 - block.t0 - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
+    flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
+    if not flags & BlockFlag.STALLED:
+        _learn(decoder, solved)
+        if solved.fit.clearest > CLEAR:  # else all are dark, and the lag found is chance
+            clocks.update(solved.lag + solved.fit.lag - float(clocks.state[0]), excess, solved.fit)
+            tracks.learn_phases(tracks.slots, solved.fit)
+        _live_and_die(decoder, solved, suspicious=bool(flags & BlockFlag.NOISY))
+    if flags in (BlockFlag.NONE, BlockFlag.CLIPPED) and len(tracks.confirmed):
+        decoder.shape.learn(solved.block, solved.prior, solved.fit)
+    return flags, replace(solved.block, y=solved.fit.residual)
+
+
+def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
+    """Common lag of the block's time base, chips: where the strongest lamps correlate best together."""
+    tracks, clocks, profile = decoder.tracks, decoder.clocks, decoder.profile
+    slots, predicted = tracks.slots, float(clocks.state[0])
+    lit = slots[~tracks.faint(slots)]
+    chosen = lit[np.argsort(-tracks.amplitude[lit])[:LEADERS]] if len(lit) else slots  # dark: whichever comes back
+    window = (STAMP_MARGIN_S + 0.5 * excess) * profile.chip_rate + 3.0 * float(np.sqrt(clocks.cov[0, 0]))
+    lamps = (tracks.code[chosen], tracks.phase[chosen] + predicted, np.maximum(tracks.amplitude[chosen], 0.0))
+    window = min(window, 0.4 * profile.length)
+    return predicted + decoder.search.common_lag(sampled.clean, clocks.clock, lamps, window)
+
+
+def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _Solved]:
+    """Joint fit; where it does not explain the block, the attempt to mend a stall."""
+    tracks, clocks, table = decoder.tracks, decoder.clocks, decoder.shape.table
+    slots, span = tracks.slots, -float(sampled.x[0])
+
+    def prior_at(more: float) -> Prior:
+        return tracks.prior(slots, lag + more, LAG_VAR, clocks.clock_var, span)
+
+    prior = prior_at(0.0)
+    fit = joint_fit(sampled, prior, table)
+    solved = _Solved(sampled, prior, lag, fit)
+    verdict = judge(sampled, fit, decoder.usual_noise)
+    _listen(decoder, fit)
+    if verdict.good or not len(tracks.confirmed):
+        return BlockFlag.NONE, solved
+    newcomers = bool(np.any(tracks.life[slots] == Life.TENTATIVE))
+    if newcomers and not (verdict.bent or verdict.smooth):
+        return BlockFlag.NOISY, solved  # what is left over is theirs
+    mended = mend(sampled, fit, prior_at, table, decoder.mains, decoder.usual_noise)
+    if isinstance(mended, bool):
+        return BlockFlag.STALLED if mended else BlockFlag.NOISY, solved
+    return BlockFlag.MENDED, _Solved(mended.block, mended.prior, lag + mended.lag, mended.fit)
+
+
+def _listen(decoder: Decoder, fit: Fit) -> None:
+    """Follow the usual noise: a lower one soon, a rise slowly, so that single blocks do not count."""
+    noise = float(np.sqrt(fit.noise_var))
+    decoder.noise = noise
+    if len(decoder.tracks.confirmed):
+        usual = decoder.usual_noise or noise
+        change = min(noise, 1.5 * usual) - usual
+        decoder.usual_noise = usual + (0.1 if change > 0.0 else 0.5) * change
+
+
+def _learn(decoder: Decoder, solved: _Solved) -> None:
+    """Amplitudes and data bits."""
+    tracks, fit, slots = decoder.tracks, solved.fit, decoder.tracks.slots
+    first = tracks.first_period(slots, solved.lag, -float(solved.block.x[0]))
+    tracks.amplitude[slots], tracks.amplitude_var[slots] = fit.amplitude, fit.amplitude_var
+    tracks.rings.add(slots, first, fit.soft, fit.soft_var)
+    for slot, period in zip(slots, first, strict=True):
+        frame = tracks.rings.frame(int(slot), int(tracks.code[slot]), int(period))
+        if frame is not None:
+            tracks.frames[slot] = frame
+    decoder.noise = float(np.sqrt(fit.noise_var))
+
+
+def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
+    """Move candidates, and in suspicious blocks all lamps, off side lobes; confirm the ripe, drop the lost.
+
+    A candidate must be stronger than the cross-correlation of a lamp that would explain all that is left over.
+    """
+    tracks, slots = decoder.tracks, decoder.tracks.slots
+    for k in np.flatnonzero((tracks.life[slots] == Life.TENTATIVE) | suspicious):
+        beside = side_lobe(solved.block, solved.prior, solved.fit, int(k), decoder.shape.table)
+        if beside:
+            tracks.move(int(slots[k]), beside)
+    hidden = DOMINANCE * float(np.sqrt(solved.fit.noise_var / pulse_energy(decoder.profile)))
+    for slot in tracks.judge(slots, max(hidden, SPURIOUS * float(np.max(solved.fit.amplitude)))):
+        tracks.life[slot] = Life.CONFIRMED
+    if len(tracks.confirmed):
+        decoder.clocks.prove()
+        decoder.barren = 0

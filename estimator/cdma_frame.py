@@ -1,0 +1,167 @@
+"""The data layer: one bit per code period, sent by inverting the code, in a frame that a lamp repeats for ever.
+
+It carries the paper's coded information T = (x, y, i) with height and power. The layout is in docs/air-interface.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+VERSION: Final = 0
+SYNC: Final = 0xEB90
+SYNC_BITS: Final = 16
+CRC_BITS: Final = 16
+
+FIELDS: Final = (
+    ("version", 2, 1.0, False),
+    ("lamp_id", 16, 1.0, False),
+    ("x_m", 18, 0.005, True),
+    ("y_m", 18, 0.005, True),
+    ("z_m", 12, 0.005, False),
+    ("power_w", 11, 0.01, False),
+    ("half_angle_deg", 7, 1.0, False),
+)
+"""Name, width in bits, unit of the last bit, two's complement; in the order sent, most significant bit first."""
+
+PAYLOAD_BITS: Final = sum(width for _, width, _, _ in FIELDS)
+FRAME_BITS: Final = SYNC_BITS + PAYLOAD_BITS + CRC_BITS
+"""116: 2.946 s with profile A."""
+
+
+@dataclass(frozen=True, slots=True)
+class LampFrame:
+    """What a lamp says about itself: the paper's T = (x, y, i), its height, and how it radiates.
+
+    Attributes:
+        lamp_id: its number in the building (codes are reused, this is not). x_m, y_m, z_m: in the survey's frame.
+        power_w: mean radiant power. half_angle_deg: at which intensity has halved, 0 where not told.
+    """
+
+    lamp_id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    power_w: float
+    half_angle_deg: float = 0.0
+    version: int = VERSION
+
+
+def crc16(bits: int, width: int) -> int:
+    """CRC-16/CCITT-FALSE (polynomial 0x1021, starts at 0xFFFF, no reflection, no final inversion) of a bit string."""
+    register = 0xFFFF
+    for at in range(width - 1, -1, -1):
+        carry = register >> 15 ^ bits >> at & 1
+        register = register << 1 & 0xFFFF ^ (0x1021 if carry else 0)
+    return register
+
+
+def _checksum(payload: int, code: int) -> int:
+    """The code's number is part of what is protected, though it is not sent: a frame heard on a wrong code fails."""
+    return crc16(code << PAYLOAD_BITS | payload, 16 + PAYLOAD_BITS)
+
+
+def encode(frame: LampFrame, code: int) -> int:
+    """The frame as an integer of FRAME_BITS bits, most significant bit sent first.
+
+    Raises:
+        ValueError: a value does not fit its field.
+    """
+    payload = 0
+    for name, width, unit, signed in FIELDS:
+        value = round(getattr(frame, name) / unit)
+        low, high = (-(1 << width - 1), (1 << width - 1) - 1) if signed else (0, (1 << width) - 1)
+        if not low <= value <= high:
+            raise ValueError(f"{name} = {getattr(frame, name)} does not fit: {low * unit:g} to {high * unit:g}")
+        payload = payload << width | value & (1 << width) - 1
+    return (SYNC << PAYLOAD_BITS | payload) << CRC_BITS | _checksum(payload, code)
+
+
+def _payload(bits: int) -> LampFrame:
+    values: dict[str, float] = {}
+    for name, width, unit, signed in reversed(FIELDS):
+        value = bits & (1 << width) - 1
+        bits >>= width
+        values[name] = (value - (1 << width) if signed and value >> width - 1 else value) * unit
+    lamp_id, version = int(values.pop("lamp_id")), int(values.pop("version"))
+    return LampFrame(lamp_id=lamp_id, version=version, **values)
+
+
+def decode_ring(ring: int, code: int) -> LampFrame | None:
+    """Find the frame in FRAME_BITS consecutive bits that begin anywhere in it; None if there is none.
+
+    A receiver that inverts the light (every bit flipped) is tried as well. Frames of another version are not for us.
+    """
+    whole = (1 << FRAME_BITS) - 1
+    for word in (ring, ring ^ whole):
+        for turn in range(FRAME_BITS):
+            turned = word << turn & whole | word >> FRAME_BITS - turn
+            if turned >> FRAME_BITS - SYNC_BITS == SYNC:
+                payload = turned >> CRC_BITS & (1 << PAYLOAD_BITS) - 1
+                if turned & 0xFFFF == _checksum(payload, code) and payload >> PAYLOAD_BITS - 2 == VERSION:
+                    return _payload(payload)
+    return None
+
+
+KNOWN: Final = 3.0
+"""A bit counts as received when its sign is so many standard deviations clear; the CRC finds up to three wrong ones."""
+
+FADE: Final = 0.7
+"""Weight of what the repetition before said of the same bit: a lamp that is told something new is believed in 9 s."""
+
+RETRY: Final = 29
+"""New bits before another attempt at a frame that failed its check: a quarter of it."""
+
+
+class BitRings:
+    """Soft bits of all tracked lamps, folded on the frame's length, so that weak lamps gain by repetition."""
+
+    def __init__(self, capacity: int) -> None:
+        self._sum: Array = np.zeros((capacity, FRAME_BITS))
+        self._weight: Array = np.zeros((capacity, FRAME_BITS))
+        self._last: Index = np.full((capacity, FRAME_BITS), -1)
+        self._due: Index = np.zeros(capacity, np.int64)
+
+    def forget(self, slot: int) -> None:
+        """Start anew in a slot that another lamp takes."""
+        self._sum[slot], self._weight[slot], self._last[slot], self._due[slot] = 0.0, 0.0, -1, 0
+
+    def add(self, slots: Index, period: Index, soft: Array, variance: Array) -> None:
+        """Take in what one block says.
+
+        Args:
+            slots: (L,).
+            period: (L,) running number of the first code period touched, not folded.
+            soft: (L, P) amplitude times sign of each period touched.
+            variance: (L, P), inf where not touched.
+        """
+        touched = np.isfinite(variance)
+        index = (period[:, None] + np.arange(soft.shape[1]))[touched]
+        rows = np.broadcast_to(slots[:, None], soft.shape)[touched]
+        at = index % FRAME_BITS
+        keep = np.where(self._last[rows, at] == index, 1.0, FADE)
+        self._sum[rows, at] = keep * self._sum[rows, at] + (soft / variance)[touched]
+        self._weight[rows, at] = keep * self._weight[rows, at] + 1.0 / variance[touched]
+        self._last[rows, at] = index
+
+    def before(self, slots: Index, period: Index) -> tuple[Array, Array]:
+        """Sum and weight gathered so far for one running period of each lamp; 0 if it is new. Both (L,)."""
+        at = period % FRAME_BITS
+        same = self._last[slots, at] == period
+        return np.where(same, self._sum[slots, at], 0.0), np.where(same, self._weight[slots, at], 0.0)
+
+    def frame(self, slot: int, code: int, period: int) -> LampFrame | None:
+        """Try to read the frame; ``period`` is the running number now, which paces the attempts."""
+        if period < self._due[slot] or not np.all(np.abs(self._sum[slot]) > KNOWN * np.sqrt(self._weight[slot])):
+            return None
+        if not np.all(self._weight[slot]):
+            return None
+        self._due[slot] = period + RETRY
+        bits = "".join("1" if s < 0 else "0" for s in self._sum[slot])
+        return decode_ring(int(bits, 2), code)

@@ -1,0 +1,154 @@
+"""The loops of the light decoder that run over samples. All arrays are the caller's; nothing is allocated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.kernel import kernel
+
+F8 = npt.NDArray[np.float64]
+F4 = npt.NDArray[np.float32]
+I8 = npt.NDArray[np.int64]
+
+
+@kernel("i8[:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1])")
+def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) -> I8:
+    """Received waveform of each lamp at amplitude 1, and its derivative with respect to the code phase.
+
+    The pulse table is expanded to first order around its nearest point (5e-5 of the pulse, 4e-4 where it bends).
+
+    Args:
+        chips: (L, C) chips of each lamp's code.
+        lamps: (2, L) phase in chips at time 0, counted from the begin of the first period (a first sample slightly
+            before it is taken as its begin), and rate in chips per unit of time.
+        samples: (2, N) times, non-decreasing, and weight: 1, or 0 for a sample that is not to be used.
+        signs: (L, P) data sign of each code period touched, in order (0 leaves the period out).
+        table: of :func:`estimator.cdma_template.pulse_table`.
+        out: (2, L, N) waveforms and derivatives.
+
+    Returns:
+        (L, P + 1) index of the first sample of each period; N behind the last.
+    """
+    length, steps = chips.shape[1], table.shape[0] - 1
+    n_lamps, n_samples = out.shape[1], out.shape[2]
+    x, weight = samples[0], samples[1]
+    bounds = np.full((n_lamps, signs.shape[1] + 1), n_samples)
+    for i in range(n_lamps):
+        code, value, slope = chips[i], out[0, i], out[1, i]
+        phase, rate = lamps[0, i], lamps[1, i]
+        before = signs[i, 0]
+        n, period = 0, 0
+        while n < n_samples:
+            bounds[i, period] = n
+            sign = signs[i, period]
+            limit = (length - phase) / rate
+            while n < n_samples and x[n] < limit:
+                u = max(phase + rate * x[n], 0.0)
+                k = min(np.uint64(u), np.uint64(length - 1))  # unsigned: no test for indices from the end
+                at = (u - k) * steps
+                j = np.uint64(at + 0.5)
+                own = code[k] * sign
+                last = code[k - np.uint64(1)] * sign if k > 0 else code[length - 1] * before
+                ramp = own * table[j, 2] + last * table[j, 3]
+                value[n] = (own * table[j, 0] + last * table[j, 1] + (at - j) / steps * ramp) * weight[n]
+                slope[n] = ramp * weight[n]
+                n += 1
+            phase -= length
+            before = sign
+            period += 1
+    return bounds
+
+
+@kernel("void(f8[:,::1], i8, f8[:,::1])")
+def gram(rows: F8, free: int, out: F8) -> None:
+    """Inner products of all M rows with the first ``free`` rows, in tiles of 2 x 4; ``out`` is (M, free).
+
+    Not left to BLAS: its threads would fight with the daemon's for two cores and can take 50 times as long.
+    """
+    last = rows.shape[0] - 1
+    for i in range(0, last + 1, 2):
+        i1 = min(i + 1, last)
+        a0, a1 = rows[i], rows[i1]
+        for j in range(0, min(i1 + 1, free), 4):
+            j1, j2, j3 = min(j + 1, last), min(j + 2, last), min(j + 3, last)
+            b0, b1, b2, b3 = rows[j], rows[j1], rows[j2], rows[j3]
+            s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+            t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+            for n in range(a0.shape[0]):
+                s0 += a0[n] * b0[n]
+                s1 += a0[n] * b1[n]
+                s2 += a0[n] * b2[n]
+                s3 += a0[n] * b3[n]
+                t0 += a1[n] * b0[n]
+                t1 += a1[n] * b1[n]
+                t2 += a1[n] * b2[n]
+                t3 += a1[n] * b3[n]
+            out[i, j], out[i1, j] = s0, t0
+            if j1 < free:
+                out[i, j1], out[i1, j1] = s1, t1
+            if j2 < free:
+                out[i, j2], out[i1, j2] = s2, t2
+            if j3 < free:
+                out[i, j3], out[i1, j3] = s3, t3
+    for i in range(free):
+        for j in range(i):
+            out[j, i] = out[i, j]
+
+
+@kernel("void(f8[:,::1])")
+def invert(a: F8) -> None:
+    """Inverse of a symmetric positive definite matrix in its own place, by sweeping each pivot.
+
+    A pivot that vanishes against its original diagonal says that this unknown depends on others: its row and column
+    become zero, as if it were not there.
+    """
+    size = a.shape[0]
+    for k in range(size):
+        scale = a[k, k]
+        a[k, k] = 1.0
+        for j in range(size):
+            a[k, j] = a[k, j] / scale if scale > 0.0 else 0.0
+        for i in range(size):
+            if i != k:
+                factor = a[i, k]
+                a[i, k] = 0.0
+                for j in range(size):
+                    a[i, j] -= factor * a[k, j]
+
+
+@kernel("void(f4[:,::1], i8, f8, f4[::1], f8[:,::1])")
+def detect(correlation: F4, n_samples: int, period: float, sums: F4, out: F8) -> None:
+    """Best code phase of each code, data signs unknown: the largest sum of |correlation| over the periods touched.
+
+    Args:
+        correlation: (K, F) correlation of the block with one period of each code that begins at sample ``lag``;
+            negative lags are kept at ``lag + F``.
+        n_samples: of the block.
+        period: samples per code period.
+        sums: (int(period) + 3,) scratch.
+        out: (K, 4) lag of the best phase in [0, period], the sum there and at the lags before and behind it.
+    """
+    size, lags = correlation.shape[1], sums.shape[0]
+    for c in range(correlation.shape[0]):
+        row = correlation[c]
+        sums[:] = np.float32(0.0)
+        for p in range(-1, int(n_samples / period) + 2):
+            offset = math.floor(p * period + 0.5) - 1
+            low, high = max(0, -int(period) - offset), min(lags, n_samples - offset)
+            wrapped = max(low, min(high, -offset))
+            if wrapped > low:
+                piece, target = row[offset + size + low : offset + size + wrapped], sums[low:wrapped]
+                for k in range(target.shape[0]):
+                    target[k] += abs(piece[k])
+            if high > wrapped:
+                piece, target = row[offset + wrapped : offset + high], sums[wrapped:high]
+                for k in range(target.shape[0]):
+                    target[k] += abs(piece[k])
+        best = 1
+        for k in range(2, lags - 1):
+            if sums[k] > sums[best]:
+                best = k
+        out[c, 0], out[c, 1], out[c, 2], out[c, 3] = best - 1, sums[best], sums[best - 1], sums[best + 1]

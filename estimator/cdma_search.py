@@ -1,0 +1,269 @@
+"""Cold acquisition: which codes are in a block, and at what phase, without knowing anything but the air interface.
+
+A block from which mains and all known lamps have been taken out is correlated, by FFT, with one period of every code;
+the sum of magnitudes over the code periods touched needs no data signs. The work is cut into slices of as many codes as
+the caller can afford. Strong lamps hide weak ones, so only those within `DOMINANCE` of the strongest are believed;
+the rest wait for the next block, from which the strong ones will have been taken out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma_block import Prior, Sampled
+from estimator.cdma_kernels import columns, detect
+from estimator.cdma_pieces import without
+from estimator.cdma_profile import Profile
+from estimator.cdma_template import pulse_energy, pulse_table
+from estimator.codes import gold_codes
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Spectrum = npt.NDArray[np.complex64]
+Lamps = tuple[Index, Array, Array]
+"""Codes, phases (chips at the middle of the block) and amplitudes."""
+
+THRESHOLD: Final = 5.2
+"""Sum of correlations over its noise, which is measured on the correlations themselves, so that it contains what other
+lamps cause. With 129 codes, 565 phases and 4 sign patterns, noise passes in 6 % of blocks; the next refutes it."""
+
+COLD_THRESHOLD: Final = 7.0
+"""The same while the sample clock is unknown and eleven times as much is tried."""
+
+DOMINANCE: Final = 0.35
+"""Largest cross-correlation of partial code periods, with margin."""
+
+GUARD_CHIPS: Final = 1.6
+"""The same code is not looked for so near to a lamp that is already tracked (its own side lobes)."""
+
+BIN: Final = 0.002
+"""Spacing of trial clocks: 25 us over half a code period of profile A, a quarter of a half chip."""
+
+FINE_RATES: Final = np.arange(-5, 6) * 4e-4
+FINE_LAGS: Final = np.arange(-2, 3) * 0.25
+SAME_CLOCK: Final = 4e-4
+"""Spectra are computed anew when the clock has moved by so much (a fiftieth of a chip at the ends of a period)."""
+
+MOST_FOUND: Final = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A candidate: code, phase in chips at the middle of the searched block, amplitude in ADC steps, significance."""
+
+    code: int
+    phase: float
+    amplitude: float
+    z: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """A block to be searched.
+
+    Attributes:
+        block: with the residual in place of its photocurrent. t_middle: s. lag: common lag of that block, chips.
+        codes, phases: of each known lamp, lag included. floor: smallest amplitude worth reporting.
+        again: whether lamps found in an earlier sweep over the same block have been taken out.
+    """
+
+    block: Sampled
+    t_middle: float
+    lag: float
+    codes: Index
+    phases: Array
+    floor: float
+    again: bool = False
+
+    @property
+    def y(self) -> Array:
+        """(N,) residual in ADC steps."""
+        return self.block.y
+
+
+class Search:
+    """Works through one job at a time, `step` by `step`."""
+
+    def __init__(self, profile: Profile) -> None:
+        self._profile = profile
+        self._codes = gold_codes(profile.degree)
+        self._table = pulse_table(profile)
+        self._energy = pulse_energy(profile)
+        self._cache: Spectrum = np.empty((0, 0), np.complex64)
+        self._cache_clock: Array = np.empty(0)
+        self._size = 0
+        self._job: Job | None = None
+        self._plan: list[float] = []
+        self._next = 0
+        self._found: list[list[Found]] = []
+        self._spectrum: Spectrum = np.empty(0, np.complex64)
+        self._limit = THRESHOLD
+
+    @property
+    def idle(self) -> bool:
+        """Whether a new job would be taken."""
+        return self._job is None
+
+    def start(self, job: Job, clocks: list[float]) -> None:
+        """Begin a sweep over all codes, once per trial clock."""
+        self._fit_size(len(job.y))
+        self._job, self._plan, self._next = job, list(clocks), 0
+        self._found = [[] for _ in clocks]
+        self._limit = THRESHOLD if len(clocks) == 1 else COLD_THRESHOLD
+        self._spectrum = _spectrum(job.y, self._size)
+
+    def step(self, codes: int) -> tuple[Job, float, list[Found]] | None:
+        """Try up to ``codes`` more codes; at the end of the sweep return (job, clock of the best trial, candidates)."""
+        job = self._job
+        if job is None:
+            return None
+        trial, first = divmod(self._next, len(self._codes))
+        last = min(first + codes, len(self._codes))
+        self._found[trial] += self._try(job, self._plan[trial], first, last)
+        self._next += last - first
+        if self._next < len(self._plan) * len(self._codes):
+            return None
+        self._job = None
+        strongest = [max((f.z for f in found), default=0.0) for found in self._found]
+        best = int(np.argmax(strongest))
+        return job, self._plan[best], _dominant(self._found[best])
+
+    def _spc(self, clock: float) -> float:
+        """Samples per chip."""
+        return self._profile.samples_per_chip / (1.0 + clock)
+
+    def _prepare(self, codes: Index, clock: float) -> None:
+        """Bring the kept spectra of these codes up to this clock: one period of each, conjugated."""
+        stale = codes[np.abs(self._cache_clock[codes] - clock) > SAME_CLOCK]
+        if not len(stale):
+            return
+        few, spc = len(stale), self._spc(clock)
+        n = int(np.ceil((self._profile.length + 1) * spc))
+        samples, lamps = np.stack([np.arange(n) / spc, np.ones(n)]), np.stack([np.zeros(few), np.ones(few)])
+        waves = np.empty((2, few, n))
+        columns(self._codes[stale], lamps, samples, np.tile([1.0, 0.0], (few, 1)), self._table, waves)
+        self._cache[stale] = np.conj(np.fft.rfft(waves[0].astype(np.float32), self._size))
+        self._cache_clock[stale] = clock
+
+    def warm(self, n: int, clock: float) -> None:
+        """Compute all spectra for blocks of ``n`` samples at once (2 to 3 ms), so that no cycle has to."""
+        self._fit_size(n)
+        self._prepare(np.arange(len(self._codes)), clock)
+
+    def _correlation(self, codes: Spectrum, block: Spectrum) -> npt.NDArray[np.float32]:
+        """(K, F) correlation of a block with one period of each code that begins at each lag."""
+        return np.fft.irfft(codes * block, self._size).astype(np.float32, copy=False)
+
+    def _try(self, job: Job, clock: float, first: int, last: int) -> list[Found]:
+        n, spc = len(job.y), self._spc(clock)
+        self._prepare(np.arange(first, last), clock)
+        correlation = self._correlation(self._cache[first:last], self._spectrum)
+        middle, period = 0.5 * (n - 1), self._profile.length * spc
+        known = (job.codes >= first) & (job.codes < last)
+        begin = (middle - job.phases[known] * spc) % period
+        near = np.arange(-np.ceil(GUARD_CHIPS * spc), np.ceil(GUARD_CHIPS * spc) + 1)
+        centre = begin[:, None] + np.arange(-1, int(n / period) + 1) * period
+        at = np.round(centre[:, :, None] + near).astype(np.int64)
+        correlation[(job.codes[known] - first)[:, None, None], at % self._size] = 0.0
+        out = np.empty((last - first, 4))
+        detect(correlation, n, period, np.empty(int(period) + 3, np.float32), out)
+        whole = correlation[:, : max(n - int(period), 1)]  # the period lies inside the block
+        noise = np.sqrt(np.median(np.einsum("ij,ij->i", whole, whole)) / (whole.shape[1] * period))
+        energy = self._energy * n
+        z = out[:, 1] / (np.sqrt(n) * max(float(noise), 1e-9))
+        amplitude = out[:, 1] / energy
+        bend = 2 * out[:, 1] - out[:, 2] - out[:, 3]
+        offset = 0.5 * (out[:, 3] - out[:, 2]) / np.maximum(bend, 1e-9)
+        phase = (middle - out[:, 0] - np.clip(offset, -0.5, 0.5)) / spc % self._profile.length
+        good = np.flatnonzero((z > self._limit) & (amplitude > job.floor))
+        return [Found(first + int(k), float(phase[k]), float(amplitude[k]), float(z[k])) for k in good]
+
+    def common_lag(self, y: Array, clock: float, lamps: Lamps, window: float) -> float:
+        """Lag in chips by which all lamps together are behind their predicted phases, within ``window`` chips.
+
+        Each code's correlation is looked up where its periods should begin, on a grid of half samples.
+        """
+        codes, phase, amplitude = lamps
+        spc, n = self._spc(clock), len(y)
+        self._fit_size(n)
+        self._prepare(codes, clock)
+        correlation = self._correlation(self._cache[codes], _spectrum(y, self._size))
+        period = self._profile.length * spc
+        shift = np.arange(-np.ceil(2 * window * spc) - 1, np.ceil(2 * window * spc) + 2) * 0.5
+        begin = (0.5 * (n - 1) - phase * spc) % period
+        at = begin[:, None] + np.arange(-1, int(n / period) + 2) * period
+        where = at[:, :, None] - shift
+        low = np.floor(where).astype(np.int64)
+        share = where - low
+        rows = np.arange(len(codes))[:, None, None]
+        value = (1 - share) * correlation[rows, low % self._size] + share * correlation[rows, (low + 1) % self._size]
+        inside = (where > -period) & (where < n)
+        score = np.einsum("i,ips->s", amplitude, np.abs(value) * inside)
+        best = int(np.clip(np.argmax(score), 1, len(shift) - 2))
+        bend = 2 * score[best] - score[best - 1] - score[best + 1]
+        fine = 0.25 * (score[best + 1] - score[best - 1]) / max(bend, 1e-9)
+        return float(shift[best] + np.clip(fine, -0.25, 0.25)) / spc
+
+    def _fit_size(self, n: int) -> None:
+        """FFT length for blocks of ``n`` samples; another length empties the kept spectra."""
+        longest = (self._profile.length + 1) * self._spc(-self._profile.clock_ppm * 1e-6) * 1.01
+        size = _fast_length(n + int(longest) + 1)
+        if self._cache.shape[1] != size // 2 + 1:
+            self._cache = np.empty((len(self._codes), size // 2 + 1), np.complex64)
+            self._cache_clock = np.full(len(self._codes), np.inf)
+        self._size = size
+
+    def refine(self, job: Job, clock: float, found: Found) -> tuple[float, float]:
+        """Clock and phase of one candidate by trial around it: 11 rates x 5 lags; the phase is at the middle."""
+        spc, n = self._spc(clock), len(job.y)
+        rate, shift = np.meshgrid(1.0 - FINE_RATES, FINE_LAGS / spc)
+        phase, rate = found.phase + shift.ravel(), rate.ravel()
+        x = (np.arange(n) - 0.5 * (n - 1)) / spc
+        phase = phase - np.floor((phase + rate * x[0]) / self._profile.length) * self._profile.length
+        touched = int((x[-1] - x[0]) * 1.01 / self._profile.length) + 3
+        chips = np.repeat(self._codes[[found.code]], len(rate), axis=0)
+        waves, ones = np.empty((2, len(rate), n)), np.ones((len(rate), touched))
+        bounds = columns(chips, np.stack([phase, rate]), np.stack([x, np.ones(n)]), ones, self._table, waves)
+        total = np.concatenate([np.zeros((len(rate), 1)), np.cumsum(waves[0] * job.y, axis=1)], axis=1)
+        score = np.abs(np.diff(np.take_along_axis(total, bounds, axis=1), axis=1)).sum(axis=1)
+        best = int(np.argmax(score))
+        return (1.0 + clock) * float(rate[best]) - 1.0, float(phase[best] % self._profile.length)
+
+    def peeled(self, job: Job, found: list[Found]) -> Job:
+        """The same block without what has just been found in it, for another look at what that had covered.
+
+        Only roughly, at the phases found.
+        """
+        few = len(found)
+        phase = np.array([f.phase for f in found])
+        prior = Prior(
+            chips=self._codes[[f.code for f in found]],
+            phase=phase - np.floor((phase + job.block.x[0]) / self._profile.length) * self._profile.length,
+            rate=np.ones(few), phase_var=np.ones(few), lag_var=1.0, clock_var=1.0,
+            amplitude=np.array([f.amplitude for f in found]),
+            bit_sum=np.zeros(few), bit_weight=np.zeros(few),
+        )  # fmt: skip
+        block = replace(job.block, y=without(job.block, prior, self._table))
+        codes = np.append(job.codes, [f.code for f in found])
+        return Job(block, job.t_middle, job.lag, codes, np.append(job.phases, phase), job.floor, True)
+
+
+def _fast_length(n: int) -> int:
+    """Smallest even number of at least ``n`` without prime factors above 5, for which the FFT is quick."""
+    odd: list[int] = [3**i * 5**j for i in range(11) for j in range(8)]
+    return min(k << max((n - 1) // k, 1).bit_length() for k in odd if k < 2 * n)
+
+
+def _spectrum(y: Array, size: int) -> Spectrum:
+    """Half spectrum of a zero-padded block in single precision, which is quick and good enough to find peaks."""
+    return np.fft.rfft(y.astype(np.float32), size).astype(np.complex64, copy=False)
+
+
+def _dominant(found: list[Found]) -> list[Found]:
+    """Only those that cannot be a cross-correlation of the strongest, strongest first."""
+    found = sorted(found, key=lambda f: -f.amplitude)[:MOST_FOUND]
+    return [f for f in found if f.amplitude > DOMINANCE * found[0].amplitude]

@@ -1,0 +1,110 @@
+"""Each compiled loop against a slow twin that says the same in other words."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from estimator import cdma_kernels
+from estimator.cdma_profile import PROFILE_A
+from estimator.cdma_template import STEPS, pulse_table
+from estimator.codes import gold_codes
+
+TABLE = pulse_table(PROFILE_A)
+
+
+def waves(phase: list[float], rate: list[float], x: np.ndarray, signs: np.ndarray) -> SimpleNamespace:
+    chips, out = gold_codes(7)[: len(phase)].copy(), np.empty((2, len(phase), len(x)))
+    lamps, samples = np.array([phase, rate]), np.stack([x, np.ones_like(x)])
+    bounds = cdma_kernels.columns(chips, lamps, samples, signs, TABLE, out)
+    return SimpleNamespace(chips=chips, value=out[0], slope=out[1], bounds=bounds)
+
+
+def slow_value(chips: np.ndarray, signs: np.ndarray, u: float) -> float:
+    """Linear interpolation in the table, chip by chip over an endless code."""
+
+    def pulse(column: int, fraction: float) -> float:
+        return float(np.interp(fraction * STEPS, np.arange(STEPS + 1), TABLE[:, column]))
+
+    def chip(at: int) -> float:
+        return float(chips[at % 127] * signs[max(at // 127, 0)])
+
+    k = int(np.floor(u))
+    return chip(k) * pulse(0, u - k) + chip(k - 1) * pulse(1, u - k)
+
+
+def test_columns_follow_the_code_with_its_signs() -> None:
+    x = np.arange(-40.0, 40.0, 0.9)
+    signs = np.array([[1.0, -1.0, 1.0], [-1.0, -1.0, 1.0]])
+    got = waves([63.7, 130.2], [1.0, 1.001], x, signs)
+    for i, (phase, rate) in enumerate([(63.7, 1.0), (130.2, 1.001)]):
+        expected = [slow_value(got.chips[i], signs[i], phase + rate * t) for t in x]
+        np.testing.assert_allclose(got.value[i], expected, atol=3e-4)
+    assert got.bounds.tolist() == [[0, np.count_nonzero(63.7 + x < 127), 89, 89], [0, 41, 89, 89]]
+
+
+def test_slopes_are_the_derivatives() -> None:
+    x, signs = np.arange(-30.0, 30.0, 0.83), np.ones((1, 3))
+    ahead, behind = waves([63.7 + 5e-3], [1.0], x, signs), waves([63.7 - 5e-3], [1.0], x, signs)
+    middle = waves([63.7], [1.0], x, signs)
+    np.testing.assert_allclose((ahead.value - behind.value) / 1e-2, middle.slope, atol=0.25)
+    assert np.abs(middle.slope).max() > 5.0
+
+
+def test_a_sign_of_zero_leaves_a_period_out_but_for_its_predecessors_tail() -> None:
+    x = np.arange(-40.0, 40.0, 0.5)
+    got = waves([120.0], [1.0], x, np.array([[1.0, 0.0, 0.0]]))
+    begin = got.bounds[0, 1]
+    assert np.abs(got.value[0, begin : begin + 2]).max() > 0.1
+    assert not got.value[0, begin + 2 :].any()
+
+
+def test_masked_samples_are_zero() -> None:
+    x = np.arange(-20.0, 20.0, 0.5)
+    out, samples = np.empty((2, 1, len(x))), np.stack([x, (np.arange(len(x)) % 3 > 0).astype(float)])
+    lamps = np.array([[60.0], [1.0]])
+    cdma_kernels.columns(gold_codes(7)[:1].copy(), lamps, samples, np.ones((1, 2)), TABLE, out)
+    assert not out[:, 0, ::3].any()
+    assert out[:, 0, 1::3].any()
+
+
+@pytest.mark.parametrize(("rows", "free"), [(1, 1), (5, 2), (6, 6), (11, 7), (9, 1)])
+def test_gram_is_the_matrix_product(rows: int, free: int) -> None:
+    data = np.random.default_rng(rows).normal(size=(rows, 23))
+    out = np.empty((rows, free))
+    cdma_kernels.gram(data, free, out)
+    np.testing.assert_allclose(out, data @ data[:free].T, atol=1e-12)
+
+
+def test_invert_and_what_it_does_to_a_dependent_unknown() -> None:
+    data = np.random.default_rng(1).normal(size=(6, 20))
+    matrix = data @ data.T
+    inverse = matrix.copy()
+    cdma_kernels.invert(inverse)
+    np.testing.assert_allclose(inverse @ matrix, np.eye(6), atol=1e-10)
+    nothing = np.zeros((3, 3))
+    nothing[0, 0] = nothing[2, 2] = 2.0
+    cdma_kernels.invert(nothing)
+    np.testing.assert_allclose(nothing, np.diag([0.5, 0.0, 0.5]))
+
+
+def slow_detect(row: np.ndarray, n: int, period: float) -> tuple[float, float, float, float]:
+    def total(lag: int) -> float:
+        starts = [lag + int(np.floor(p * period + 0.5)) for p in range(-1, int(n / period) + 2)]
+        return float(sum(abs(row[s]) for s in starts if -int(period) <= s < n))
+
+    sums = [total(lag) for lag in range(-1, int(period) + 2)]
+    best = 1 + int(np.argmax(sums[1:-1]))
+    return best - 1, sums[best], sums[best - 1], sums[best + 1]
+
+
+@pytest.mark.parametrize(("n", "period"), [(90, 37.4), (40, 37.4), (130, 25.0)])
+def test_detect_sums_over_the_periods_touched(n: int, period: float) -> None:
+    size = n + int(period) + 3
+    correlation = np.random.default_rng(n).normal(size=(4, size)).astype(np.float32)
+    out = np.empty((4, 4))
+    cdma_kernels.detect(correlation, n, period, np.empty(int(period) + 3, np.float32), out)
+    for row, found in zip(correlation, out, strict=True):
+        np.testing.assert_allclose(found, slow_detect(row, n, period), rtol=1e-5)
