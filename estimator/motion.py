@@ -66,7 +66,7 @@ class Motion:
         P: 3x3 covariance of the pose relative to the local map (odom-aligned axes).
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
         t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
-        ahead: motion already applied beyond the last odometry. odometry: whether any has arrived.
+        ahead: motion already applied beyond the last odometry. odometry: whether any has arrived; t_odometry: its end.
         doubt: factor on the noise's variance, learned.
     """
 
@@ -79,6 +79,7 @@ class Motion:
     t_gyro: float = -math.inf
     ahead: Array = field(default_factory=se2.identity)
     odometry: bool = False
+    t_odometry: float = -math.inf
     doubt: float = 1.0
 
 
@@ -91,16 +92,30 @@ def move(motion: Motion, delta: Array, variance: Array) -> None:
 
 
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
-    """Replace what was carried ahead by what the wheels say. An increment that is no number is passed over."""
+    """Replace what was carried ahead by what the wheels say. An increment that is no number is passed over.
+
+    Only an increment that follows on the last one speaks of the same stretch as the carry. One that begins anew (a
+    sender switched on late) or bridges a silence adds what lies after the present instant: until then the pose has been
+    held by others.
+    """
     if not np.isfinite(record.delta).all():
         return
-    motion.odometry = True
     dt = record.t_end - record.t_begin
     variance = odometry_variance(record.delta, dt, noise)
-    move(motion, se2.between(motion.ahead, record.delta), variance)
+    follows = abs(record.t_begin - motion.t_odometry) < 1e-6 and dt < LONGEST_CARRY_S
+    made = se2.between(motion.ahead, record.delta) if follows else remainder(record, motion.t_mono)
+    move(motion, made, variance)
     feel(motion, record.delta, (record.t_begin, record.t_end), motion.doubt * variance, noise)
-    motion.ahead = se2.identity()
+    motion.ahead, motion.odometry, motion.t_odometry = se2.identity(), True, record.t_end
     motion.t_mono = max(motion.t_mono, record.t_end)
+
+
+def remainder(record: Odometry, t_mono: float) -> Array:
+    """The part of an increment that lies after an instant."""
+    dt = record.t_end - record.t_begin
+    if not dt > 0.0 or t_mono <= record.t_begin:
+        return record.delta
+    return se2.exp(se2.log(record.delta) * max(0.0, (record.t_end - t_mono) / dt))
 
 
 def odometry_variance(delta: Array, dt: float, noise: MotionNoise) -> Array:
