@@ -86,6 +86,8 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     mask: Mask = Mask()
 
     def __post_init__(self) -> None:
+        if self.device != "auto" and not re.match(r"/.|[\w-]+:.", self.device):
+            raise ValueError(f"Expected `auto`, a path such as /dev/ttyACM0 or tcp://host:port, got `{self.device}`")
         if self.baud not in BAUDS:
             raise ValueError(f"Expected one of {', '.join(map(str, BAUDS))} in `baud`, got {self.baud}")
 

@@ -17,6 +17,7 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from daemon import configfile
@@ -227,6 +228,7 @@ def main(args: argparse.Namespace) -> int:
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
+    log.info("%s", _whereabouts(settings, args.record))
     recorder = None
     try:
         if args.record is not None:
@@ -238,6 +240,15 @@ def main(args: argparse.Namespace) -> int:
         log.error("%s", error)
         return 1
     return 0
+
+
+def _whereabouts(settings: Config, record: Path | None) -> str:
+    """One line for the person at the terminal: where the pose can be read, what is kept, how to stop."""
+    modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
+    said = [modbus if settings.modbus.port else "no Modbus"]
+    said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
+    said += [f"recording into {record}"] if record is not None else []
+    return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 
 
 async def _run_until_signal(settings: Config, recorder: Recorder | None) -> None:

@@ -81,6 +81,7 @@ class HokuyoDriver:
         self._rate_found = 0
         self._told: set[str] = set()
         self._loss_told = False
+        self._greeted = False
         self._random = random.Random(device + serial)
 
     @property
@@ -272,9 +273,10 @@ class HokuyoDriver:
             self._status.link = Link.STREAMING
             if count == _GOOD_RUN:
                 self._faults = self._attempts = 0
-                if self._loss_told:
-                    self._loss_told = False
-                    log.info("%s: lidar %s delivers again", self._status.extra["device"], scan.geometry.model)
+                if self._loss_told or not self._greeted:
+                    word = "delivers again" if self._loss_told else f"(serial {scan.geometry.serial}) delivers"
+                    log.info("%s: lidar %s %s", self._status.extra["device"], scan.geometry.model, word)
+                    self._loss_told, self._greeted = False, True
             if self._told and scan.t_rx - began > _CALM_S:
                 self._told.clear()
             on_scan(scan)

@@ -130,7 +130,7 @@ configs = st.builds(
     bind=st.sampled_from(["127.0.0.1", "0.0.0.0", "::1"]),
     lidar=st.builds(
         LidarConfig,
-        device=st.text(st.characters(blacklist_categories=["Cs"]), min_size=1),
+        device=st.just("auto") | st.from_regex(r"(tcp://|/)[ -~]+", fullmatch=True),
         mount=st.builds(Mount, x=st.floats(-100, 100), y=st.floats(-100, 100), yaw=bearings, inverted=st.booleans()),
         mask=st.builds(
             Mask,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -21,9 +23,7 @@ def driving(pose: tuple[float, float, float], velocity: tuple[float, float, floa
 def increments(begin: float, end: float, velocity: tuple[float, float, float], rate: float = 50.0) -> list[Odometry]:
     stamps = np.linspace(begin, end, round((end - begin) * rate) + 1)
     twist = np.array(velocity)
-    return [
-        Odometry(float(a), float(b), se2.exp(twist * (b - a))) for a, b in zip(stamps[:-1], stamps[1:], strict=True)
-    ]
+    return [Odometry(float(a), float(b), se2.exp(twist * (b - a))) for a, b in pairwise(stamps)]
 
 
 def away(a: Array, b: Array) -> float:

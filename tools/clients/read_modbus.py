@@ -90,4 +90,6 @@ if __name__ == "__main__":
             print(reader.read())
         except TimeoutError:
             print("no answer")
+        except ConnectionRefusedError:
+            sys.exit("nobody listens there: is lumiloop running, and does `bind` allow this machine?")
         time.sleep(0.1)
