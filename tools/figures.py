@@ -41,6 +41,7 @@ def bounded(name: str, value: float, unit: str, target: str, command: str) -> Fi
     if relation not in ("<=", ">="):
         raise ValueError(f"figure {name!r}: target {target!r} must read '<= number' or '>= number'")
     limit = float(bound)
+    value = float(value)  # numpy's scalars do not go into JSON
     ok = math.isfinite(value) and (value <= limit if relation == "<=" else value >= limit)
     return Figure(name, value, unit, target, ok, command)
 
@@ -58,5 +59,6 @@ def save(name: str, figures: Sequence[Figure], folder: Path = Path("out")) -> Pa
     """Write ``<folder>/<name>.json`` (a list of objects) and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    path.write_text(json.dumps([asdict(f) for f in figures], indent=1) + "\n")
+    rows = [asdict(f) | {"value": float(f.value)} for f in figures]
+    path.write_text(json.dumps(rows, indent=1) + "\n")
     return path

@@ -2,6 +2,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tools.figures import Figure, bounded, save, table
@@ -20,7 +21,7 @@ def test_a_target_that_cannot_be_judged_is_refused() -> None:
 
 
 def test_saved_figures_read_back(tmp_path: Path) -> None:
-    figures = [bounded("a", 1.0, "ms", "<= 2", "make bench"), Figure("b", 3.0, "MB")]
+    figures = [bounded("a", np.float64(1.0), "ms", "<= 2", "make bench"), Figure("b", np.float64(3.0), "MB")]
     loaded = json.loads(save("demo", figures, tmp_path / "new").read_text())
     assert [entry["name"] for entry in loaded] == ["a", "b"]
     assert loaded[0]["ok"] is True
