@@ -30,6 +30,7 @@ def fuse(state: State, match: MatchResult) -> None:
         moving.P = invert3(invert3(P) + match.information)
         if state.t_scan > -np.inf:
             made = se2.between(state.T_odom_scan, moving.T_odom_base)
+            moving.gyro.learn(float(made[2]), moving.t_mono - state.t_scan)
             motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * np.diag(moving.P), state.settings.noise)
     elif match.reason is not Reason.NO_MAP:
         state.failures += 1

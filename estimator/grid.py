@@ -97,7 +97,7 @@ def extent(keyframes: Sequence[Keyframe], margin: float) -> tuple[Array, Array]:
 
 
 def render(keyframes: Sequence[Keyframe], resolution: float) -> Grid:
-    """The grid of these keyframes at their present places in the map.
+    """The grid of these keyframes at their present places in the map; the GIL is free while a scan is cast.
 
     Raises:
         ValueError: the resolution is not positive, or the grid would have more than :data:`LIMIT` cells.

@@ -21,8 +21,16 @@ from estimator.records import Array
 GRAZE = 0.2
 """Part of the range noise that remains across a surface met at a grazing angle: footprint, roughness, bearing."""
 
-INLIERS, PAIRS, WEIGHTS, SQUARES, SETTLED, LENGTH2 = range(15, 21)
-"""Places in the sums behind the normal equations."""
+ASKEW = 0.6
+"""Sine of the largest angle between a point's surface and its partner's, 37 deg: leaves room for a wrong heading."""
+
+SHRINK = 2.0
+"""Robust scale in units of what the last step moved a point."""
+
+INLIERS, PAIRS, WEIGHTS, SQUARES, SETTLED, LENGTH2, DAMPING = range(15, 22)
+"""Places in the sums behind the normal equations; ``SUMS`` in all."""
+
+SUMS = 22
 
 
 Reference = tuple[Array, Ints, Array, Array]
@@ -37,7 +45,7 @@ squared, it may move until another row can be nearest."""
     "void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, i8,"
     " Tuple((i8[::1], i8[::1], f8[:, ::1])))"
 )
-def pair_up(xy: Array, reference: Reference, T: Array, gate2: float, stride: int, memory: Memory) -> None:
+def pair_up(points: Array, reference: Reference, T: Array, gate2: float, stride: int, memory: Memory) -> None:
     """Step 1 of Sect. 4.2: the nearest row within the gate for every ``stride``-th point at pose ``T``.
 
     A point that has not left its safe radius keeps its row without being looked up.
@@ -45,9 +53,9 @@ def pair_up(xy: Array, reference: Reference, T: Array, gate2: float, stride: int
     rows, start, rays, _ = reference
     partner, found, safe = memory
     c, s = np.cos(T[2]), np.sin(T[2])
-    for i in range(0, len(xy), stride):
-        px = c * xy[i, 0] - s * xy[i, 1] + T[0]
-        py = s * xy[i, 0] + c * xy[i, 1] + T[1]
+    for i in range(0, len(points), stride):
+        px = c * points[i, 0] - s * points[i, 1] + T[0]
+        py = s * points[i, 0] + c * points[i, 1] + T[1]
         row = found[i]
         if row >= 0 and (px - safe[i, 0]) ** 2 + (py - safe[i, 1]) ** 2 < safe[i, 2]:
             d2 = (px - rows[row, 0]) ** 2 + (py - rows[row, 1]) ** 2
@@ -61,7 +69,7 @@ def pair_up(xy: Array, reference: Reference, T: Array, gate2: float, stride: int
 
 @kernel("void(f8[:, ::1], Tuple((f8[:, ::1], f8[:, ::1], i8[::1])), f8[::1], Tuple((f8, f8, f8)), i8, f8[::1])")
 def sum_up(
-    xy: Array,
+    points: Array,
     pairs: tuple[Array, Array, Ints],
     T: Array,
     how: tuple[float, float, float],
@@ -70,9 +78,9 @@ def sum_up(
 ) -> None:
     """Step 2 of Sect. 4.2: the normal equations of point-to-line over the pairs.
 
-    ``pairs``: rows, lines and each point's partner. ``how``: lidar in the base frame (x, y), robust scale. ``sums``: 6
-    of the information, 6 of its expected noise part, 3 of the gradient, inliers, pairs, robust weights and squares
-    (m^2, scaled to what they would be as range noise).
+    ``points``: x, y and tangent (n, 4). ``pairs``: rows, lines and each point's partner. ``how``: lidar in the base
+    frame (x, y), robust scale. ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient,
+    inliers, pairs, robust weights and squares (m^2, scaled to what they would be as range noise).
     """
     rows, lines, partner = pairs
     c, s = np.cos(T[2]), np.sin(T[2])
@@ -81,16 +89,18 @@ def sum_up(
     h00 = h01 = h02 = h11 = h12 = h22 = 0.0
     n00 = n01 = n02 = n11 = n12 = n22 = 0.0
     g0 = g1 = g2 = inliers = count = weights = squares = 0.0
-    for i in range(0, len(xy), stride):
+    for i in range(0, len(points), stride):
         row = partner[i]
         if row < 0:
             continue
-        ux, uy = c * xy[i, 0] - s * xy[i, 1], s * xy[i, 0] + c * xy[i, 1]
+        ux, uy = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
         px, py = ux + T[0], uy + T[1]
-        nx, ny = lines[row, 0], lines[row, 1]
+        nx, ny, tx, ty = lines[row, 0], lines[row, 1], points[i, 2], points[i, 3]
         facing = nx * (ex - px) + ny * (ey - py)
         if facing <= 0.0:
             continue  # seen from behind: the other side of a thin wall
+        if abs(nx * (c * tx - s * ty) + ny * (s * tx + c * ty)) > ASKEW:
+            continue  # the other wall of a corner
         cos2 = facing * facing / ((ex - px) ** 2 + (ey - py) ** 2)
         p = 1.0 / (GRAZE + (1.0 - GRAZE) * cos2)  # precision in units of the range noise
         e = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
@@ -153,14 +163,13 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
             H[i, j] = keep[i, 0] * M[0, j] + keep[i, 1] * M[1, j] + keep[i, 2] * M[2, j]
 
 
-@kernel("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8, f8)")
-def first_scale(xy: Array, eye: Array, L1: Array, last: float, gate: float) -> float:
-    """Robust scale to begin with: twice what the prediction's uncertainty moves a point at the scan's mean range."""
+@kernel("f8(f8[:, ::1], f8[::1])")
+def mean_lever(points: Array, eye: Array) -> float:
+    """Root mean square distance of the points from the lidar: metres that they move per radian."""
     square = 0.0
-    for i in range(len(xy)):
-        square += (xy[i, 0] - eye[0]) ** 2 + (xy[i, 1] - eye[1]) ** 2
-    spread = 1.0 / L1[0, 0] + 1.0 / L1[1, 1] + square / max(len(xy), 1) / L1[2, 2]
-    return float(min(max(last, 2.0 * np.sqrt(spread)), 0.5 * gate))
+    for i in range(len(points)):
+        square += (points[i, 0] - eye[0]) ** 2 + (points[i, 1] - eye[1]) ** 2
+    return float(np.sqrt(square / max(len(points), 1)))
 
 
 @kernel(
@@ -168,7 +177,7 @@ def first_scale(xy: Array, eye: Array, L1: Array, last: float, gate: float) -> f
     " Tuple((f8[:, ::1], f8[::1])))"
 )
 def iterate(
-    xy: Array,
+    points: Array,
     reference: Reference,
     T: Array,
     L1: Array,
@@ -177,11 +186,12 @@ def iterate(
 ) -> int:
     """Iterate Eq. 13-14 from ``T`` (relative to the axis centre), which is moved in place; the number of iterations.
 
-    The robust scale shrinks from what the prediction's uncertainty asks for to a few times the noise; until then every
-    fourth point will do. A step that turns back on the one before is halved: pairs may alternate between two sets.
+    The robust scale shrinks from twice what the prediction's uncertainty moves a point to a few times the noise, not
+    faster than the steps do; until then every fourth point will do. A step that turns back on the one before is halved:
+    pairs may alternate between two sets.
     ``how``: lidar in the base frame (x, y), iteration cap, gate, last scale, noise, least step in its own deviations,
-    stride while coarse. ``out``: the laser's information (3, 3), and the sums of the last pass with SETTLED and LENGTH2
-    (squared length of the last step in its own deviations).
+    stride while coarse. ``out``: the laser's information (3, 3), and the sums of the last pass with SETTLED, LENGTH2
+    (squared length of the last step in its own deviations) and DAMPING.
     """
     H, sums = out
     T1 = T.copy()
@@ -190,10 +200,10 @@ def iterate(
     step = np.empty(3)
     before = np.zeros(3)
     keep = np.empty((3, 3))
-    eye = how[:2]
-    last = how[4]
-    scale = first_scale(xy, eye, L1, last, how[3])
-    memory = (np.full(len(xy), -1), np.full(len(xy), -1), np.zeros((len(xy), 3)))
+    last, lever = how[4], mean_lever(points, how[:2])
+    spread = np.sqrt(1.0 / L1[0, 0] + 1.0 / L1[1, 1] + lever * lever / L1[2, 2])
+    scale = min(max(last, 2.0 * spread), 0.5 * how[3])
+    memory = (np.full(len(points), -1), np.full(len(points), -1), np.zeros((len(points), 3)))
     damping = 1.0
     count = 0
     sums[SETTLED] = 0.0
@@ -202,8 +212,10 @@ def iterate(
         stride = int(how[7]) if scale > 2.0 * last else 1
         k = stride / (how[5] * how[5])
         gate = min(how[3], max(6.0 * scale, 0.1))
-        pair_up(xy, reference, T, gate * gate, stride, memory)
-        sum_up(xy, (reference[0], reference[3], memory[0]), T, (how[0], how[1], scale), stride, sums)
+        pair_up(points, reference, T, gate * gate, stride, memory)
+        sum_up(points, (reference[0], reference[3], memory[0]), T, (how[0], how[1], scale), stride, sums)
+        sums[INLIERS] *= stride
+        sums[PAIRS] *= stride
         trusted(sums, k, H, keep)
         for i in range(3):
             b[i] = 0.0
@@ -222,7 +234,8 @@ def iterate(
         for i in range(3):
             T[i] += damping * step[i]
             before[i] = step[i]
-        sums[LENGTH2] = length2
+        sums[LENGTH2], sums[DAMPING] = length2, damping
         sums[SETTLED] = 1.0 if length2 < how[6] * how[6] and scale == last else 0.0
-        scale = max(last, (0.25 if length2 < 4.0 else 0.5) * scale)
+        moved = np.sqrt(step[0] * step[0] + step[1] * step[1]) + lever * abs(step[2])
+        scale = max(last, min(scale, max(0.25 * scale, SHRINK * moved)))
     return count

@@ -46,7 +46,7 @@ class MapSettings:
     """
 
     spacing_m: float = 0.025
-    age: int = 10
+    age: int = 20
     weight: float = 10.0
     capacity: int = 6000
     strikes: float = 0.3

@@ -16,6 +16,9 @@ from estimator.result import MatchResult, Reason
 VAGUE = np.diag((4.0, 4.0, 33.0))
 """Information of a pose known to 0.5 m and 10 deg."""
 
+FIRST, SECOND = 30, 20
+"""Most iterations of a first attempt, and of the one that finishes a second opinion."""
+
 SURE = 0.8
 """Share of fitting beams beyond which a good prediction needs no further evidence."""
 
@@ -28,8 +31,9 @@ class MatchSettings:
         gate_m: farthest partner ever accepted. scale: final robust scale in units of the noise.
         settled: a step shorter than this share of its own standard deviation ends the iteration.
         min_points: fewest pairs that make a result.
-        tracking, searching: least share of the beams that must fit, and largest share of the evidence that may speak
-            against it: when the prediction was good, and when it was not (a wrong place can look half right).
+        tracking, searching: ways to be believed, each the least share of the beams that must fit and the largest share
+            of the evidence that may speak against it, in falling order: when the prediction was good, and when it was
+            not (a wrong place can look half right).
         wide_m, wide_rad: deviations of the prediction beyond which it counts as not good.
         doubt_share: where fewer beams fit, the prediction is doubted. doubt_m, doubt_rad: its deviations are then taken
             to be at least these, and ``fan`` headings to either side are tried, ``fan_rad`` apart.
@@ -40,8 +44,8 @@ class MatchSettings:
     scale: float = 2.5
     settled: float = 0.2
     min_points: int = 10
-    tracking: tuple[float, float] = (0.35, 0.35)
-    searching: tuple[float, float] = (0.6, 0.1)
+    tracking: tuple[tuple[float, float], ...] = ((0.35, 0.35),)
+    searching: tuple[tuple[float, float], ...] = ((0.6, 0.1), (0.5, 0.02))
     wide_m: float = 0.15
     wide_rad: float = 0.1
     doubt_share: float = 0.6
@@ -58,11 +62,11 @@ class View:
     """What is to be matched.
 
     Attributes:
-        xy: (n, 2) points in the base frame at the scan's end. T_base_lidar: mount.
+        points: (n, 4) place and tangent in the base frame at the scan's end. T_base_lidar: mount.
         beams: the scan they came from, for what it says of free space. noise_m: range noise to reckon with.
     """
 
-    xy: Array
+    points: Array
     T_base_lidar: Array
     beams: Beams
     noise_m: float
@@ -93,42 +97,48 @@ class Attempt:
 
 
 def match(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> MatchResult:
-    """Match a scan from its prediction in at most ``cap`` iterations (a second opinion may take as many again)."""
-    best = attempt(view, local, prior, cap, settings)
-    if best.share < settings.doubt_share:
-        best = second_opinion(best, view, local, prior, settings)
-    return verdict(best, view, local, prior, settings)
+    """Match a scan from its prediction in at most ``cap`` iterations, a second opinion included."""
+    first = attempt(view, local, prior, min(cap, FIRST), settings)
+    result = verdict(first, view, local, prior, settings)
+    left = cap - first.iterations
+    if left < SECOND or (result.ok and first.share >= settings.doubt_share):
+        return result
+    second = second_opinion(first, view, local, prior, settings)
+    return replace(verdict(second, view, local, prior, settings), iterations=min(cap, second.iterations))
 
 
 def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> Attempt:
     """Iterate from a prediction."""
-    H, sums = np.zeros((3, 3)), np.zeros(21)
+    H, sums = np.zeros((3, 3)), np.zeros(icp.SUMS)
     axis, noise = local.axis, view.noise_m
-    coarse = settings.coarse if len(view.xy) > settings.dense else 1
+    coarse = settings.coarse if len(view.points) > settings.dense else 1
     tail = (cap, settings.gate_m, settings.scale * noise, noise, settings.settled, coarse)
-    eye = view.T_base_lidar
-    how = np.array((eye[0], eye[1], *tail))
+    how = np.array((view.T_base_lidar[0], view.T_base_lidar[1], *tail))
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = prior.T - centre
-    n = icp.iterate(view.xy, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums))
-    return Attempt(T + centre, H, sums, n, len(view.xy))
+    n = icp.iterate(view.points, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums))
+    return Attempt(T + centre, H, sums, n, len(view.points))
 
 
 def second_opinion(first: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> Attempt:
-    """Doubt the prediction: look about it for the place and heading that fit best, on a few points; finish that one."""
-    L = np.minimum(prior.L, np.diag((settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2)))
-    L[~np.eye(3, dtype=bool)] = 0.0
-    few = replace(view, xy=np.ascontiguousarray(view.xy[:: max(1, len(view.xy) // 180)]))
-    best, share = first, first.share + 0.05
+    """Doubt the prediction: look about it for the place and heading that fit best, on a few points; finish that one.
+
+    Iterations are counted by the points they took, so that what is said of the cost stays true.
+    """
+    L = np.diag(np.minimum(np.diag(prior.L), (settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2)))
+    few = replace(view, points=np.ascontiguousarray(view.points[:: max(1, len(view.points) // 180)]))
+    best, share, work = first, first.share + 0.05, 0
     for k in range(-settings.fan, settings.fan + 1):
         start = Prior(prior.T + np.array((0.0, 0.0, k * settings.fan_rad)), L)
         trial = attempt(few, local, start, 12, settings)
+        work += trial.iterations * len(few.points)
         if trial.share > share:
             best, share = trial, trial.share
-    if best is first:
-        return first
-    final = attempt(view, local, Prior(best.T, L), 30, settings)
-    return final if final.share > first.share else first
+    if best is not first:
+        best = attempt(view, local, Prior(best.T, L), SECOND, settings)
+        work += best.iterations * best.points
+    better = best if best.share > first.share else first
+    return replace(better, iterations=first.iterations + work // max(1, first.points))
 
 
 def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> MatchResult:
@@ -144,7 +154,7 @@ def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: 
     elif sums[icp.SETTLED]:
         reason = Reason.CONVERGED
     else:
-        reason = Reason.ITERATION_CAP if length2 < 4.0 else Reason.OSCILLATING
+        reason = Reason.OSCILLATING if sums[icp.DAMPING] < 0.5 and length2 > 1.0 else Reason.ITERATION_CAP
     ok = reason in (Reason.CONVERGED, Reason.ITERATION_CAP)
     H = best.H / (1.0 + length2)
     return MatchResult(
@@ -170,12 +180,13 @@ def plausible(
     x, y, yaw = correction.tolist()
     surprise = float(correction @ L @ correction) > 25.0
     surprise = surprise and (x * x + y * y > settings.wide_m**2 or abs(yaw) > settings.wide_rad)
-    share, against = settings.searching if wide or surprise else settings.tracking
-    if best.share < share:
+    ways = settings.searching if wide or surprise else settings.tracking
+    if best.share < ways[-1][0]:
         return False
     if best.share > SURE and not wide:
         return True
-    return contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m) <= against
+    against = contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m)
+    return any(best.share >= share and against <= most for share, most in ways)
 
 
 def known_axes(H: Array) -> Array:

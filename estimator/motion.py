@@ -26,6 +26,8 @@ LARGEST_TURN = math.pi
 
 GYRO_RAD = 5e-4
 """Error of a gyro reading's turn: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
+BIAS_LEARNING = 0.02
+"""Share of the difference to a match's turn that goes into the gyro's bias, per 0.1 s."""
 GYRO_GATE = 5.0
 """Deviations beyond which a gyro is not believed: wrong units, or damaged. No robot gains speed like that."""
 
@@ -57,6 +59,31 @@ class MotionNoise:
         return self.acceleration**2, self.acceleration**2, self.angular_acceleration**2
 
 
+@dataclass(slots=True)
+class Gyro:
+    """What the gyro has added up: since the last odometry, and since the last match; and its bias, learned there."""
+
+    turned_rad: float = 0.0
+    span_s: float = 0.0
+    match_turned_rad: float = 0.0
+    match_span_s: float = 0.0
+    bias_rad_s: float = 0.0
+
+    def add(self, turn: float, dt: float) -> None:
+        """Take in a reading, less the bias."""
+        self.turned_rad += turn
+        self.span_s += dt
+        self.match_turned_rad += turn
+        self.match_span_s += dt
+
+    def learn(self, turned_rad: float, dt: float) -> None:
+        """Compare with the turn that two matches ``dt`` apart have shown, if readings covered it."""
+        span, said = self.match_span_s, self.match_turned_rad
+        self.match_turned_rad = self.match_span_s = 0.0
+        if dt > 0.0 and abs(span - dt) < 0.3 * dt:
+            self.bias_rad_s += BIAS_LEARNING * min(1.0, dt / 0.1) * (said * dt / span - turned_rad) / dt
+
+
 @dataclass(slots=True, eq=False)
 class Motion:
     """The moving pose and its uncertainty: the predicted half of a filter.
@@ -67,7 +94,7 @@ class Motion:
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
         t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
         ahead: motion already applied beyond the last odometry. odometry: whether any has arrived; t_odometry: its end.
-        doubt: factor on the noise's variance, learned.
+        doubt: factor on the noise's variance, learned. gyro: sums and bias.
     """
 
     t_mono: float = -math.inf
@@ -81,6 +108,7 @@ class Motion:
     odometry: bool = False
     t_odometry: float = -math.inf
     doubt: float = 1.0
+    gyro: Gyro = field(default_factory=Gyro)
 
 
 def move(motion: Motion, delta: Array, variance: Array) -> None:
@@ -92,8 +120,9 @@ def move(motion: Motion, delta: Array, variance: Array) -> None:
 
 
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
-    """Replace what was carried ahead by what the wheels say. An increment that is no number is passed over.
+    """Replace what was carried ahead by what the wheels say, and their turn by the gyro's where it covers the stretch.
 
+    An increment that is no number is passed over.
     Only an increment that follows on the last one speaks of the same stretch as the carry. One that begins anew (a
     sender switched on late) or bridges a silence adds what lies after the present instant: until then the pose has been
     held by others.
@@ -101,21 +130,25 @@ def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
     if not np.isfinite(record.delta).all():
         return
     dt = record.t_end - record.t_begin
-    variance = odometry_variance(record.delta, dt, noise)
+    delta, variance = record.delta, odometry_variance(record.delta, dt, noise)
+    if dt > 0.0 and abs(motion.gyro.span_s - dt) < 0.3 * dt:
+        delta = np.array((delta[0], delta[1], motion.gyro.turned_rad * dt / motion.gyro.span_s))
+        variance[2] = min(float(variance[2]), GYRO_RAD**2)
+    motion.gyro.turned_rad = motion.gyro.span_s = 0.0
     follows = abs(record.t_begin - motion.t_odometry) < 1e-6 and dt < LONGEST_CARRY_S
-    made = se2.between(motion.ahead, record.delta) if follows else remainder(record, motion.t_mono)
+    made = se2.between(motion.ahead, delta) if follows else remainder(delta, record, motion.t_mono)
     move(motion, made, variance)
-    feel(motion, record.delta, (record.t_begin, record.t_end), motion.doubt * variance, noise)
+    feel(motion, delta, (record.t_begin, record.t_end), motion.doubt * variance, noise)
     motion.ahead, motion.odometry, motion.t_odometry = se2.identity(), True, record.t_end
     motion.t_mono = max(motion.t_mono, record.t_end)
 
 
-def remainder(record: Odometry, t_mono: float) -> Array:
-    """The part of an increment that lies after an instant."""
+def remainder(delta: Array, record: Odometry, t_mono: float) -> Array:
+    """The part of an increment ``delta``, made over the record's interval, that lies after an instant."""
     dt = record.t_end - record.t_begin
     if not dt > 0.0 or t_mono <= record.t_begin:
-        return record.delta
-    return se2.exp(se2.log(record.delta) * max(0.0, (record.t_end - t_mono) / dt))
+        return delta
+    return se2.exp(se2.log(delta) * max(0.0, (record.t_end - t_mono) / dt))
 
 
 def odometry_variance(delta: Array, dt: float, noise: MotionNoise) -> Array:
@@ -148,7 +181,7 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
 
 
 def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
-    """Turn by what the gyro says over its interval, move on at the velocity; odometry replaces the motion later.
+    """Turn by what the gyro says over its interval, less its bias, and move on at the velocity.
 
     A rate that the turn rate known so far cannot have become meanwhile is passed over: taken for certain, it would
     carry the pose to where no scan fits, and the map would be begun anew there.
@@ -157,13 +190,14 @@ def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
     if not (0.0 < dt < LONGEST_CARRY_S and math.isfinite(record.dyaw)):
         return
     carry_to(motion, record.t_begin, noise)
-    rate, variance = record.dyaw / dt, (GYRO_RAD / dt) ** 2
+    rate, variance = record.dyaw / dt - motion.gyro.bias_rad_s, (GYRO_RAD / dt) ** 2
     late = min(max(0.0, record.t_end - max(motion.t_felt, motion.t_gyro)), LONGEST_CARRY_S)
     expected = float(motion.velocity_variance[2]) + (noise.angular_acceleration * late) ** 2 + variance
     if (rate - float(motion.velocity[2])) ** 2 <= GYRO_GATE**2 * expected:
         motion.velocity = np.array((motion.velocity[0], motion.velocity[1], rate))
         motion.velocity_variance[2] = variance
         motion.t_gyro = record.t_end
+        motion.gyro.add(rate * dt, dt)
     carry_to(motion, record.t_end, noise)
 
 

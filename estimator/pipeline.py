@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 
 import numpy as np
@@ -14,12 +15,12 @@ from estimator.keyframe import unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_keyframe, update_map
 from estimator.matching import Prior, View
-from estimator.records import Array, Command, Imu, Limits, Odometry, Record, Scan
+from estimator.records import Array, Command, Imu, Job, Limits, Odometry, Record, Scan
 from estimator.result import MatchResult, Reason, StepResult
-from estimator.scanpoints import ScanPoints, points_of
+from estimator.scanpoints import ScanPoints, oriented, points_of
 from estimator.state import Settings, State, new_state
 
-__all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_map", "step"]
+__all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_job", "render_map", "step"]
 
 
 def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
@@ -75,9 +76,8 @@ def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> 
         return matching.no_match(T_pred, count, Reason.NO_MAP)
     if count < state.settings.matching.min_points:
         return matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
-    thin = max(1, -(-count // max(1, limits.points)))
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-    view = View(np.ascontiguousarray(points.xy[::thin]), scan.T_base_lidar, beams, noise_of(state, scan))
+    view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan))
     prior = Prior(T_pred, invert3(state.fused.P))
     return matching.match(view, state.local, prior, limits.icp_iterations, state.settings.matching)
 
@@ -118,3 +118,13 @@ def keyframe_poses(state: State) -> dict[int, Array]:
 def render_map(state: State, resolution: float) -> Grid:
     """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (see `grid.render`)."""
     return grid.render(list(state.keyframes.values()), resolution)
+
+
+def render_job(state: State, resolution: float, job_id: int, priority: int = 9) -> Job:
+    """:func:`render_map` as work for the background worker: the keyframes of this moment, nothing else of the state.
+
+    The answer's payload is the `Grid`. Later steps do not disturb it: a keyframe's scan never changes, and a correction
+    replaces its pose as a whole.
+    """
+    keyframes = tuple(copy.copy(frame) for frame in state.keyframes.values())
+    return Job(job_id, priority, lambda: grid.render(keyframes, resolution))

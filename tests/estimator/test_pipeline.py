@@ -48,6 +48,7 @@ def drive(state: State, *, odometry: bool, n: int = 300) -> tuple[list[Array], l
     return truth, results
 
 
+@pytest.mark.jit
 @pytest.mark.parametrize("odometry", [True, False])
 def test_follows_the_robot(odometry: bool) -> None:
     state = new_state(Settings(history=True))
@@ -62,6 +63,7 @@ def test_follows_the_robot(odometry: bool) -> None:
         np.testing.assert_allclose(again, se2.compose(r.T_map_odom, r.T_odom_base), atol=1e-9)
 
 
+@pytest.mark.jit
 def test_map_shows_the_walls_and_the_free_floor() -> None:
     state = new_state(Settings())
     drive(state, odometry=True)

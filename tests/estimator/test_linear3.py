@@ -1,0 +1,71 @@
+"""The small solvers against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from estimator.linear3 import TINY, eigen3, invert3, positive, solve3
+from estimator.records import Array
+
+FACTORS = arrays(np.float64, (3, 3), elements=st.floats(-3.0, 3.0))
+SCALES = st.sampled_from([(1.0, 1.0, 1.0), (1e3, 1e-2, 1.0), (1.0, 1.0, 1e-4)])
+
+
+def spd(factor: Array, scale: tuple[float, float, float]) -> Array:
+    s = np.diag(scale)
+    return np.ascontiguousarray(s @ (factor @ factor.T + 0.1 * np.eye(3)) @ s)
+
+
+@given(FACTORS, SCALES, arrays(np.float64, 3, elements=st.floats(-5.0, 5.0)))
+@settings(deadline=None)
+def test_solve(factor: Array, scale: tuple[float, float, float], b: Array) -> None:
+    A, x = spd(factor, scale), np.empty(3)
+    det = solve3(A, b, x)
+    assert det == pytest.approx(np.linalg.det(A), rel=1e-6)
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-6, atol=1e-6)
+
+
+def test_solve_refuses_what_is_singular() -> None:
+    x = np.ones(3)
+    assert solve3(np.diag((1.0, 1.0, 0.0)), np.ones(3), x) == 0.0
+    assert not x.any()
+    assert solve3(np.full((3, 3), np.nan), np.ones(3), x) == 0.0
+
+
+@given(FACTORS)
+@settings(deadline=None)
+def test_eigen(factor: Array) -> None:
+    A = np.ascontiguousarray(factor + factor.T)
+    D, V = A.copy(), np.empty((3, 3))
+    eigen3(D, V)
+    np.testing.assert_allclose(np.sort(np.diag(D)), np.linalg.eigvalsh(A), atol=1e-9)
+    np.testing.assert_allclose(V @ V.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(V @ np.diag(np.diag(D)) @ V.T, A, atol=1e-9)
+
+
+@given(FACTORS)
+@settings(deadline=None)
+def test_positive(factor: Array) -> None:
+    A = np.ascontiguousarray(factor + factor.T)
+    least = np.linalg.eigvalsh(A)[0]
+    if abs(least) > 1e-6:
+        assert positive(A) == (least > 0.0)
+
+
+@given(FACTORS, SCALES)
+@settings(deadline=None)
+def test_invert(factor: Array, scale: tuple[float, float, float]) -> None:
+    A = spd(factor, scale)
+    exact = np.linalg.inv(A + TINY * np.eye(3))
+    d = np.sqrt(np.diag(exact))
+    np.testing.assert_allclose(invert3(A) / d / d[:, None], exact / d / d[:, None], atol=1e-4)
+
+
+def test_invert_is_finite_for_nothing_and_for_one_direction() -> None:
+    assert np.isfinite(invert3(np.zeros((3, 3)))).all()
+    line = np.outer((1.0, 2.0, 0.0), (1.0, 2.0, 0.0))
+    assert np.isfinite(invert3(line)).all()

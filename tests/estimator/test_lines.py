@@ -1,0 +1,85 @@
+"""Line elements: where surfaces are, which way they face, and how well that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimator.lines import lines_of, neighbours
+from estimator.records import Array
+from estimator.scanpoints import ScanPoints
+from tests.estimator.world import points_in, scan_in
+from tools.bench._scenes import Scene, bearings, box, paper_room
+
+ORIGIN = np.zeros(2)
+
+
+def points(xy: Array, sigma: float = 0.01) -> ScanPoints:
+    return ScanPoints(np.ascontiguousarray(xy), ORIGIN, 0.0, sigma)
+
+
+def wall(n: int, spacing: float, noise: Array | float = 0.0) -> Array:
+    x = (np.arange(n) - (n - 1) / 2.0) * spacing
+    return np.column_stack((x, 2.0 + noise * np.ones(n)))
+
+
+def test_a_wall_faces_the_sensor() -> None:
+    lines = lines_of(points(wall(41, 0.02)))
+    assert len(lines) == 41
+    np.testing.assert_allclose(lines[:, 1], 2.0, atol=1e-9)
+    np.testing.assert_allclose(lines[:, 2:4], np.tile((0.0, -1.0), (41, 1)), atol=1e-9)
+    np.testing.assert_allclose(lines[:, 5], 0.8)
+
+
+def test_sparse_beams_use_their_neighbours_and_no_others() -> None:
+    assert neighbours(wall(9, 0.3), 4) == (3, 6)  # beyond half a metre nothing belongs together
+    assert neighbours(wall(9, 0.2), 4) == (2, 7)  # two on either side
+    assert neighbours(wall(41, 0.02), 20) == (14, 27)  # all within 12 cm
+    assert len(lines_of(points(wall(9, 0.6)))) == 0
+
+
+def test_runs_are_measured_end_to_end() -> None:
+    xy = np.vstack((wall(11, 0.02), wall(11, 0.02) + np.array((3.0, 0.0))))
+    np.testing.assert_allclose(lines_of(points(xy))[:, 5], 0.2)
+
+
+def test_what_is_no_line_is_left_out() -> None:
+    assert len(lines_of(points(np.empty((0, 2))))) == 0
+    assert len(lines_of(points(np.full((30, 2), 1.0)))) == 0
+    cloud = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 2)) + 2.0
+    assert len(lines_of(points(cloud))) <= 20  # a few neighbours are in line by chance
+
+
+@pytest.mark.jit
+def test_the_variance_of_a_direction_is_what_noise_makes_it() -> None:
+    rng = np.random.default_rng(2)
+    directions, said = [], []
+    for _ in range(400):
+        lines = lines_of(points(wall(31, 0.02, rng.normal(0.0, 0.01, 31))))
+        directions.append(np.arctan2(lines[15, 2], -lines[15, 3]))
+        said.append(lines[15, 4])
+    assert np.median(said) == pytest.approx(np.var(directions), rel=0.25)
+
+
+@pytest.mark.jit
+def test_a_column_is_not_drawn_inwards() -> None:
+    """The mean distance of the elements from the column's middle is its radius to a millimetre, and no chord's."""
+    rng = np.random.default_rng(3)
+    scene = paper_room()
+    radii = []
+    for _ in range(40):
+        scan = scan_in(scene, np.array((0.5, 2.5, 0.0)), bearings(361, 90.0), rng)
+        lines = lines_of(points_in(scan))
+        r = np.hypot(*(lines[:, :2] + np.array((0.5, 2.5)) - scene.columns[3, :2]).T)
+        radii.append(r[r < 0.4])
+    assert np.mean(np.concatenate(radii)) == pytest.approx(0.25, abs=1.5e-3)
+
+
+def test_corners_of_a_room_keep_their_walls_apart() -> None:
+    scene = Scene(np.array(box(-2, -2, 2, 2), dtype=np.float64), (-1, -1), (1, 1))
+    scan = scan_in(scene, np.zeros(3), bearings(721, 180.0), np.random.default_rng(1))
+    lines = lines_of(points_in(scan))
+    along_axes = np.maximum(np.abs(lines[:, 2]), np.abs(lines[:, 3]))
+    assert np.percentile(along_axes, 5) > np.cos(np.radians(8.0))
+    off = np.minimum(np.abs(np.abs(lines[:, 0]) - 2.0), np.abs(np.abs(lines[:, 1]) - 2.0))
+    assert np.sqrt(np.mean(off**2)) < 0.008
