@@ -78,7 +78,7 @@ class Bench:
     def __init__(self, settings: Config) -> None:
         clock = LoopClock(asyncio.get_running_loop())
         opener = FakeOpener(clock)
-        opener.plug("lidar", FakeHokuyo(URG_04LX_UG01, Room(URG_04LX_UG01)))
+        opener.plug("/dev/lidar", FakeHokuyo(URG_04LX_UG01, Room(URG_04LX_UG01)))
         self.snapshots: list[Snapshot] = []
 
         async def warm() -> None:
@@ -102,7 +102,7 @@ class Bench:
 
 
 def settings(**more: object) -> Config:
-    return Config(lidar=LidarConfig(device="lidar"), **more)  # type: ignore[arg-type]  # test shorthand
+    return Config(lidar=LidarConfig(device="/dev/lidar"), **more)  # type: ignore[arg-type]  # test shorthand
 
 
 def test_a_plc_sets_the_pose_and_is_told_when_it_is_done() -> None:
