@@ -18,11 +18,12 @@ class Blemish(Flag):
     """What is known to be wrong with a block of samples; the block is delivered all the same."""
 
     NONE = 0
-    STRETCHED = auto()  # took longer than its bits: samples inside are not evenly spaced
+    STRETCHED = auto()  # took longer than its bits: returned late, or samples inside are not evenly spaced
     CLIPPED = auto()  # words at either rail
     STUCK = auto()  # the same word over and over
     MISALIGNED = auto()  # upper bits set: shifted or lost bits, or a bus that floats
     SHORT = auto()  # fewer words than asked for
+    GAP = auto()  # blocks are missing before this one: dropped, or the bus was not read for longer than a block
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +33,10 @@ class RawSamples:
     Attributes:
         seq: counts blocks of this driver from 0.
         t0, t1: ``t_mono`` immediately before and after the transaction.
-        t_first: ``t_mono`` of the first conversion, anchored at ``t1`` (the return delay is small and positive).
+        t_first: earliest ``t_mono`` of the first conversion, anchored at ``t0``. slack_s: it was no later than
+            ``t_first + slack_s``: by how much longer than its bits the transaction took. Nearly all of that is at the
+            end, where ``t_first`` does not suffer from it (a late return: this process or its interpreter was busy);
+            the rest is fixed overhead, another client of the bus before the block, or a stall inside it.
         rate_hz: conversions per second as measured from transaction lengths; the decoder refines it.
         words: uint16, right-aligned converter codes, 0 .. 2**bits - 1.
     """
@@ -45,6 +49,7 @@ class RawSamples:
     words: npt.NDArray[np.uint16]
     bits: int
     blemish: Blemish
+    slack_s: float = 0.0
 
 
 @dataclass(slots=True)

@@ -14,6 +14,9 @@ ROOT = Path(__file__).parents[1]
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--lidar", default="fake", help="fake, or a real device: /dev/ttyACM0, tcp://192.168.0.10:10940")
+    parser.addoption(
+        "--adc", default="fake", help="fake, or a real converter: /dev/i2c-1@0x4d, /dev/i2c-1@0x54,adc121c021"
+    )
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,251 @@
+"""The client of a remote bus (``unix:/path``, ``tcp://host:port``); :mod:`hal.i2c_frames` describes the protocol.
+
+Repeated transactions are ordered one ahead, so that the bus does not wait for this process between two blocks.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Generator
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from hal import i2c_frames as frames
+from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
+from hal.i2c import Message, Transferred, check
+
+DEFAULT_TCP_PORT: Final = 10941
+CONNECT_S: Final = 2.0
+REPLY_S: Final = 4.0
+"""Longer than any transaction: 8192 bytes at 100 kHz take 0.74 s, an adapter's time-out 1 s, one is ordered ahead."""
+_START: Final = "start the bus server: python -m hal.i2c_server BUS "
+
+
+def clock_name() -> str:
+    """Equal in two processes if and only if they read the same CLOCK_MONOTONIC; empty where that cannot be told."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot} {Path('/proc/self/ns/time').readlink()}"
+    except OSError:
+        return ""
+
+
+class RemoteClock:
+    """Translates the server's clock to ours.
+
+    Every exchange bounds the difference from both sides: what we sent cannot arrive before it was sent, nor its answer.
+    The best of the latest bounds are kept for ``WINDOW`` exchanges, in which clocks drift apart by microseconds.
+    """
+
+    WINDOW: Final = 64
+
+    def __init__(self, same: bool) -> None:
+        self._same = same
+        self._low: deque[float] = deque(maxlen=self.WINDOW)
+        self._high: deque[float] = deque(maxlen=self.WINDOW)
+
+    def learn(self, ordered: float, received: float, sent: float, answered: float) -> None:
+        """One exchange: our times of order and answer, the server's of the same two frames."""
+        self._low.append(sent - answered)
+        self._high.append(received - ordered)
+
+    def ours(self, theirs: float) -> float:
+        """A time of the server in our clock."""
+        if self._same or not self._low:
+            return theirs
+        return theirs - 0.5 * (max(self._low) + min(self._high))
+
+
+class RemoteBus:
+    """An open connection to a bus server; see :class:`hal.i2c.Bus`. Made by :func:`open_remote`. Not thread-safe."""
+
+    def __init__(self, name: str, link: socket.socket) -> None:
+        """Wait for the server's greeting; raises `HalError` where there is none."""
+        self._name = name
+        self._link: socket.socket | None = link
+        self._splitter = frames.Splitter()
+        self._inbox: deque[tuple[int, bytes]] = deque()
+        self._ordered: dict[int, float] = {}
+        self._early: dict[int, frames.Done] = {}
+        self._number = 0
+        greeting = self._greeting()
+        self._about = greeting.about
+        self._clock = RemoteClock(same=greeting.clock == clock_name() != "")
+
+    @property
+    def name(self) -> str:
+        """The bus as the user named it."""
+        return self._name
+
+    @property
+    def about(self) -> str:
+        """What the adapter at the other end calls itself."""
+        return self._about
+
+    def transfer(self, messages: tuple[Message, ...]) -> Transferred:
+        """Carry out one transaction; raises `OSError`, ENODEV where the connection is lost."""
+        return self._collect(self._order(messages))
+
+    def repeat(self, messages: tuple[Message, ...]) -> Generator[Transferred]:
+        """The same transaction again and again, one ordered ahead."""
+        ahead = [self._order(messages)]
+        try:
+            while True:
+                ahead.append(self._order(messages))
+                yield self._collect(ahead.pop(0))
+        finally:
+            for number in ahead:  # their answers are thrown away when they come
+                self._ordered.pop(number, None)
+                self._early.pop(number, None)
+
+    def close(self) -> None:
+        """Close the connection."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    def _order(self, messages: tuple[Message, ...]) -> int:
+        check(messages)
+        self._number = (self._number + 1) & 0xFFFFFFFF
+        self._ordered[self._number] = time.monotonic()
+        try:
+            self._open_link().sendall(frames.transfer(self._number, messages))
+        except OSError as error:
+            raise self._lost(error) from error
+        return self._number
+
+    def _collect(self, number: int) -> Transferred:
+        done = self._early.pop(number, None)
+        while done is None:
+            answer, answered = self._answer()
+            ordered = self._ordered.pop(answer.number, None)
+            if ordered is None:
+                continue
+            self._clock.learn(ordered, answer.received, answer.sent, answered)
+            if answer.number == number:
+                done = answer
+            else:
+                self._early[answer.number] = answer
+        if done.errno:
+            raise OSError(done.errno, os.strerror(done.errno))
+        return Transferred(self._clock.ours(done.t0), self._clock.ours(done.t1), done.reads)
+
+    def _answer(self) -> tuple[frames.Done, float]:
+        kind, body = self._frame()
+        answered = time.monotonic()
+        try:
+            if kind != frames.DONE:
+                raise frames.BadFrame(f"a frame of kind {kind} instead of an answer")
+            return frames.parse_done(body), answered
+        except frames.BadFrame as error:
+            raise self._lost(OSError(errno.EPROTO, f"the bus server sent {error}")) from error
+
+    def _greeting(self) -> frames.Hello:
+        try:
+            kind, body = self._frame()
+            if kind == frames.REFUSED:
+                raise frames.parse_refused(body, self._name)
+            if kind != frames.HELLO:
+                raise frames.BadFrame("this is no I2C bus server")
+            return frames.parse_hello(body)
+        except frames.BadFrame as error:
+            self.close()
+            raise self._no_server(error) from error
+        except OSError as error:
+            self.close()
+            if error.errno == errno.EPROTO:
+                raise self._no_server(error.strerror) from error
+            problem = f"no greeting: {error.strerror or error}"
+            raise DeviceFault(self._name, problem, "restart the bus server") from error
+        except HalError:
+            self.close()
+            raise
+
+    def _no_server(self, why: object) -> HalError:
+        return DeviceRefused(self._name, f"not an I2C bus server: {why}", "check the address")
+
+    def _frame(self) -> tuple[int, bytes]:
+        while not self._inbox:
+            try:
+                data = self._open_link().recv(1 << 17)
+                if not data:
+                    raise OSError(errno.ENODEV, "the bus server has closed the connection")
+                self._inbox += self._splitter.feed(data)
+            except TimeoutError as error:
+                raise self._lost(OSError(errno.ETIMEDOUT, "the bus server does not answer")) from error
+            except frames.BadFrame as error:
+                raise self._lost(OSError(errno.EPROTO, f"the bus server sent {error}")) from error
+            except OSError as error:
+                raise self._lost(error) from error
+        return self._inbox.popleft()
+
+    def _open_link(self) -> socket.socket:
+        if self._link is None:
+            raise OSError(errno.ENODEV, "the connection to the bus server is closed")
+        return self._link
+
+    def _lost(self, error: OSError) -> OSError:
+        """Close, for nothing that still comes can be relied on; what to raise."""
+        self.close()
+        self._ordered.clear()
+        if error.errno in (errno.ETIMEDOUT, errno.EPROTO, errno.ENODEV):
+            return error
+        return OSError(errno.ENODEV, f"the connection to the bus server is lost: {error.strerror or error}")
+
+
+def parse_address(name: str) -> str | tuple[str, int]:
+    """Path of ``unix:/path``, or host and port of ``tcp://host[:port]``; raises `DeviceRefused` for anything else."""
+    if name.startswith("unix:") and len(name) > len("unix:"):
+        return name.removeprefix("unix:")
+    try:
+        parts = urlsplit(name)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not host or not name.startswith("tcp://"):
+        raise DeviceRefused(name, "not the address of a bus server", "expected unix:/path or tcp://host:port")
+    return str(host), DEFAULT_TCP_PORT if port is None else port
+
+
+def open_remote(name: str) -> RemoteBus:
+    """Connect to a bus server within 2 s and wait for its greeting.
+
+    Raises:
+        DeviceMissing: no server there, or no bus behind it. DeviceRefused: not a bus server, or a bus not for us.
+        DeviceFault: a server that does not answer.
+    """
+    address = parse_address(name)
+    link: socket.socket | None = None
+    try:
+        if isinstance(address, str):
+            link = socket.socket(socket.AF_UNIX)
+            link.settimeout(CONNECT_S)
+            link.connect(address)
+        else:
+            link = socket.create_connection(address, CONNECT_S)
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        link.settimeout(REPLY_S)
+    except OSError as error:
+        if link is not None:
+            link.close()
+        raise _explain(name, error) from error
+    return RemoteBus(name, link)
+
+
+def _explain(name: str, error: OSError) -> HalError:
+    if isinstance(error, socket.gaierror):
+        return DeviceMissing(name, "host name is not known", "name the host by its IP address")
+    if error.errno in (errno.ENOENT, errno.ECONNREFUSED):
+        return DeviceMissing(name, "no bus server there", _START + name)
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return DeviceRefused(name, "permission denied", "the socket's mode must let this user read and write it")
+    if error.errno in (errno.EPROTOTYPE, errno.ENOTSOCK):
+        return DeviceRefused(name, "not a stream socket", "name the bus server's own socket")
+    if isinstance(error, TimeoutError):
+        return DeviceMissing(name, f"no answer within {CONNECT_S:g} s", "check network, address and port")
+    return DeviceMissing(name, os.strerror(error.errno) if error.errno else str(error), "check network and address")

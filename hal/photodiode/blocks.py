@@ -1,0 +1,86 @@
+"""From the bytes of one block to words, and what is wrong with them. Pure, no I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hal.adc import Blemish
+
+STUCK_RUN: Final = 64
+"""Equal words in a row, not at a rail, beyond which nothing alive is being converted (3 ms at 22 ksps)."""
+RELEASED: Final = 0xFFFF
+"""What a bus reads as when nobody pulls it down."""
+
+
+@dataclass(frozen=True, slots=True)
+class Census:
+    """How much of a block is wrong, for whoever judges many of them.
+
+    Attributes:
+        clipped: share of words at a rail. misaligned: share of words with spare bits set.
+        stuck: whether one value, not at a rail, makes up a run of at least STUCK_RUN words.
+        constant: whether the whole block is one value, wherever that is.
+        floated: every bit of the block is 1.
+    """
+
+    clipped: float = 0.0
+    misaligned: float = 0.0
+    stuck: bool = False
+    constant: bool = False
+    floated: bool = False
+
+
+def inspect(data: bytes, asked: int, spare: int, bits: int) -> tuple[npt.NDArray[np.uint16], Blemish, Census]:
+    """Words of a block, right-aligned, and their blemishes.
+
+    Words at the end of which every bit is 1 were not sent by the chip: they are cut off.
+
+    Args:
+        data: as read.
+        asked: bytes that were asked for.
+        spare: bits of a word that are always 0.
+        bits: of a conversion.
+    """
+    raw = np.frombuffer(data, dtype=">u2", count=len(data) // 2).astype(np.uint16)
+    blemish = Blemish.NONE
+    floated = raw.size > 0 and bool((raw == RELEASED).all())
+    if not floated:
+        raw = raw[: raw.size - _released_at_end(raw)]
+    if raw.size < asked // 2:
+        blemish |= Blemish.SHORT
+    if raw.size == 0:
+        return raw, blemish, Census()
+    misaligned = int(np.count_nonzero(raw & np.uint16(spare)))
+    top = (1 << bits) - 1
+    words = raw & np.uint16(top)
+    census = _count(words, top, misaligned / raw.size, floated)
+    if census.clipped and not floated:
+        blemish |= Blemish.CLIPPED
+    if misaligned:
+        blemish |= Blemish.MISALIGNED
+    if census.stuck:
+        blemish |= Blemish.STUCK
+    return words, blemish, census
+
+
+def _released_at_end(raw: npt.NDArray[np.uint16]) -> int:
+    alive = np.flatnonzero(raw != RELEASED)
+    return raw.size - 1 - int(alive[-1]) if alive.size else raw.size
+
+
+def _count(words: npt.NDArray[np.uint16], top: int, misaligned: float, floated: bool) -> Census:
+    at_rail = (words == 0) | (words == top)
+    starts = np.concatenate(([0], np.flatnonzero(words[1:] != words[:-1]) + 1))
+    lengths = np.diff(starts, append=words.size)
+    longest = int(lengths[~at_rail[starts]].max(initial=0))
+    return Census(
+        clipped=float(np.count_nonzero(at_rail)) / words.size,
+        misaligned=misaligned,
+        stuck=longest >= min(STUCK_RUN, max(words.size, 2)),
+        constant=starts.size == 1 < words.size,
+        floated=floated,
+    )

@@ -1,0 +1,100 @@
+"""What a failed transaction means, and what is done about it."""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import dataclass
+from typing import Final
+
+from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
+
+Noun = type[HalError]
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """How one errno is met.
+
+    Attributes:
+        noun: the kind of error. problem: with ``{chip}`` and ``{address}``. remedy: what a person can do.
+        retries: on the open bus, before it is opened anew. pause_s: before each of them.
+        calm: a 2-byte read first, which makes a STOP and is discarded.
+    """
+
+    noun: Noun
+    problem: str
+    remedy: str
+    retries: int = 0
+    pause_s: float = 0.0
+    calm: bool = False
+
+
+_ABSENT: Final = Policy(
+    DeviceMissing,
+    "no {chip} answers at address {address}",
+    "check its power and wiring, and the address with: i2cdetect -y N",
+    retries=3,
+    pause_s=0.01,
+)
+_UNPLUGGED: Final = Policy(DeviceMissing, "the adapter is gone", "plug it in again; it is reopened by itself")
+_NOT_ALLOWED: Final = Policy(DeviceRefused, "permission denied", "add the user to group i2c and log in again")
+_TOO_MUCH: Final = Policy(
+    DeviceRefused, "the adapter does not do such reads", "use an I2C controller of the processor itself"
+)
+
+POLICIES: Final[dict[int, Policy]] = {
+    errno.ENXIO: _ABSENT,
+    errno.EREMOTEIO: _ABSENT,
+    errno.ETIMEDOUT: Policy(
+        DeviceFault,
+        "the bus is stuck (a transaction timed out)",
+        "switch the converter's power off and on; look for SDA or SCL held low",
+        retries=2,
+        pause_s=0.01,
+        calm=True,
+    ),
+    errno.EIO: Policy(
+        DeviceFault,
+        "transactions fail (EIO)",
+        "check wiring, pull-ups and cable length; look into the kernel log",
+        retries=2,
+        pause_s=0.01,
+        calm=True,
+    ),
+    errno.EAGAIN: Policy(
+        DeviceFault,
+        "arbitration on the bus is lost again and again",
+        "look for noise on SDA and SCL, or a second master",
+        retries=10,
+    ),
+    errno.EBUSY: Policy(
+        DeviceRefused,
+        "address {address} is taken by a kernel driver, or the bus is busy",
+        "remove the device-tree overlay or unbind that driver",
+    ),
+    errno.EOPNOTSUPP: _TOO_MUCH,
+    errno.EINVAL: _TOO_MUCH,
+    errno.ENODEV: _UNPLUGGED,
+    errno.ESHUTDOWN: _UNPLUGGED,
+    errno.ENOENT: _UNPLUGGED,
+    errno.EACCES: _NOT_ALLOWED,
+    errno.EPERM: _NOT_ALLOWED,
+    errno.EPROTO: Policy(DeviceFault, "the adapter's protocol has failed (EPROTO)", "replug the adapter"),
+}
+
+
+def policy_for(error: OSError) -> Policy:
+    """What is done about an error; one that no adapter is known for has the bus opened anew."""
+    number = error.errno or 0
+    unknown = Policy(DeviceFault, f"unexpected error: {os.strerror(number)}", "look into the kernel log: dmesg | tail")
+    return POLICIES.get(number, unknown)
+
+
+def explain(error: OSError, bus: str, chip: str, address: int) -> HalError:
+    """An error of a transaction as one of the four nouns, with the remedy; a bus may know better what has happened."""
+    policy = policy_for(error)
+    problem = policy.problem.format(chip=chip, address=f"{address:#04x}")
+    if error.strerror and error.strerror != os.strerror(error.errno or 0):
+        problem = error.strerror
+    return policy.noun(bus, problem, policy.remedy)

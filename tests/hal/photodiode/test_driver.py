@@ -1,0 +1,176 @@
+"""The driver's conduct while nothing is wrong; the first tests also run on a real converter (``--adc``)."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hal.adc import Blemish
+from hal.fake.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
+from hal.lidar import Link
+from hal.photodiode.driver import PhotodiodeAdc, Sampling
+from tests.hal.photodiode.bench import Bench, falsehoods, on_bench, on_fake
+
+
+@pytest.fixture
+def adc(request: pytest.FixtureRequest) -> str:
+    return str(request.config.getoption("--adc"))
+
+
+def test_delivers_uniform_blocks(adc: str) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            blocks = await bench.more(20, 10.0, driver)
+            assert driver.status.link is Link.STREAMING
+            assert driver.status.error is None
+        assert driver.status.link is Link.CLOSED
+        assert [block.seq for block in blocks] == list(range(20))
+        for block in blocks:
+            assert block.words.dtype == np.uint16
+            assert block.words.max() < 1 << block.bits
+            assert block.t0 < block.t_first < block.t1
+            assert 0.02 < block.words.size / block.rate_hz < 0.06
+        assert all(late.t0 >= early.t1 for early, late in pairwise(blocks))
+
+    on_bench(body, adc)
+
+
+def test_can_be_stopped_and_started_again(adc: str) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        for _ in range(2):
+            async with bench.running(driver):
+                await bench.more(3, 10.0, driver)
+        assert [block.seq for block in bench.blocks] == sorted({block.seq for block in bench.blocks})
+
+    on_bench(body, adc)
+
+
+@pytest.mark.parametrize("adapter", [BCM2835, DESIGNWARE], ids=lambda a: a.name.split()[0])
+@pytest.mark.parametrize(("chip", "address"), [("MCP3221", 0x4D), ("ADC121C021", 0x54)])
+def test_words_and_times_are_the_converters_own(chip: str, address: int, adapter: Adapter) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(100, 10.0, driver)
+        assert not any(block.blemish for block in bench.blocks)
+        assert falsehoods(bench, bench.blocks) == []
+
+    on_fake(body, chip, address, adapter)
+
+
+@pytest.mark.parametrize("percent", [-1.0, 1.0, -37.0])
+def test_scl_is_measured(percent: float) -> None:
+    async def body(bench: Bench) -> None:
+        bench.device.bus.scl_error = 0.01 * percent
+        driver = bench.driver()
+        async with bench.running(driver):
+            blocks = await bench.more(300, 40.0, driver)
+        true_hz = 400e3 * (1.0 + 0.01 * percent) / 18
+        assert abs(blocks[0].rate_hz / true_hz - 1.0) < 500e-6
+        assert abs(blocks[-1].rate_hz / true_hz - 1.0) < 100e-6
+        assert abs(blocks[-1].words.size / true_hz - 0.05) < 1e-3
+        assert driver.status.extra["scl"] == f"{18e-3 * blocks[-20].rate_hz:.2f} kHz"
+
+    on_fake(body)
+
+
+def test_blocks_are_read_back_to_back() -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            blocks = await bench.more(50, 10.0, driver)
+        pauses = [late.t0 - early.t1 for early, late in pairwise(blocks)]
+        assert max(pauses) < 1e-3
+
+    on_fake(body)
+
+
+def test_first_word_after_a_pause_is_left_out() -> None:
+    """It was sampled when the transaction before the pause ended."""
+
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            before = await bench.more(3, 10.0, driver)
+            bench.order("what = 'nack'; count = 4")  # three retries do not help: reopened a second later
+            after = await bench.more(5, 10.0, driver)
+        returned = [block for block in after if block.blemish]
+        assert [block.blemish for block in returned] == [Blemish.GAP]
+        assert returned[0].t0 - before[-1].t1 > 0.8
+        assert before[0].words.size == returned[0].words.size == before[1].words.size - 1
+        assert falsehoods(bench, bench.blocks) == []
+
+    on_fake(body)
+
+
+@pytest.mark.parametrize(
+    ("adapter", "samples", "why"),
+    [(FT260, 30, "60 bytes"), (CP2112, 30, "61 bytes"), (CH341, 30, "32 bytes"), (I2C_GPIO, 278, "bit by bit")],
+    ids=["FT260", "CP2112", "CH341", "i2c-gpio"],
+)
+def test_adapters_that_pause_are_named(adapter: Adapter, samples: int, why: str) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            blocks = await bench.more(5, 10.0, driver)
+        assert why in driver.status.extra["limit"]
+        assert abs(blocks[-1].words.size - samples) <= 4
+
+    on_fake(body, adapter=adapter)
+
+
+def test_an_adapter_that_cannot_read_blocks_is_refused() -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await asyncio.sleep(3.0)
+            assert "cannot read 60 bytes in one go" in str(driver.status.error)
+        assert not bench.blocks
+
+    on_fake(body, adapter=Adapter("SMBus thing", max_read=32))
+
+
+def test_block_length_follows_the_wish() -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver(Sampling(block_s=0.03))
+        async with bench.running(driver):
+            blocks = await bench.more(5, 10.0, driver)
+        assert abs(blocks[-1].words.size / blocks[-1].rate_hz - 0.03) < 1e-3
+
+    on_fake(body)
+
+
+def test_scl_beyond_the_data_sheet_is_told() -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(5, 10.0, driver)
+        assert "faster than the 400 kHz" in driver.status.extra["warning"]
+
+    on_fake(body, adapter=Adapter("fast", scl_hz=1e6))
+
+
+@pytest.mark.parametrize(
+    ("chip", "address", "block_s", "says"),
+    [
+        ("MCP3421", 0x68, 0.05, "known are mcp3221"),
+        ("ADS1115", 0x48, 0.05, "levels only"),
+        ("MCP3221", 0x54, 0.05, "answers at one of 0x48, 0x49"),
+        ("ADC121C021", 0x4D, 0.05, "answers at one of 0x50"),
+        ("mcp3221", 0x4D, 0.0, "0.001 to 1 s"),
+        ("mcp3221", 0x4D, float("nan"), "0.001 to 1 s"),
+    ],
+)
+def test_what_cannot_be_is_refused_at_once(chip: str, address: int, block_s: float, says: str) -> None:
+    async def body(bench: Bench) -> None:
+        with pytest.raises(ValueError, match=says):
+            PhotodiodeAdc(
+                "/dev/i2c-1", address, chip, clock=bench.clock, opener=bench.opener, sampling=Sampling(block_s)
+            )
+
+    on_fake(body)

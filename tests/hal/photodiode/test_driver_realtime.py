@@ -1,0 +1,141 @@
+"""The whole driver in real time: its thread, smbus2, and a model of the kernel under it."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import time
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from hal.adc import Blemish
+from hal.clock import SystemClock
+from hal.errors import DeviceFault, DeviceRefused
+from hal.fake.adc import FakeAdc
+from hal.i2c import open_bus
+from tests.hal.i2c_kernel import Kernel
+from tests.hal.photodiode.bench import Bench, Light, error_of, falsehoods
+
+pytestmark = pytest.mark.realtime
+SLACK = 4.0
+ROUGH = 0.05
+"""Relative error of rates: the shortest of three reads is 0.3 ms late on a computer that is busy, or more."""
+
+Body = Callable[[Bench, Kernel], Awaitable[None]]
+
+
+def on_kernel(body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SystemClock()
+    light = Light()
+    device = FakeAdc(light, clock)
+    linux = Kernel(monkeypatch, device)
+    asyncio.run(_run(body, Bench(clock, open_bus, "/dev/i2c-1", light=light, fake=device), linux))
+
+
+async def _run(body: Body, bench: Bench, linux: Kernel) -> None:
+    await body(bench, linux)
+
+
+def test_blocks_of_the_light_at_its_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(bench: Bench, linux: Kernel) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            blocks = await bench.more(20, 3.0 * SLACK, driver)
+            assert driver.status.error is None
+        assert falsehoods(bench, blocks, ROUGH) == []
+        assert not any(block.blemish & ~(Blemish.STRETCHED | Blemish.GAP) for block in blocks)
+
+    on_kernel(body, monkeypatch)
+
+
+def test_a_loop_without_time_loses_blocks_and_counts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(bench: Bench, linux: Kernel) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(3, 3.0 * SLACK, driver)
+            before = driver.status.dropped
+            time.sleep(0.4)  # noqa: ASYNC251 - the loop has no time, that is the test
+            blocks = await bench.more(4, 1.0 * SLACK, driver)
+            assert driver.status.dropped - before >= 2
+        numbers = [block.seq for block in bench.blocks]
+        assert numbers[-1] == len(numbers) - 1 + driver.status.dropped
+        assert any(Blemish.GAP in block.blemish for block in blocks)
+        assert falsehoods(bench, bench.blocks, ROUGH) == []
+
+    on_kernel(body, monkeypatch)
+
+
+def test_errors_of_the_kernel(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+    async def body(bench: Bench, linux: Kernel) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(3, 3.0 * SLACK, driver)
+            linux.fails = [errno.EAGAIN, 0, errno.EREMOTEIO, errno.EREMOTEIO]
+            await bench.more(5, 2.0 * SLACK, driver)
+            assert linux.closed == 0
+            assert not caplog.records
+            linux.fails = [errno.ENODEV]
+            await bench.more(5, 4.0 * SLACK, driver)
+            assert linux.closed == 1  # opened anew by its name
+            assert linux.paths == ["/dev/i2c-1"] * 2
+        assert falsehoods(bench, bench.blocks, ROUGH) == []
+
+    on_kernel(body, monkeypatch)
+    assert [record.getMessage() for record in caplog.records] == [
+        "photodiode: /dev/i2c-1: the adapter is gone (plug it in again; it is reopened by itself)",
+        "/dev/i2c-1: MCP3221 at 0x4d delivers again",
+    ]
+
+
+def test_a_kernel_driver_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(bench: Bench, linux: Kernel) -> None:
+        linux.claimed = {0x4D}
+        driver = bench.driver()
+        async with bench.running(driver):
+            await asyncio.sleep(0.3)
+            assert isinstance(error_of(driver), DeviceRefused)
+            assert "address 0x4d is taken by a kernel driver" in str(error_of(driver))
+
+    on_kernel(body, monkeypatch)
+
+
+def test_a_transaction_that_hangs_in_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop goes on, the status says so, and no second thread is started on the bus meanwhile."""
+    monkeypatch.setattr("hal.photodiode.follow.SILENCE_S", 0.4)
+
+    async def body(bench: Bench, linux: Kernel) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(3, 3.0 * SLACK, driver)
+            linux.hang = True
+            await asyncio.sleep(1.5)
+            assert isinstance(error_of(driver), DeviceFault)
+            assert "has not returned for 0.4 s" in str(error_of(driver))
+            assert len(linux.paths) == 1
+            linux.hang = False
+            await bench.more(3, 2.0 * SLACK, driver)
+            assert driver.status.error is None
+            assert driver.status.recoveries == 1
+
+    on_kernel(body, monkeypatch)
+
+
+def test_stopping_while_it_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(bench: Bench, linux: Kernel) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(3, 3.0 * SLACK, driver)
+            linux.hang = True
+            await asyncio.sleep(0.1)
+            before = time.monotonic()
+        assert time.monotonic() - before < 0.3 * SLACK
+        linux.hang = False
+        while not linux.closed:
+            assert time.monotonic() - before < 2.0 * SLACK
+            await asyncio.sleep(0.01)
+
+    on_kernel(body, monkeypatch)
