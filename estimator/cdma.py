@@ -57,7 +57,7 @@ def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
     """Follow all known lamps through one block and report them. Blocks must come in order of time."""
     sampled, flags = _prepare(decoder, block)
     if sampled is not None:
-        t_middle = 0.5 * (block.t0 + block.t1)
+        t_middle = 0.5 * (block.t_begin + block.t_end)
         decoder.clocks.predict(decoder.tracks.predict(t_middle))
         more, residual = follow(decoder, block, sampled)
         flags |= more
@@ -120,7 +120,7 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
     profile = decoder.profile
     words = np.asarray(block.words, np.float64)
     n, top = len(words), 2.0**profile.front_end.bits - 1.0
-    if not (np.all(np.isfinite(words)) and block.rate > 0.0 and block.t1 > block.t0):
+    if not (np.all(np.isfinite(words)) and block.rate > 0.0 and block.t_end > block.t_begin):
         return None, BlockFlag.MALFORMED
     if not 1.0 <= n / (block.rate * profile.period_s) <= LONGEST:
         return None, BlockFlag.LENGTH
@@ -157,8 +157,8 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
     twin = np.array([np.count_nonzero(code == c) > 1 for c in code], bool)
     faint = tracks.faint(links)
     return LightEpoch(
-        t_begin=block.t0,
-        t_end=block.t1,
+        t_begin=block.t_begin,
+        t_end=block.t_end,
         ids=code,
         amplitude=amplitude * lsb,
         variance=variance * lsb**2,

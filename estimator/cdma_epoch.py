@@ -44,11 +44,11 @@ class SampleBlock:
     """One uninterrupted read of the converter.
 
     Attributes:
-        t0, t1: ``t_mono`` just before and just after the read. words: ADC words. rate: samples per second, nominal.
+        t_begin, t_end: ``t_mono`` just before and just after the read. words: ADC words. rate: samples per second, nominal.
     """
 
-    t0: float
-    t1: float
+    t_begin: float
+    t_end: float
     words: Array
     rate: float
 

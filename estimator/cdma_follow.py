@@ -77,7 +77,7 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     if not len(tracks.slots):
         clocks.rest()
         return BlockFlag.NONE, replace(sampled, y=sampled.clean)
-    excess = max(block.t1 - block.t0 - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
+    excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
     flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
     if not flags & BlockFlag.STALLED:
         _learn(decoder, solved)

@@ -15,7 +15,7 @@ from estimator.keyframe import unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_keyframe, update_map
 from estimator.matching import Prior, View
-from estimator.records import Array, Command, Imu, Job, Limits, Odometry, Record, Scan
+from estimator.records import Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
 from estimator.state import Settings, State, new_state
@@ -44,7 +44,7 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
 
 def order(record: Record) -> tuple[float, bool]:
     """Records go by the instant up to which they speak; a scan after whatever moved the robot until then."""
-    end = record.t_end if isinstance(record, Scan | Odometry | Imu) else record.t_begin
+    end = record.t_end if isinstance(record, Scan | SampleBlock | LightEpoch | Odometry | Imu) else record.t_begin
     return end, isinstance(record, Scan)
 
 

@@ -14,6 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from estimator.cdma_epoch import LightEpoch, SampleBlock
+
 Array = npt.NDArray[np.float64]
 
 
@@ -49,26 +51,6 @@ class Scan:
     beam: npt.NDArray[np.uint8]
     sigma_m: float
     intensity: Array | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LightEpoch:
-    """Ceiling lights decoded from one block of photodiode samples. Arrays have one element per light, strongest first.
-
-    Attributes:
-        t_begin, t_end: ``t_mono`` of the block's first and last sample (about 50 ms apart).
-        code: int64, number of the CDMA code (several lamps of a large building may share one).
-        amplitude: received modulated amplitude, as a fraction of the converter's full scale.
-        variance: of ``ln amplitude``, from noise alone (not from the optical model).
-        blemished: whether something was found wrong inside the block (stall, clipping): amplitudes are then suspect.
-    """
-
-    t_begin: float
-    t_end: float
-    code: npt.NDArray[np.int64]
-    amplitude: Array
-    variance: Array
-    blemished: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,8 +109,8 @@ class Answer:
     payload: object
 
 
-Record = Scan | Odometry | Imu | Command | Answer
-"""What `step` takes; light epochs join this union with the photodiode."""
+Record = Scan | SampleBlock | LightEpoch | Odometry | Imu | Command | Answer
+"""What `step` takes. Light comes as a photodiode's samples, or decoded already (a foreign log, a link-level run)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +121,13 @@ class Limits:
         icp_iterations: cap on matching iterations.
         points: cap on query points per match (the scan is thinned evenly above it).
         update_map: whether keyframe and map work may run in this cycle.
+        codes: how many light codes may be searched for lamps not seen yet (6 us each with profile A).
     """
 
     icp_iterations: int
     points: int
     update_map: bool
+    codes: int = 129
 
 
 UNLIMITED: Final = Limits(icp_iterations=50, points=100_000, update_map=True)

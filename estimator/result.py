@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from estimator.cdma_epoch import BlockFlag
 from estimator.records import Array, Job
 
 
@@ -59,6 +60,76 @@ class Loop:
     residual_m: float
 
 
+class LinkState(Enum):
+    """What one received lamp is used for, or why it is not."""
+
+    ACCEPTED = "used"
+    OCCLUDED = "weaker than it can be here: something stands in its way"
+    REJECTED = "stronger than it can be here, or from the wrong place: moved, exchanged, or its code in use twice"
+    RIM = "at the edge of the receiver's field of view"
+    FAINT = "not above the noise"
+    TWIN = "two lamps of this code are in view"
+    UNSURVEYED = "no lamp of this code is known"
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """One lamp in view.
+
+    Attributes:
+        code: as received. lamp_id: which lamp of that code, None where that is not known.
+        amplitude: of the modulated photocurrent, A. residual: ln(received / expected), None without an expectation.
+        sigma: one sigma of that residual, of everything. gain, sigma_gain: ln of the lamp's power against the
+            survey's, common part included, as estimated so far.
+    """
+
+    code: int
+    lamp_id: int | None
+    state: LinkState
+    amplitude: float
+    residual: float | None = None
+    sigma: float | None = None
+    gain: float = 0.0
+    sigma_gain: float = 0.0
+
+
+class Fix(Enum):
+    """How far the position from light has come."""
+
+    NONE = "no lamps in view, or too few"
+    STARTING = "position known, heading and gains still being found"
+    GOOD = "position and heading known"
+    HELD = "carried on by odometry alone, every link is paused"
+    AMBIGUOUS = "several places fit"
+    LOST = "what is received contradicts the position: starting anew"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightsResult:
+    """The `lights` filter (odometry and links, never laser) after a step: the independent witness and the paper's T_1.
+
+    Attributes:
+        t_mono: instant of the latest epoch taken in, `-inf` before the first.
+        T_map_base, covariance: (x, y, yaw) and 3x3, meaningful unless fix is NONE or LOST; in AMBIGUOUS the likeliest.
+        links: strongest first. accepted: lamp IDs of the links used (the paper's S).
+        gained: 3x3 information that this step's links added to the pose beyond the prediction, and ``gained_by``: the
+            pose's correction they made; `fused` takes exactly this, so that odometry is never counted twice.
+        floor: the diffuse part as estimated. block: flags of the latest sample block. clock_ppm: of the sample clock.
+    """
+
+    t_mono: float
+    fix: Fix
+    T_map_base: Array
+    covariance: Array
+    links: tuple[Link, ...]
+    accepted: frozenset[int]
+    gained: Array
+    gained_by: Array
+    floor: float = 0.0
+    block: BlockFlag = BlockFlag.NONE
+    clock_ppm: float | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StepResult:
     """The estimate after one `step`.
@@ -74,6 +145,7 @@ class StepResult:
         anchor, T_anchor_base: keyframe this pose hangs on and the pose relative to it (0 is the start), so that a
             trajectory kept as anchors follows every later correction of the map.
         jumps: how often T_map_odom moved by more than 5 cm or 1 deg at once, since the start.
+        lights: of the `lights` filter, None where there is no photodiode.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
@@ -89,4 +161,5 @@ class StepResult:
     anchor: int
     T_anchor_base: Array
     jumps: int
+    lights: LightsResult | None = None
     jobs: tuple[Job, ...] = ()
