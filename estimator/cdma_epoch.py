@@ -44,7 +44,8 @@ class SampleBlock:
     """One uninterrupted read of the converter.
 
     Attributes:
-        t_begin, t_end: ``t_mono`` just before and just after the read. words: ADC words. rate: samples per second, nominal.
+        t_begin, t_end: ``t_mono`` just before and just after the read. words: ADC words.
+        rate: samples per second, nominal.
     """
 
     t_begin: float
