@@ -59,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
     _status(commands.add_parser("status", help="show what a running daemon publishes"))
     _map(commands.add_parser("map", help="work with maps"))
+    _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
     return parser
 
 
@@ -121,14 +122,26 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.set_defaults(body=_later("daemon.export", "main"))
 
 
+def _codes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--profile", choices=("A", "B", "D"), default="A", help="air interface; default: A")
+    parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
+    parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
+    parser.set_defaults(body=_loaded("daemon.codes", "main"))
+
+
 def _later(module: str, name: str) -> Body:
     """A body that resolves the configuration (``args.settings``: `daemon.config.Config`) and then loads its module."""
+    return _configured(_loaded(module, name))
+
+
+def _loaded(module: str, name: str) -> Body:
+    """A body that loads its module when it runs."""
 
     def body(args: argparse.Namespace) -> int:
         run: Body = getattr(import_module(module), name)
         return run(args)
 
-    return _configured(body)
+    return body
 
 
 def _configured(body: Body) -> Body:
