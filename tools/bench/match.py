@@ -1,0 +1,220 @@
+"""Matching: time and final error of one scan against another, ours and the peers' on the same scans and starts.
+
+Everything counts: normals and index of the reference, tangents of the new scan, iterations.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numba
+import numpy as np
+
+from estimator import distance_region, localmap, se2
+from estimator.keyframe import keep
+from estimator.lines import lines_of
+from estimator.localmap import LocalMap
+from estimator.matching import MatchSettings, Prior, View, match
+from estimator.records import Array, Beam, Scan
+from estimator.scanpoints import oriented, points_of
+from tools.bench._peers import Match, peers
+from tools.bench._scenes import Scene, bearings, office, paper_room, round_room
+from tools.figures import Figure, bounded
+
+COMMAND: Final = "python -m tools.bench match"
+SIGMA: Final = 0.01
+STILL: Final = np.zeros(3)
+FAR: Final = (0.17, 4.0)
+NEAR: Final = (0.005, 0.2)
+SETTINGS: Final = MatchSettings()
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two scans, where the second was in the first's frame, and a wrong idea of it."""
+
+    reference: Scan
+    new: Scan
+    truth: Array
+    start: Array
+
+
+def pairs(scene: Scene, beams: int, fov: float, off: tuple[float, float], count: int) -> list[Pair]:
+    """Scans from about the same place, whose start is wrong by exactly ``off`` (m, deg)."""
+    rng = np.random.default_rng(7)
+    bearing, made = bearings(beams, fov), []
+    while len(made) < count:
+        T = scene.place(rng)
+        a = rng.uniform(-np.pi, np.pi)
+        away = np.array((off[0] * np.cos(a), off[0] * np.sin(a), np.radians(off[1]) * rng.choice((-1.0, 1.0))))
+        T_new = se2.compose(T, away)
+        if scene.clear(T_new, 0.2):
+            made.append(Pair(scan(scene, T, bearing, rng), scan(scene, T_new, bearing, rng), away, STILL))
+    return made
+
+
+def scan(scene: Scene, T: Array, bearing: Array, rng: np.random.Generator) -> Scan:
+    """With 1 cm of range noise."""
+    distance = scene.ranges(T, bearing)
+    seen = np.isfinite(distance)
+    distance = np.where(seen, distance, 0.0) + np.where(seen, rng.normal(0.0, SIGMA, len(distance)), 0.0)
+    return Scan(0.0, 0.0, 0, STILL, bearing, distance, np.where(seen, Beam.HIT, Beam.NONE).astype(np.uint8), SIGMA)
+
+
+def map_of(reference: Scan) -> LocalMap:
+    """Line elements of one scan on their axis: our index."""
+    lines = lines_of(points_of(reference, STILL, 80.0, 0.0))
+    elements = np.zeros((len(lines), localmap.WIDTH))
+    elements[:, : localmap.SLOPE + 1], elements[:, localmap.WEIGHT] = lines[:, :5], 1.0
+    return localmap.index(elements, STILL[:2], 1, keep(0, STILL, STILL, reference, 0.0))
+
+
+def ours(off: tuple[float, float]) -> Callable[[Pair], Array]:
+    """The whole of our match; the prediction is given the uncertainty it has."""
+    L = np.diag((off[0] ** -2, off[0] ** -2, np.radians(off[1]) ** -2))
+
+    def run(pair: Pair) -> Array:
+        local = map_of(pair.reference)
+        beams = (pair.new.bearing_rad, pair.new.range_m, pair.new.beam)
+        view = View(oriented(points_of(pair.new, STILL, 80.0, 0.0), 100_000), STILL, beams, SIGMA)
+        return match(view, local, Prior(pair.start, L), 50, SETTINGS).T_odom_base
+
+    return run
+
+
+def theirs(method: Match) -> Callable[[Pair], Array]:
+    """A peer on the same two scans."""
+
+    def run(pair: Pair) -> Array:
+        return method(points(pair.reference), points(pair.new), pair.start)
+
+    return run
+
+
+def points(scan: Scan) -> Array:
+    """Cartesian, as every matcher needs them."""
+    hit = scan.beam == Beam.HIT
+    a, r = scan.bearing_rad[hit], scan.range_m[hit]
+    return np.column_stack((r * np.cos(a), r * np.sin(a)))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Milliseconds (median) and error (RMS over the matches that came within 5 cm and 2 deg; their share)."""
+
+    ms: float
+    metres: float
+    degrees: float
+    share: float
+
+
+def measure(method: Callable[[Pair], Array], given: list[Pair]) -> Outcome:
+    """Time and judge one matcher."""
+    method(given[0])
+    times, errors = [], []
+    for pair in given:
+        begin = time.perf_counter()
+        T = method(pair)
+        times.append(time.perf_counter() - begin)
+        e = se2.between(pair.truth, T)
+        errors.append((np.hypot(e[0], e[1]), np.degrees(abs(e[2]))))
+    found = np.array([e for e in errors if e[0] < 0.05 and e[1] < 2.0] or [(np.nan, np.nan)])
+    rms = np.sqrt((found**2).mean(axis=0))
+    return Outcome(1e3 * statistics.median(times), float(rms[0]), float(rms[1]), len(found) / len(errors))
+
+
+def run() -> list[Figure]:
+    """All of it, in one process on one core."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    figures = [*_against_peers(), *_other_sizes(), *_growth(), *_search()]
+    return figures
+
+
+def _against_peers() -> list[Figure]:
+    rooms = {"paper room": paper_room(), "office": office()}
+    figures = []
+    for room, scene in rooms.items():
+        given = pairs(scene, 1081, 270.0, FAR, 60)
+        mine = measure(ours(FAR), given)
+        name = f"1081 beams, {room}, 17 cm / 4 deg"
+        figures += [
+            bounded(f"{name}: ours", mine.ms, "ms", "<= 0.8", COMMAND),
+            bounded(f"{name}: our error", 1e3 * mine.metres, "mm", "<= 1.2", COMMAND),
+            bounded(f"{name}: our error", mine.degrees, "deg", "<= 0.009", COMMAND),
+            bounded(f"{name}: success", mine.share, "", ">= 0.99", COMMAND),
+        ]
+        for (peer, method), least in zip(peers().items(), (6, 4, 2), strict=False):
+            their = measure(theirs(method), given)
+            text = f"{name}: {peer}"
+            figures.append(Figure(f"{text}", their.ms, "ms", command=COMMAND))
+            figures.append(Figure(f"{text} error", 1e3 * their.metres, "mm", command=COMMAND))
+            figures.append(Figure(f"{text} success", their.share, "", command=COMMAND))
+            equal = their.metres <= 1.1 * mine.metres and their.share >= mine.share - 0.02
+            said = "" if equal else " (did not reach our error)"
+            figures.append(bounded(f"{text} / ours{said}", their.ms / mine.ms, "x", f">= {least}", COMMAND))
+        good = measure(ours(NEAR), pairs(scene, 1081, 270.0, NEAR, 60))
+        figures.append(bounded(f"1081 beams, {room}, 5 mm / 0.2 deg: ours", good.ms, "ms", "<= 0.3", COMMAND))
+    return figures
+
+
+def _other_sizes() -> list[Figure]:
+    figures = []
+    for beams, fov, target in ((180, 179.0, "<= 0.07"), (360, 270.0, "<= 0.2")):
+        found = measure(ours((0.05, 1.5)), pairs(office(), beams, fov, (0.05, 1.5), 100))
+        figures.append(bounded(f"{beams} beams, office, 5 cm / 1.5 deg: ours", found.ms, "ms", target, COMMAND))
+    return figures
+
+
+def _growth() -> list[Figure]:
+    """Exponent of time against number of points, 181 to 10 000."""
+    sizes = (181, 361, 1081, 3001, 10_001)
+    ms = [measure(ours(FAR), pairs(paper_room(), n, 270.0, FAR, 20)).ms for n in sizes]
+    slope = float(np.polyfit(np.log(sizes), np.log(ms), 1)[0])
+    return [bounded("time grows with the points to the power of", slope, "", "<= 1.2", COMMAND)]
+
+
+def _search() -> list[Figure]:
+    """The nearest-neighbour pass alone against brute force in compiled code."""
+    figures = []
+    cases = {
+        "17 cm / 4 deg": (paper_room(), FAR, ">= 8"), "converged": (paper_room(), (0.001, 0.01), ">= 25"),
+        "1 m / 20 deg": (paper_room(), (1.0, 20.0), ">= 1"), "circle, centred": (round_room(), (0.02, 1.0), ">= 1"),
+    }  # fmt: skip
+    for name, (scene, off, target) in cases.items():
+        ratios = [_ratio(pair) for pair in pairs(scene, 1081, 270.0, off, 12)]
+        figures.append(bounded(f"search pass, {name}: brute / ours", statistics.median(ratios), "x", target, COMMAND))
+    return figures
+
+
+def _ratio(pair: Pair) -> float:
+    axis = distance_region.build_axis(points(pair.reference), STILL[:2])
+    queries = np.ascontiguousarray(points(pair.new))
+    out = (np.empty(len(queries), np.int64), np.empty(len(queries)), np.empty(len(queries)))
+    mine = _best(lambda: distance_region.nearest_all(axis.rows, axis.start, axis.rays, queries, np.inf, out))
+    return _best(lambda: brute(axis.rows, queries, out[0])) / mine
+
+
+@numba.njit(fastmath=True)
+def brute(rows: Array, queries: Array, found: distance_region.Ints) -> None:
+    """Every pair compared, compiled: what a search has to beat."""
+    for i in range(len(queries)):
+        best, at = np.inf, -1
+        for j in range(len(rows)):
+            d2 = (rows[j, 0] - queries[i, 0]) ** 2 + (rows[j, 1] - queries[i, 1]) ** 2
+            if d2 < best:
+                best, at = d2, j
+        found[i] = at
+
+
+def _best(work: Callable[[], object]) -> float:
+    times = []
+    for _ in range(7):
+        begin = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begin)
+    return min(times)
