@@ -14,7 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma_epoch import LightEpoch, SampleBlock
+from estimator.cdma_epoch import LightEpoch as LightEpoch  # records too, so they are offered from here
+from estimator.cdma_epoch import SampleBlock as SampleBlock
 
 Array = npt.NDArray[np.float64]
 
