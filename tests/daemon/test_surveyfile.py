@@ -1,0 +1,191 @@
+"""The light survey as a file: what is written reads back, and whatever is wrong is named with place and remedy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.surveyfile import SurveyError, dump, order_of, read_survey, write_survey
+from estimator.lamps import Lamp, Receiver, Survey
+
+EXAMPLE = Path(__file__).parents[2] / "systemd" / "lights" / "room-of-16.toml"
+
+GOOD = """\
+depth = 0.3
+[[lamp]]
+lamp_id = 4
+code = 17
+x = 1.0
+y = 2.0
+z = 3.0
+half_angle_deg = 60.0
+[[lamp]]
+lamp_id = 2
+code = 17
+x = 4.0
+y = 2.0
+z = 3.0
+[receiver]
+x = 0.1
+"""
+
+
+def finite(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high).map(lambda value: round(value, 6))
+
+
+lamps = st.builds(
+    Lamp,
+    lamp_id=st.integers(0, 65535),
+    code=st.integers(0, 128),
+    x=finite(-500, 500),
+    y=finite(-500, 500),
+    z=finite(6.5, 20),
+    power_w=finite(0.01, 500),
+    order=finite(0.1, 40),
+    slope_x=finite(-0.9, 0.9),
+    slope_y=finite(-0.9, 0.9),
+    sigma_ln=finite(0.01, 1.0),
+)
+receivers = st.builds(
+    Receiver,
+    x=finite(-2, 2),
+    y=finite(-2, 2),
+    z=finite(0, 6),
+    area_m2=finite(0.01, 10).map(lambda cm2: round(1e-4 * cm2, 10)),
+    responsivity=finite(0.01, 1),
+    order=finite(0.1, 5),
+    half_fov_rad=st.integers(10, 90).map(math.radians),
+    slope_x=finite(-0.5, 0.5),
+    slope_y=finite(-0.5, 0.5),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(lamps, min_size=1, max_size=8, unique_by=(lambda lamp: lamp.lamp_id, lambda lamp: round(lamp.x))),
+    receivers,
+)
+def test_what_is_written_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, some: list[Lamp], receiver: Receiver
+) -> None:
+    path = tmp_path_factory.mktemp("survey") / "lights.toml"
+    survey = Survey(tuple(sorted(some, key=lambda lamp: lamp.lamp_id)), receiver, 0.02, 0.25)
+    write_survey(path, survey, ("a note",), {some[0].lamp_id: "a remark"})
+    assert read_survey(path) == survey
+    text = path.read_text()
+    assert "# a note\n" in text
+    assert "  # a remark\n" in text
+    write_survey(path, read_survey(path), force=True)
+    assert path.read_text() == dump(survey)
+
+
+def test_the_example_is_good() -> None:
+    survey = read_survey(EXAMPLE)
+    assert len(survey.lamps) == 16
+    assert len({lamp.code for lamp in survey.lamps}) == 16
+    assert survey.receiver == Receiver()
+
+
+def test_tables_and_half_angle(tmp_path: Path) -> None:
+    path = tmp_path / "lights.toml"
+    path.write_text(GOOD)
+    survey = read_survey(path)
+    assert [lamp.lamp_id for lamp in survey.lamps] == [2, 4]
+    assert survey.lamps[1].order == pytest.approx(1.0)
+    assert survey.lamps[0].order == pytest.approx(order_of(70.0), abs=1e-4)
+    assert survey.receiver.x == 0.1
+
+
+WRONG = [
+    ("x = 1.0\n", "x = nan\n", ":5", ">= -10000.0 - at `$.lamp[0].x` (metres, luminous centre)"),
+    ("x = 1.0\n", "x = inf\n", ":5", "<= 10000.0"),
+    ("code = 17\nx = 1.0", "code = 129\nx = 1.0", ":4", "number of the CDMA code"),
+    ("code = 17\nx = 1.0", "code = -1\nx = 1.0", ":4", "code"),
+    ("lamp_id = 4", "lamp_id = 2", ":9", "lamp 2: that `lamp_id` is taken already by line 2"),
+    ("lamp_id = 4", 'lamp_id = "4"', ":3", "int"),
+    (
+        "y = 2.0\nz = 3.0\nhalf",
+        "y = 2.0\nz = 3.0\npower = 2\nhalf",
+        ":8",
+        "unknown key `power`; did you mean `power_w`",
+    ),
+    ("z = 3.0\nhalf", "hight = 3.0\nhalf", ":7", "unknown key `hight`"),
+    ("z = 3.0\nhalf", "half", ":2", "missing required field `z`"),
+    ("half_angle_deg = 60.0", "half_angle_deg = 60.0\norder = 1.0", ":2", "got both"),
+    ("half_angle_deg = 60.0", "half_angle_deg = 90.0", ":8", "angle at which intensity has halved"),
+    ("z = 3.0\nhalf", "z = nan\nhalf", ":7", "`$.lamp[0].z`"),
+    ("z = 3.0\nhalf", "z = 300.0\nhalf", ":7", "metres above the floor"),
+    ("x = 4.0", "x = 1.0", ":9", "hangs where lamp 4 hangs"),
+    ("depth = 0.3", "depth = 3.0", ":1", "modulation depth"),
+    ("depth = 0.3", "dept = 0.3", ":1", "did you mean `depth`"),
+    ("x = 0.1", "x = 40.0", ":16", "ahead of the robot"),
+    ("x = 0.1", "lever = 0.1", ":16", "known here are x, y, z"),
+    ("x = 0.1", "z = 2.9", ":2", "not above the receiver"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "line", "words"), WRONG)
+def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, line: str, words: str) -> None:
+    assert old in GOOD
+    path = tmp_path / "lights.toml"
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(SurveyError) as error:
+        read_survey(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}{line}: "), text
+    assert words in text
+
+
+def test_lines_are_found_in_the_written_form(tmp_path: Path) -> None:
+    path = tmp_path / "lights.toml"
+    survey = read_survey(EXAMPLE)
+    write_survey(path, survey)
+    lines = path.read_text().splitlines()
+    at = next(number for number, line in enumerate(lines) if "lamp_id = 7," in line)
+    lines[at] = lines[at].replace("lamp_id = 7,", "lamp_id = 6,")
+    path.write_text("\n".join(lines))
+    with pytest.raises(SurveyError, match=f":{at + 1}: lamp 6: .* taken already by line {at}$"):
+        read_survey(path)
+    lines[at] = lines[at].replace("lamp_id = 6,", "lamp_id = 7, colour = 3,")
+    path.write_text("\n".join(lines))
+    with pytest.raises(SurveyError, match=f":{at + 1}: unknown key `colour`"):
+        read_survey(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"lamp = []", b"lamp = 3", b"x", b"\xff\xfe", b"[[lamp]]"])
+def test_files_that_are_no_survey(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "lights.toml"
+    path.write_bytes(content)
+    with pytest.raises(SurveyError, match=r"lights\.toml"):
+        read_survey(path)
+
+
+def test_missing_and_unreadable(tmp_path: Path) -> None:
+    with pytest.raises(SurveyError, match="no such survey"):
+        read_survey(tmp_path / "none.toml")
+    with pytest.raises(SurveyError, match="cannot be read"):
+        read_survey(tmp_path)
+
+
+def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "lights.toml"
+    survey = read_survey(EXAMPLE)
+    write_survey(path, survey)
+    other = replace(survey, floor=0.03)
+    with pytest.raises(SurveyError, match="--force"):
+        write_survey(path, other)
+    assert read_survey(path) == survey
+    write_survey(path, other, force=True)
+    assert read_survey(path) == other
+    assert [file.name for file in tmp_path.iterdir()] == ["lights.toml"]
+
+
+def test_no_place_to_write(tmp_path: Path) -> None:
+    with pytest.raises(SurveyError, match="cannot write"):
+        write_survey(tmp_path / "nowhere" / "lights.toml", read_survey(EXAMPLE))
