@@ -1,0 +1,1 @@
+"""Experiments: what the estimators reach in simulated rooms and on public recordings, as tables, data and pictures."""

@@ -1,0 +1,170 @@
+"""What an experiment hands back, and how its work is spread over the cores of a machine.
+
+An experiment is a module of this package with ``run(quick: bool, work: Work) -> Report``. It raises :class:`Skipped`
+where something outside is missing (recorded data). With ``quick`` it does a small part of the same, in seconds, so that
+a test can run it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from tools.figures import Figure
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Cell = str | float | int
+
+COMMAND: Final = "python -m tools.experiments lights --only"
+
+
+class Skipped(RuntimeError):
+    """The experiment cannot run here; the message says what is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows under a head; numbers keep their full digits in JSON and are shown with four."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def text(self) -> str:
+        """Aligned for a terminal, the first column to the left, numbers to the right."""
+        cells = [list(self.head), *([_shown(cell) for cell in row] for row in self.rows)]
+        widths = [max(len(row[i]) for row in cells) for i in range(len(self.head))]
+        lines = [
+            "  ".join(cell.rjust(width) if i else cell.ljust(width) for i, (cell, width) in enumerate(pairs)).rstrip()
+            for pairs in (list(zip(row, widths, strict=True)) for row in cells)
+        ]
+        return "\n".join([self.title, *lines])
+
+
+def _shown(cell: Cell) -> str:
+    return cell if isinstance(cell, str) else str(cell) if isinstance(cell, int) else f"{cell:.4g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A drawing: ``draw`` gets an empty matplotlib figure; saved as ``<name>.png``."""
+
+    name: str
+    draw: Callable[[Any], None]
+    inches: tuple[float, float] = (7.0, 4.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything one experiment found.
+
+    Attributes:
+        figures: single numbers, judged where the project has a bound for them. seeds: of every random generator used.
+        notes: sentences that must stand beside the numbers (conditions, caveats).
+    """
+
+    figures: tuple[Figure, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    seeds: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+class Work:
+    """Spreads independent trials over processes and says on stderr how far they are.
+
+    Args:
+        jobs: processes; 1 runs everything here, in order, which is also what a debugger wants.
+        progress: whether to write to stderr at all.
+    """
+
+    def __init__(self, jobs: int = 1, progress: bool = False) -> None:
+        if jobs < 1:
+            raise ValueError(f"jobs = {jobs}: at least one process is needed")
+        self.jobs, self.progress, self._shown_at = jobs, progress, -math.inf
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> list[Result]:
+        """``[function(item) for item in items]``, in that order; both must be importable by other processes.
+
+        Raises:
+            whatever ``function`` raises.
+        """
+        trials = list(items)
+        if self.jobs == 1 or len(trials) < 2:
+            return self._collect(map(function, trials), len(trials), label)
+        # spawn: a fork would copy threads' locks; each child imports afresh, with kernels from the cache
+        with ProcessPoolExecutor(min(self.jobs, len(trials)), multiprocessing.get_context("spawn"), _gentle) as pool:
+            return self._collect(pool.map(function, trials), len(trials), label)
+
+    def _collect(self, results: Iterable[Result], total: int, label: str) -> list[Result]:
+        done: list[Result] = []
+        for result in results:
+            done.append(result)
+            self._show(f"{label} {len(done)}/{total}", last=len(done) == total)
+        return done
+
+    def _show(self, text: str, last: bool) -> None:
+        now = time.monotonic()
+        if self.progress and (last or now - self._shown_at > 1.0):
+            self._shown_at = now
+            sys.stderr.write(f"\r  {text.strip()}\x1b[K" + ("\n" if last else ""))
+            sys.stderr.flush()
+
+
+def _gentle() -> None:
+    """A worker gives way to whatever else the machine does."""
+    os.nice(5)
+
+
+def save(name: str, report: Report, facts: dict[str, object], folder: Path) -> list[Path]:
+    """Write ``<name>.json`` and the pictures; returns what was written.
+
+    ``facts`` (command, seconds, quick) go in front. Without matplotlib the pictures are left out.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    data: dict[str, object] = {
+        **facts,
+        "seeds": list(report.seeds),
+        "notes": list(report.notes),
+        "figures": [asdict(f) | {"value": _plain(f.value)} for f in report.figures],
+        "tables": [
+            {"title": t.title, "head": t.head, "rows": [[_plain(c) for c in r] for r in t.rows]} for t in report.tables
+        ],
+    }
+    path = folder / f"{name}.json"
+    path.write_text(json.dumps(data, indent=1) + "\n")
+    return [path, *draw(report, folder)]
+
+
+def draw(report: Report, folder: Path) -> list[Path]:
+    """The pictures as PNG; none without matplotlib."""
+    try:
+        from matplotlib.figure import Figure as Canvas
+    except ImportError:
+        return []
+    paths = []
+    for picture in report.pictures:
+        canvas = Canvas(figsize=picture.inches, dpi=110, layout="constrained")
+        picture.draw(canvas)
+        paths.append(folder / f"{picture.name}.png")
+        canvas.savefig(paths[-1])
+    return paths
+
+
+def _plain(value: Cell) -> Cell | None:
+    """A number JSON can hold (numpy's scalars cannot be; NaN and infinity become null)."""
+    if isinstance(value, str):
+        return value
+    if not isinstance(value, float):
+        return int(value)
+    return float(value) if math.isfinite(value) else None
