@@ -29,7 +29,8 @@ SYSFS: Final = Path("/sys/class/i2c-dev")
 DEV: Final = Path("/dev")
 _ADAPTER: Final = "adapter:"
 _GONE: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ESHUTDOWN})
-_ENABLE: Final = "enable I2C (Raspberry Pi: dtparam=i2c_arm=on) and load the module i2c-dev"
+ENABLE: Final = "enable I2C (Raspberry Pi: dtparam=i2c_arm=on) and load the module i2c-dev"
+"""What to do where there is no bus at all."""
 
 
 class LinuxBus:
@@ -101,6 +102,12 @@ def _bytes(message: i2c_msg) -> bytes:
     return cast(bytes, message.__bytes__())  # list(message) takes a thousand times as long; the stub says str
 
 
+def buses() -> list[str]:
+    """Device nodes of the buses of this computer, by number."""
+    numbers = [path.name.removeprefix("i2c-") for path in DEV.glob("i2c-*")]
+    return [str(DEV / f"i2c-{number}") for number in sorted(int(text) for text in numbers if text.isdecimal())]
+
+
 def open_linux(name: str) -> LinuxBus:
     """Open ``/dev/i2c-N`` (or a link to it), or ``adapter:NAME``.
 
@@ -128,8 +135,8 @@ def explain_open_error(name: str, path: Path, error: OSError) -> HalError:
     """Turn what the operating system said about an open into one of the four nouns, with the remedy."""
     number = error.errno or 0
     if number in _GONE:
-        there = sorted(str(node) for node in DEV.glob("i2c-*"))
-        remedy = f"there are: {', '.join(there)}" if there else _ENABLE
+        there = buses()
+        remedy = f"there are: {', '.join(there)}" if there else ENABLE
         return DeviceMissing(name, "no such bus" if number == errno.ENOENT else os.strerror(number), remedy)
     if number in (errno.EACCES, errno.EPERM):
         return DeviceRefused(name, "permission denied", f"add the user to group {_group_of(path)} and log in again")
@@ -168,4 +175,4 @@ def _find(name: str) -> Path:
     listed = "; ".join(f"{node}: {own}" for node, own in adapters.items())
     if matching:
         raise DeviceRefused(name, f"{len(matching)} adapters have that name", f"use a path, or more of it: {listed}")
-    raise DeviceMissing(name, "no adapter has that name", f"there are: {listed}" if listed else _ENABLE)
+    raise DeviceMissing(name, "no adapter has that name", f"there are: {listed}" if listed else ENABLE)

@@ -1,0 +1,124 @@
+"""Look for converters on this computer's I2C buses and say what is there, without changing anything.
+
+What is done at an address: two bytes are read; if something acknowledges, some of its registers are read, for which a
+pointer is written. No register is written. Addresses outside those of the converters we know are left alone.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from hal.errors import HalError
+from hal.i2c import NACKS, AsyncBus, BusOpener, read
+from hal.photodiode import adc121c021, ads1x15, mcp3221
+from hal.photodiode.chips import Query
+from hal.photodiode.level import ask
+from hal.photodiode.trouble import explain
+
+ADDRESSES: Final = tuple(sorted(mcp3221.ADDRESSES | ads1x15.ADDRESSES | adc121c021.ADC121C021.addresses))
+_ELSE: Final = "something that is none of the converters known here"
+_FATAL: Final = frozenset({errno.ETIMEDOUT, errno.ENODEV, errno.ESHUTDOWN, errno.EACCES, errno.EPERM})
+"""After one of these the other addresses need not be asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chip:
+    """Something that answers.
+
+    Attributes:
+        address: 7 bits. name: MCP3221, ADC121C021, ``ADS1015 or ADS1115``; empty for anything else.
+        usable: lights can be decoded with it (else it tells levels, or nothing). problem: why nothing can be said.
+    """
+
+    address: int
+    name: str = ""
+    usable: bool = False
+    problem: str = ""
+
+    def __str__(self) -> str:
+        level = "" if self.usable or not self.name else " (levels only: the DC channel)"
+        return f"{self.address:#04x}: {self.name or self.problem or _ELSE}{level}"
+
+
+@dataclass(frozen=True, slots=True)
+class BusFinding:
+    """One bus.
+
+    Attributes:
+        bus: as a driver's bus is named. adapter: its own name. chips: what answered, by address.
+        error: why the bus, or the rest of it, could not be looked at; with a remedy.
+    """
+
+    bus: str
+    adapter: str = ""
+    chips: tuple[Chip, ...] = ()
+    error: HalError | None = None
+
+    def __str__(self) -> str:
+        title = f"{self.bus}: {self.adapter}" if self.adapter else self.bus
+        lines = [title, *(f"  {chip}" for chip in self.chips)]
+        if self.error is not None:
+            lines.append(f"  {self.error}")
+        elif not self.chips:
+            lines.append("  no converter answers; check its power, SDA and SCL")
+        return "\n".join(lines)
+
+
+async def probe_buses(opener: BusOpener, buses: Sequence[str]) -> list[BusFinding]:
+    """Look at each bus; never raises for anything a bus does.
+
+    Args:
+        opener: opens buses (:func:`hal.i2c.open_bus`).
+        buses: their names; those of this computer are :func:`hal.i2c_linux.buses`.
+    """
+    return [await probe_bus(opener, bus) for bus in buses]
+
+
+async def probe_bus(opener: BusOpener, name: str) -> BusFinding:
+    """Look at one bus."""
+    try:
+        bus = await opener(name)
+    except HalError as error:
+        return BusFinding(name, error=error)
+    chips: list[Chip] = []
+    try:
+        for address in ADDRESSES:
+            chip = await _look(bus, address)
+            if chip is not None:
+                chips.append(chip)
+    except OSError as error:
+        return BusFinding(name, bus.about, tuple(chips), explain(error, name, "converter", address))
+    finally:
+        await bus.close()
+    return BusFinding(name, bus.about, tuple(chips))
+
+
+async def _look(bus: AsyncBus, address: int) -> Chip | None:
+    """What is at an address, None: nothing. Raises `OSError` where the bus itself is at fault."""
+    try:
+        await bus.transfer((read(address, 2),))
+        return await _identify(bus, address)
+    except OSError as error:
+        if error.errno in _FATAL:
+            raise
+        if error.errno in NACKS or error.errno == errno.EIO:
+            return None
+        taken = "taken by a kernel driver; unbind it to look"
+        return Chip(address, problem=taken if error.errno == errno.EBUSY else os.strerror(error.errno or 0))
+
+
+async def _identify(bus: AsyncBus, address: int) -> Chip:
+    async def answers(queries: Sequence[Query]) -> tuple[bytes | None, ...]:
+        return tuple([await ask(bus, address, query) for query in queries])
+
+    if address in ads1x15.ADDRESSES and not ads1x15.judge(await answers(ads1x15.QUERIES)):
+        return Chip(address, "ADS1015 or ADS1115")
+    chip = mcp3221.CHIP if address in mcp3221.ADDRESSES else adc121c021.ADC121C021
+    told = await answers(chip.queries)
+    if chip is mcp3221.CHIP and told != (None,):  # others have zeros there as well, but an MCP3221 takes no data
+        return Chip(address)
+    return Chip(address) if chip.judge(told) else Chip(address, chip.name, usable=True)
