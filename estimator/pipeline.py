@@ -1,4 +1,4 @@
-"""The method, as one readable step: predict -> virtual frame -> match -> fuse -> keyframe -> map."""
+"""The method, as one readable step: predict -> lights -> virtual frame -> match -> fuse -> keyframe -> map."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
     keyframe = -1
     for record in sorted(records, key=order):
         predict(state, record)
+        if isinstance(record, SampleBlock | LightEpoch):
+            see_lights(state, record)
         if isinstance(record, Scan):
             points = virtual_frame(state, record)
             match = match_scan(state, record, points, limits)
@@ -39,6 +41,7 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
             if limits.update_map and keyframe_due(state, points, match):
                 keyframe = lay_keyframe(state, record, points)
                 update_map(state, record, points)
+    look_for_lamps(state, limits)
     return report(state, match, keyframe)
 
 
@@ -51,6 +54,8 @@ def order(record: Record) -> tuple[float, bool]:
 def predict(state: State, record: Record) -> None:
     """Bring the pose to the record's instant: by odometry, by gyro, else at constant velocity; obey a command."""
     noise = state.settings.noise
+    if state.light is not None:
+        state.light.predict(record)
     match record:
         case Odometry():
             motion.on_odometry(state.fused, record, noise)
@@ -60,6 +65,21 @@ def predict(state: State, record: Record) -> None:
             motion.carry_to(state.fused, record.t_end, noise)
         case Command():
             obey(state, record)
+
+
+def see_lights(state: State, record: SampleBlock | LightEpoch) -> None:
+    """Eq. 1-7: decode the block, if it is one, and take its links into the `lights` filter.
+
+    Without a photodiode in the setup the record is passed over.
+    """
+    if state.light is not None:
+        state.light.take(record)
+
+
+def look_for_lamps(state: State, limits: Limits) -> None:
+    """Go on looking for lamps that are not followed yet, as far as this cycle can afford."""
+    if state.light is not None:
+        state.light.look_on(limits.codes)
 
 
 def virtual_frame(state: State, scan: Scan) -> ScanPoints:
@@ -98,6 +118,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         anchor=state.anchor,
         T_anchor_base=se2.between(state.T_odom_anchor, moving.T_odom_base),
         jumps=state.jumps,
+        lights=None if state.light is None else state.light.result,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from estimator.localmap import LocalMap, MapSettings
 from estimator.matching import MatchSettings
 from estimator.motion import Motion, MotionNoise
 from estimator.records import Array
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light import Light, LightsSetup
 
 Place = tuple[int, int, int]
 
@@ -47,8 +51,8 @@ class State:
     """All of it; made by :func:`new_state`, changed only by `step`.
 
     Attributes:
-        fused: the filter whose pose is published. A second one, of lights and odometry without laser, stands beside it
-            as an independent witness where there are lights; the same records predict both.
+        fused: the filter whose pose is published. light: a second one, of lights and odometry without laser, beside it
+            as an independent witness; the same records predict both. None where there is no photodiode.
         T_map_odom: absolute correction. T_map_start: keyframe 0, where the robot was switched on.
         keyframes: by ID, with their scans. places: their IDs by half metre square and eighth of a turn.
         retired: T_map_keyframe of those let go, where history is kept.
@@ -60,6 +64,7 @@ class State:
 
     settings: Settings
     fused: Motion = field(default_factory=Motion)
+    light: Light | None = None
     T_map_odom: Array = field(default_factory=se2.identity)
     T_map_start: Array = field(default_factory=se2.identity)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
@@ -78,6 +83,19 @@ class State:
     T_odom_scan: Array = field(default_factory=se2.identity)
 
 
-def new_state(settings: Settings | None = None) -> State:
-    """A robot that has just been switched on, at the origin of its map."""
-    return State(settings or Settings())
+def new_state(settings: Settings | None = None, lights: LightsSetup | None = None) -> State:
+    """A robot that has just been switched on, at the origin of its map.
+
+    Args:
+        settings: default ones if None.
+        lights: the photodiode, None where there is none.
+
+    Raises:
+        ValueError: a stored sample clock outside the profile's range.
+    """
+    state = State(settings or Settings())
+    if lights is not None:
+        from estimator.light import Light
+
+        state.light = Light(lights)
+    return state

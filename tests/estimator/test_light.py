@@ -1,0 +1,67 @@
+"""The light half of a step: what is loaded when, and blocks and epochs on their way to the links."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from estimator.cdma_epoch import BlockFlag, LightEpoch, LinkFlag
+from estimator.light import LightsSetup
+from estimator.pipeline import new_state, step
+from estimator.records import UNLIMITED, Limits
+from estimator.result import LinkState
+from tests.estimator.cdma_scene import SAMPLES, ceiling, currents, sampled
+
+
+def epoch_of(t: float, ids: list[int], amplitude: list[float], flags: list[int]) -> LightEpoch:
+    """An epoch as if a decoder had made it, 50 ms long and ending at ``t``."""
+    n = len(ids)
+    seen = (np.array(ids), np.array(amplitude), np.full(n, 1e-18), np.array(flags))
+    return LightEpoch(t - 0.05, t, *seen, (None,) * n, BlockFlag.NONE, 1e-9, None)
+
+
+def test_without_a_photodiode_nothing_of_light_is_loaded() -> None:
+    code = (
+        "import sys\nfrom estimator.pipeline import new_state, step\nfrom estimator.records import UNLIMITED\n"
+        "assert step(new_state(), [], UNLIMITED).lights is None\n"
+        "assert not [name for name in sys.modules if name in ('estimator.cdma', 'estimator.light', 'estimator.lights')]"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_light_without_a_photodiode_in_the_setup_is_passed_over() -> None:
+    state = new_state()
+    assert step(state, [epoch_of(0.05, [3], [1e-6], [0])], UNLIMITED).lights is None
+
+
+def test_links_come_strongest_first_with_their_flags() -> None:
+    state = new_state(lights=LightsSetup())
+    flags = [0, int(LinkFlag.FAINT), int(LinkFlag.TWIN)]
+    lights = step(state, [epoch_of(0.05, [3, 7, 9], [1e-6, 2e-8, 2e-6], flags)], UNLIMITED).lights
+    assert lights is not None
+    assert [link.code for link in lights.links] == [9, 3, 7]
+    assert [link.state for link in lights.links][::2] == [LinkState.TWIN, LinkState.FAINT]
+
+
+@pytest.mark.jit
+@pytest.mark.parametrize("codes", [129, 33])
+def test_blocks_are_decoded_and_the_search_keeps_to_its_cap(codes: int) -> None:
+    scene, state, t = ceiling(1, currents(4.6, 5.3)[:6]), new_state(lights=LightsSetup(clock_ppm=0.0)), 1.0
+    limits, seen, blocks = Limits(50, 1000, update_map=True, codes=codes), set[int](), 0
+    while len(seen) < 6 and blocks < 30:
+        block = scene.block(t, SAMPLES, ())
+        t = block.t1 + 2e-4
+        lights = step(state, [sampled(block)], limits).lights
+        assert lights is not None
+        seen, blocks = {link.code for link in lights.links}, blocks + 1
+    assert seen == {lamp.code for lamp in scene.lamps}
+    assert blocks <= 5 if codes == 129 else 5 < blocks < 25
+
+
+def test_a_stored_clock_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ValueError, match="clock_ppm"):
+        new_state(lights=LightsSetup(clock_ppm=5e4))
