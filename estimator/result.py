@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -70,17 +71,19 @@ class LinkState(Enum):
     FAINT = "not above the noise"
     TWIN = "two lamps of this code are in view"
     UNSURVEYED = "no lamp of this code is known"
+    MISSING = "should be received here and has not been for a while: dead, switched off, or covered for good"
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """One lamp in view.
+    """One lamp in view, or one that should be.
 
     Attributes:
         code: as received. lamp_id: which lamp of that code, None where that is not known.
         amplitude: of the modulated photocurrent, A. residual: ln(received / expected), None without an expectation.
         sigma: one sigma of that residual, of everything. gain, sigma_gain: ln of the lamp's power against the
-            survey's, common part included, as estimated so far.
+            survey's, common part included, as estimated so far. contradicted: what the lamp says of itself differs
+            from the survey (which wins).
     """
 
     code: int
@@ -91,6 +94,7 @@ class Link:
     sigma: float | None = None
     gain: float = 0.0
     sigma_gain: float = 0.0
+    contradicted: bool = False
 
 
 class Fix(Enum):
@@ -111,6 +115,7 @@ class LightsResult:
     Attributes:
         t_mono: instant of the latest epoch taken in, `-inf` before the first.
         T_map_base, covariance: (x, y, yaw) and 3x3, meaningful unless fix is NONE or LOST; in AMBIGUOUS the likeliest.
+            True for ``t_pose``, which is the instant of the newest record of any kind.
         links: strongest first. accepted: lamp IDs of the links used (the paper's S).
         gained: 3x3 information that this step's links added to the pose beyond the prediction, and ``gained_by``: the
             pose's correction they made; `fused` takes exactly this, so that odometry is never counted twice.
@@ -128,6 +133,7 @@ class LightsResult:
     floor: float = 0.0
     block: BlockFlag = BlockFlag.NONE
     clock_ppm: float | None = None
+    t_pose: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
