@@ -15,7 +15,9 @@ import numpy.typing as npt
 
 from daemon.config import LidarConfig
 from estimator import se2
-from estimator.records import Array, Beam, Imu, Odometry, Scan
+from estimator.cdma_profile import Profile
+from estimator.records import Array, Beam, Imu, Odometry, SampleBlock, Scan
+from hal.adc import Blemish, RawSamples
 from hal.imu import RawImu
 from hal.lidar import VALID, LidarGeometry, RawScan
 from hal.odometry import RawOdometry
@@ -184,3 +186,50 @@ class ImuBridge:
         if last is None or not 0.0 < now - last[0] <= self.LONGEST_S:
             return None
         return Imu(last[0], now, 0.5 * (last[1] + raw.yaw_rate) * (now - last[0]))
+
+
+UNFIT: Final = Blemish.SHORT | Blemish.MISALIGNED | Blemish.STUCK
+"""Blocks with one of these are not what the light was; all else is for the decoder to judge."""
+
+MEASURED: Final = 2e-3
+"""How well a driver measures its rate, relative: within this beyond the decoder's reach the decoder decides."""
+
+
+class SampleBridge:
+    """Turns a converter's blocks into blocks on the nominal rate of the air interface, each with its own time base.
+
+    The decoder looks for the sample clock about the nominal rate, so that is what every block is given; a converter
+    beyond the decoder's reach keeps its own rate, and :attr:`off_rate` says so.
+
+    Attributes:
+        unfit, stretched: blocks dropped for their words, and blocks whose samples may not be evenly spaced.
+        rate_hz: conversions per second of the latest block as measured, 0 before the first.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        self.unfit = self.stretched = 0
+        self.rate_hz = 0.0
+        self._profile = profile
+
+    @property
+    def off_rate(self) -> bool:
+        """Whether the converter is clocked so differently that no lamp can be decoded."""
+        return self.rate_hz > 0.0 and not self._reachable(self.rate_hz)
+
+    def block(self, raw: RawSamples) -> SampleBlock | None:
+        """The same block as the decoder takes it; None for words that the light never was."""
+        if raw.blemish & UNFIT or raw.words.size == 0:
+            self.unfit += 1
+            return None
+        self.stretched += Blemish.STRETCHED in raw.blemish
+        self.rate_hz = raw.rate_hz
+        return SampleBlock(
+            t_begin=raw.t_first,
+            t_end=raw.t_first + raw.words.size / raw.rate_hz + raw.slack_s,
+            words=raw.words.astype(np.float64),
+            rate=self._profile.sample_rate if self._reachable(raw.rate_hz) else raw.rate_hz,
+        )
+
+    def _reachable(self, rate_hz: float) -> bool:
+        off = abs(rate_hz / self._profile.sample_rate - 1.0)
+        return off <= 1e-6 * self._profile.clock_ppm + MEASURED

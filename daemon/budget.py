@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Final, Protocol
 
 from estimator.records import UNLIMITED, Limits
@@ -25,6 +26,11 @@ MEDIAN_OF: Final = 5
 FORGETTING: Final = 0.1
 """Weight of a measurement when costs fall; a rise counts at once."""
 
+SEARCH_US: Final = 1000.0
+SEARCH_SHARE: Final = 0.1
+"""The search for further lamps gets so long, and no more than this share of the budget: it may take many cycles."""
+FEWEST_CODES: Final = 4
+
 
 class Budget(Protocol):
     """Says before each step what it may do, and learns afterwards what it cost."""
@@ -35,6 +41,10 @@ class Budget(Protocol):
 
     def learn(self, step_us: float, limits: Limits, result: StepResult) -> None:
         """Take in what the step under these caps has cost."""
+        ...
+
+    def learn_code(self, code_us: float) -> None:
+        """Take in what the search for one light code costs, microseconds."""
         ...
 
 
@@ -49,6 +59,9 @@ class FixedBudget:
         return self._limits
 
     def learn(self, step_us: float, limits: Limits, result: StepResult) -> None:
+        """Nothing to learn."""
+
+    def learn_code(self, code_us: float) -> None:
         """Nothing to learn."""
 
 
@@ -72,6 +85,9 @@ class RecordedBudget:
     def learn(self, step_us: float, limits: Limits, result: StepResult) -> None:
         """Nothing to learn."""
 
+    def learn_code(self, code_us: float) -> None:
+        """Nothing to learn."""
+
 
 class MeasuredBudget:
     """Real time: cost per iteration and point, and cost of map work, tracked from cycle to cycle."""
@@ -79,15 +95,17 @@ class MeasuredBudget:
     def __init__(self) -> None:
         self._iteration_us = 0.0
         self._map_us = 0.0
+        self._code_us = 0.0
         self._iteration_costs: deque[float] = deque(maxlen=MEDIAN_OF)
         self._map_costs: deque[float] = deque(maxlen=MEDIAN_OF)
         self._queries = 0
         self._waited = 0
 
     def limits(self, budget_us: float) -> Limits:
-        """Caps for a step that may take ``budget_us`` microseconds; unlimited until something was measured."""
+        """Caps for a step that may take ``budget_us`` microseconds; uncapped matching until something was measured."""
+        codes = self._codes(budget_us)
         if self._iteration_us <= 0.0:
-            return UNLIMITED
+            return replace(UNLIMITED, codes=codes)
         matching_us = ENOUGH_ITERATIONS * self._iteration_us
         update_map = matching_us + self._map_us <= budget_us or self._waited >= LONGEST_MAP_WAIT
         points = UNLIMITED.points
@@ -95,7 +113,17 @@ class MeasuredBudget:
             points = max(FEWEST_POINTS, int(self._queries * budget_us / matching_us))
         per_iteration = self._iteration_us * min(1.0, points / max(1, self._queries))
         iterations = math.floor(budget_us / per_iteration)
-        return Limits(min(UNLIMITED.icp_iterations, max(FEWEST_ITERATIONS, iterations)), points, update_map)
+        return Limits(min(UNLIMITED.icp_iterations, max(FEWEST_ITERATIONS, iterations)), points, update_map, codes)
+
+    def _codes(self, budget_us: float) -> int:
+        if self._code_us <= 0.0:
+            return UNLIMITED.codes
+        affordable = math.floor(min(SEARCH_US, SEARCH_SHARE * budget_us) / self._code_us)
+        return min(UNLIMITED.codes, max(FEWEST_CODES, affordable))
+
+    def learn_code(self, code_us: float) -> None:
+        """Take in what the search for one light code costs."""
+        self._code_us = code_us
 
     def learn(self, step_us: float, limits: Limits, result: StepResult) -> None:
         """Take in one step. Steps without a match teach nothing about iterations."""

@@ -16,6 +16,11 @@ from msgspec import Meta
 BAUDS = (0, 19200, 38400, 57600, 115200, 250000, 500000, 750000)
 """Line rates that SCIP knows (command SS, C-42-03320B), and 0."""
 
+NO_DEVICE = "none"
+"""A lidar that is not there: lights alone."""
+PROFILES = ("A", "B", "D")
+"""Air interfaces (docs/air-interface.md)."""
+
 Port = Annotated[int, Meta(ge=0, le=65535)]
 Metres = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -77,7 +82,10 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     device: Annotated[
         str,
-        Meta(min_length=1, description="auto (look for one), a path such as /dev/ttyACM0, or tcp://host:port"),
+        Meta(
+            min_length=1,
+            description="auto (look for one), a path such as /dev/ttyACM0, tcp://host:port, or none (lights alone)",
+        ),
     ] = "auto"
     serial: Annotated[str, Meta(description="serial number to insist on where several are connected; empty: any")] = ""
     baud: Annotated[int, Meta(description="line rate of a real serial line; 0: find it; USB and TCP ignore it")] = 0
@@ -86,10 +94,94 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     mask: Mask = Mask()
 
     def __post_init__(self) -> None:
-        if self.device != "auto" and not re.match(r"/.|[\w-]+:.", self.device):
-            raise ValueError(f"Expected `auto`, a path such as /dev/ttyACM0 or tcp://host:port, got `{self.device}`")
+        if self.device not in ("auto", NO_DEVICE) and not re.match(r"/.|[\w-]+:.", self.device):
+            raise ValueError(
+                f"Expected `auto`, `none`, a path such as /dev/ttyACM0 or tcp://host:port, got `{self.device}`"
+            )
         if self.baud not in BAUDS:
             raise ValueError(f"Expected one of {', '.join(map(str, BAUDS))} in `baud`, got {self.baud}")
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there is a lidar."""
+        return self.device != NO_DEVICE
+
+
+def parse_chip(text: str) -> tuple[str, int, int | None]:
+    """Split ``chip@address`` or ``chip@address/channel`` into its parts; the channel is None where there is none.
+
+    Raises:
+        ValueError: naming what is wrong and what was expected.
+    """
+    match = re.fullmatch(r"(?P<chip>\w+)@(?P<address>0[xX][0-9A-Fa-f]{1,2}|\d{1,3})(?:/(?P<channel>\d))?", text)
+    if match is None:
+        raise ValueError(f"Expected chip@address, as in mcp3221@0x4d, got `{text}`")
+    channel = None if match["channel"] is None else int(match["channel"])
+    return match["chip"], int(match["address"], 0), channel
+
+
+class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """The photodiode that sees the ceiling lights: where its converter is connected. How it sits is in the survey."""
+
+    bus: Annotated[
+        str,
+        Meta(
+            description="I2C bus of its converter: /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port; empty: none"
+        ),
+    ] = ""
+    converter: Annotated[str, Meta(description="its converter, chip@address: mcp3221, adc121c021 or adc121c027")] = (
+        "mcp3221@0x4d"
+    )
+    level: Annotated[
+        str,
+        Meta(description="DC channel that tells dark from dazzled, chip@address/channel: ads1115@0x48/0; empty: none"),
+    ] = ""
+    profile: Annotated[str, Meta(description="air interface of the lamps: A, B or D")] = "A"
+
+    def __post_init__(self) -> None:
+        from hal.photodiode.chips import chip_named
+
+        if self.bus and not re.match(r"/.|adapter:.|unix:/.|tcp://.", self.bus):
+            raise ValueError(
+                f"Expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port in `bus`, got `{self.bus}`"
+            )
+        name, address, channel = parse_chip(self.converter)
+        try:
+            chip = chip_named(name)
+        except ValueError as error:
+            raise ValueError(f"{error} in `converter`") from None
+        if channel is not None or address not in chip.addresses:
+            possible = ", ".join(f"{a:#04x}" for a in sorted(chip.addresses))
+            raise ValueError(f"Expected {name}@ADDRESS in `converter`, one of {possible}, got `{self.converter}`")
+        if self.profile not in PROFILES:
+            raise ValueError(f"Expected one of {', '.join(PROFILES)} in `profile`, got `{self.profile}`")
+        if self.level:
+            self._check_level(address)
+
+    def _check_level(self, converter: int) -> None:
+        from hal.photodiode.level import LevelInput
+
+        chip, address, channel = parse_chip(self.level)
+        if channel is None or address == converter:
+            raise ValueError(f"Expected chip@address/channel beside the converter in `level`, got `{self.level}`")
+        try:
+            LevelInput(chip, address, channel)
+        except ValueError as error:
+            raise ValueError(f"{error} in `level`") from None
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there is a photodiode."""
+        return bool(self.bus)
+
+
+class LightsConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """What is known of the ceiling lights."""
+
+    survey: Annotated[
+        str,
+        Meta(description="survey file of lamps and receiver, relative to this file; empty: lamps describe themselves"),
+    ] = ""
 
 
 class OdometryConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -137,6 +229,8 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         Meta(description="address of this machine the servers listen on; 0.0.0.0: reachable from every network"),
     ] = "127.0.0.1"
     lidar: LidarConfig = LidarConfig()
+    photodiode: PhotodiodeConfig = PhotodiodeConfig()
+    lights: LightsConfig = LightsConfig()
     odometry: OdometryConfig = OdometryConfig()
     cycle: CycleConfig = CycleConfig()
     modbus: ModbusConfig = ModbusConfig()
@@ -145,5 +239,7 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     def __post_init__(self) -> None:
         if not _is_address(self.bind):
             raise ValueError(f"Expected an IP address of this machine in `bind`, got `{self.bind}`")
+        if not self.lidar.fitted and not self.photodiode.fitted:
+            raise ValueError("Expected a lidar or a photodiode: `lidar.device` is none and `photodiode.bus` is empty")
         if self.odometry.port and self.odometry.port == self.modbus.port:
             raise ValueError(f"Expected a port other than Modbus's in `odometry.port`, got {self.odometry.port}")

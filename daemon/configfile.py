@@ -66,7 +66,16 @@ def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
     for override in overrides:
         _lay_over(tree, override)
         _convert(tree, f"--set {override}", "")
-    return _convert(tree, name, text)
+    return _anchored(_convert(tree, name, text), file)
+
+
+def _anchored(config: Config, file: Path | None) -> Config:
+    """The same with the survey's path as seen from the configuration file, not from wherever the process runs."""
+    survey = config.lights.survey
+    if file is None or not survey or Path(survey).is_absolute():
+        return config
+    lights = msgspec.structs.replace(config.lights, survey=str(file.resolve().parent / survey))
+    return msgspec.structs.replace(config, lights=lights)
 
 
 def options() -> list[Option]:

@@ -1,4 +1,6 @@
-"""The cycle: take what has arrived, step the estimator, judge, publish. One per scan, or at 1.5 scan periods without.
+"""The cycle: take what has arrived, step the estimator, judge, publish.
+
+There is one per scan; without scans, one per block of light samples; and at 1.5 periods at the latest.
 
 :class:`Cycle` is synchronous and knows no timer, so that replay can drive it as well; :class:`Pacemaker` runs it when
 it is due, in real or in virtual time. What a cycle consumed and decided goes to a tap as a :class:`CycleRecord`: with
@@ -13,17 +15,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from daemon.bridge import ImuBridge, OdometryBridge, ScanBridge
+from daemon.bridge import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
 from daemon.budget import Budget
-from daemon.evidence import Observer
+from daemon.evidence import EARLY, Observer
 from daemon.inbox import Inbox, Taken
 from daemon.pace import ScanPeriod
+from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
-from daemon.publish.snapshot import Snapshot, State
-from daemon.state import REASONS, Memory, judge
+from daemon.publish.snapshot import Snapshot
+from daemon.state import REASONS, SILENT_PERIODS, Memory, judge
 from daemon.worker import Worker
 from estimator.records import Command, Limits, Order, Record
 from estimator.result import StepResult
+from hal.adc import RawSamples
 from hal.clock import Clock
 from hal.lidar import LidarStatus, RawScan
 
@@ -48,7 +52,7 @@ class CycleRecord:
     Attributes:
         cycle: counts cycles from 1. t_mono: when it began.
         scan: `RawScan.seq` of the scan consumed, None without one. dropped: those that a later scan replaced.
-        odometry, imu: readings received since the start, all of them consumed by now.
+        odometry, imu, samples: readings, and blocks of light samples, received since the start, all consumed by now.
         commands: consumed. answers: job IDs of the answers applied, in order.
         limits: the step's caps; None where nothing had arrived and no step was made.
         result: of the step, or the previous one's; None before the first. snapshot: what was published.
@@ -67,6 +71,7 @@ class CycleRecord:
     result: StepResult | None
     snapshot: Snapshot
     stage_us: dict[str, int]
+    samples: int = 0
 
 
 Tap = Callable[[CycleRecord], None]
@@ -77,7 +82,8 @@ class Parts:
     """What a cycle is made of; every part can be replaced.
 
     Attributes:
-        status: of the lidar driver, live. odometry: an odometry input is configured.
+        status: of the lidar driver, live. lidar, odometry: there is one.
+        samples, blocks: of the photodiode; None where there is none.
         budget_us: time budget of a cycle, 0: half of the scan period.
         stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
         fault: number of the gravest present fault. map_id: identity of the map frame.
@@ -89,7 +95,10 @@ class Parts:
     budget: Budget
     worker: Worker
     status: LidarStatus
+    lidar: bool = True
     odometry: bool = False
+    samples: SampleBridge | None = None
+    blocks: BlockWatch | None = None
     budget_us: float = 0.0
     stopwatch: Callable[[], float] | None = None
     sinks: list[Sink] = field(default_factory=list)
@@ -151,6 +160,7 @@ class Cycle:
                 result=self.result,
                 snapshot=snapshot,
                 stage_us=stages.us,
+                samples=taken.samples_total,
             )
             self.parts.tap(record)
         return snapshot
@@ -175,11 +185,34 @@ class Cycle:
                 self.observer.witnesses.restart()
             self.observer.on_odometry(reading.t_rx)
         records += [turn for reading in taken.imu if (turn := self.imu.turn(reading)) is not None]
+        records += self._light(taken.samples)
         if taken.scan is not None:
             self.period.learn(taken.scan)
             self.observer.on_scan(taken.scan.t_rx)
             records.append(self.parts.scans.scan(taken.scan))
         return records
+
+    def _light(self, samples: tuple[RawSamples, ...]) -> list[Record]:
+        """The blocks that can be used."""
+        bridge, watch = self.parts.samples, self.parts.blocks
+        if bridge is None or watch is None:
+            return []
+        records: list[Record] = []
+        for raw in samples:
+            if (block := bridge.block(raw)) is not None:
+                watch.on_block(raw)
+                self.period.learn_block(watch.seconds)
+                records.append(block)
+        return records
+
+    def lidar_silence(self, t_mono: float) -> float | None:
+        """Scan periods since the last scan; None before the first."""
+        return self.observer.silence(t_mono, self.period.seconds)
+
+    def lidar_ok(self, t_mono: float) -> bool | None:
+        """Whether scans are coming; None where there is no lidar."""
+        silence = self.lidar_silence(t_mono)
+        return (silence is not None and silence < (1.0 - EARLY) * SILENT_PERIODS) if self.parts.lidar else None
 
     def _step(self, records: tuple[Record, ...], stages: _Stages) -> Limits | None:
         """Step the estimator under the budget's caps and return them; None where there was nothing to step over."""
@@ -206,9 +239,9 @@ class Cycle:
         return self.verdict
 
     def _facts(self, t_mono: float) -> Facts:
-        parts, silence = self.parts, self.observer.silence(t_mono, self.period.seconds)
-        alive = silence is not None and self.verdict.state is not State.NO_LIDAR
-        rate = None if silence is None else 1.0 / self.period.seconds if alive else 0.0
+        parts, alive = self.parts, self.lidar_ok(t_mono)
+        known = self.lidar_silence(t_mono) is not None
+        rate = None if not known else 1.0 / self.period.seconds if alive else 0.0
         return Facts(
             t_mono=t_mono,
             t_utc=parts.clock.utc(),
@@ -218,6 +251,7 @@ class Cycle:
             overruns=self.overruns,
             cycle_us=self.cycle_us,
             lidar_ok=alive,
+            adc_ok=None if parts.blocks is None else parts.blocks.ok(t_mono),
             odometry_ok=self.observer.odometry_ok(t_mono),
             fault=parts.fault(),
         )
@@ -260,7 +294,7 @@ class _Stages:
 
 
 class Pacemaker:
-    """Starts a cycle when a scan is complete, or at 1.5 scan periods without one."""
+    """Starts a cycle when a scan is complete; without scans, when a block of light samples is, or after a while."""
 
     def __init__(self, cycle: Cycle) -> None:
         self._cycle = cycle
@@ -270,6 +304,14 @@ class Pacemaker:
         """Take a scan from the driver; the cycle starts in the next turn of the loop, with the latest by then."""
         self._cycle.inbox.put_scan(scan)
         self._wake()
+
+    def on_samples(self, block: RawSamples) -> None:
+        """Take a block from the converter's driver; the next scan's cycle takes it along, if there are scans."""
+        cycle = self._cycle
+        cycle.inbox.put_samples(block)
+        silence = cycle.lidar_silence(cycle.parts.clock.now())
+        if silence is None or silence > IDLE_PERIODS:
+            self._wake()
 
     async def run(self) -> None:
         """Run cycles until cancelled."""

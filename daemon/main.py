@@ -1,7 +1,7 @@
 """``lumiloop run``: puts the rooms together, keeps every part running, and stops cleanly.
 
-Start order: publishers, lidar and inputs (their hand-shakes take time), then the estimator is loaded in a thread while
-they do, then cycles. Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recording.
+Start order: publishers, lidar, photodiode and inputs (their hand-shakes take time), then the estimator is loaded in a
+thread while they do, then cycles. Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recording.
 """
 
 from __future__ import annotations
@@ -21,24 +21,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from daemon import configfile
-from daemon.bridge import ScanBridge
+from daemon.bridge import SampleBridge, ScanBridge
 from daemon.budget import Budget, MeasuredBudget
+from daemon.cli import FAILED, OK, USAGE
 from daemon.config import Config, LidarConfig
 from daemon.cycle import Cycle, Pacemaker, Parts, Sink, Step
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
+from daemon.lights import Lights, SurveyError, load_lights, new_state
 from daemon.network import Feeds, Network
 from daemon.notify import notify
+from daemon.photodiode import AdcMaker, BlockWatch, make_adc
 from daemon.publish.snapshot import Snapshot
+from daemon.sampleclock import SampleClock
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
-from daemon.warmup import CannotLoad, warm_up
+from daemon.warmup import CannotLoad, Warmth, warm_up
 from daemon.worker import ThreadWorker, Worker
 from estimator.records import Limits, Record
 from estimator.result import StepResult
 from hal.clock import Clock, SystemClock
 from hal.errors import HalError
-from hal.lidar import Lidar
+from hal.i2c import BusOpener, open_bus
+from hal.lidar import Lidar, LidarGeometry, LidarStatus, RawScan
 from hal.port import PortOpener, open_port
 
 if TYPE_CHECKING:
@@ -75,6 +80,27 @@ def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
     )
 
 
+class NoLidar:
+    """Stands in the lidar's place where there is none (`hal.lidar.Lidar`)."""
+
+    def __init__(self) -> None:
+        self._status = LidarStatus(dialect="no lidar")
+
+    @property
+    def geometry(self) -> LidarGeometry | None:
+        """There is none."""
+        return None
+
+    @property
+    def status(self) -> LidarStatus:
+        """Closed, and without an error."""
+        return self._status
+
+    async def run(self, on_scan: Callable[[RawScan], None]) -> None:
+        """Nothing comes."""
+        await asyncio.Event().wait()
+
+
 @dataclass(slots=True)
 class World:
     """What the daemon meets outside itself. A test replaces any of it; the defaults are the real thing.
@@ -82,6 +108,8 @@ class World:
     Attributes:
         stopwatch: measures stages and budget; None: nothing is measured. sinks: get every snapshot too.
         warm_up: loads the estimator. draw_map_id: identity of a new map frame.
+        lights: survey and sample clock; None: as configured, and a sample clock that is to be found.
+        sample_clock: keeps the sample clock; None: it is not kept.
     """
 
     clock: Clock
@@ -93,26 +121,40 @@ class World:
     warm_up: Callable[[], Awaitable[object]] = warm_up
     sinks: tuple[Sink, ...] = ()
     draw_map_id: Callable[[], int] = lambda: 1 + secrets.randbelow(2**32 - 1)
+    buses: BusOpener = open_bus
+    make_adc: AdcMaker = make_adc
+    lights: Lights | None = None
+    sample_clock: SampleClock | None = None
 
 
 class Daemon:
-    """One run of the daemon: everything is built here, nothing is opened before :meth:`run`."""
+    """One run of the daemon: everything is built here, nothing is opened before :meth:`run`.
+
+    Raises:
+        SurveyError: the survey of the lamps cannot be used.
+    """
 
     def __init__(self, settings: Config, world: World, recorder: Recorder | None = None) -> None:
         self.supervisor = Supervisor()
         self._world = world
         self._recorder = recorder
+        lights = world.lights or load_lights(settings)
         opener = world.opener if recorder is None else recorder.tap(world.opener)
-        self.lidar = world.make_lidar(settings.lidar, world.clock, opener)
+        fitted = settings.lidar.fitted
+        self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
+        self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
         self.cycle = Cycle(
             Parts(
                 clock=world.clock,
-                step=_Estimator(),
+                step=_Estimator(lights),
                 scans=ScanBridge(settings.lidar),
                 budget=world.make_budget(),
                 worker=world.make_worker(),
                 status=self.lidar.status,
+                lidar=fitted,
                 odometry=settings.odometry.port > 0,
+                samples=None if lights is None else SampleBridge(lights.profile),
+                blocks=None if lights is None or self.adc is None else BlockWatch(self.adc.status, lights.profile),
                 budget_us=1e3 * settings.cycle.budget_ms,
                 stopwatch=world.stopwatch,
                 tap=None if recorder is None else recorder.on_cycle,
@@ -121,6 +163,8 @@ class Daemon:
         )
         self.pacemaker = Pacemaker(self.cycle)
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
+        on_samples = self.pacemaker.on_samples
+        self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
         self.network = Network(settings, world.clock, self._feeds())
         self.cycle.parts.sinks += [*self.network.sinks, *world.sinks, _FirstPose()]
         self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle))
@@ -134,7 +178,7 @@ class Daemon:
         """
         tasks = {name: asyncio.create_task(part, name=name) for name, part in self._parts().items()}
         stopped = asyncio.create_task(stop.wait(), name="stop")
-        warming = asyncio.create_task(_awaited(self._world.warm_up()), name="warm-up")
+        warming = asyncio.create_task(self._warm_up(), name="warm-up")
         try:
             await _first_to_end(warming, stopped, tasks["heartbeat"])
             if not stop.is_set():
@@ -144,6 +188,7 @@ class Daemon:
         finally:
             notify("STOPPING=1")
             log.info("stopping")
+            self._keep_sample_clock()
             for name in ("cycle", "lidar", *tasks):  # the lidar before what only listens: its laser is to go off
                 await _stop(tasks.get(name))
             for task in (stopped, warming):
@@ -152,9 +197,16 @@ class Daemon:
             if self._recorder is not None:
                 self._recorder.close()
 
+    async def _warm_up(self) -> None:
+        warmth = await self._world.warm_up()
+        if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
+            self.cycle.parts.budget.learn_code(warmth.code_us)
+
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
         parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._on_scan)}
+        if (adc := self.adc) is not None:
+            parts["photodiode"] = lambda: adc.run(self._on_samples)
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
@@ -164,7 +216,13 @@ class Daemon:
             return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command)
         return Feeds(recorder.on_odometry(inbox.put_odometry), recorder.on_imu(inbox.put_imu), inbox.put_command)
 
+    def _keep_sample_clock(self) -> None:
+        result, store = self.cycle.result, self._world.sample_clock
+        if store is not None and result is not None and result.lights is not None:
+            store.learn(result.lights.clock_ppm)
+
     def _vitals(self, lateness: float) -> Vitals:
+        self._keep_sample_clock()
         if self.cycle.cycles == 0:
             self.cycle.announce()
             notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
@@ -177,14 +235,15 @@ class Daemon:
 class _Estimator:
     """The estimator with its state; loaded with the first step, which the warm-up has made quick."""
 
-    def __init__(self) -> None:
+    def __init__(self, lights: Lights | None) -> None:
+        self._lights = lights
         self._step: Step | None = None
 
     def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
         if self._step is None:
             from estimator import pipeline
 
-            self._step = partial(pipeline.step, pipeline.new_state())
+            self._step = partial(pipeline.step, new_state(self._lights))
         return self._step(records, limits)
 
 
@@ -198,10 +257,6 @@ class _FirstPose:
         if snapshot.pose is not None and not self._said:
             self._said = True
             log.info("first pose %.2f s after the start, %.0f MB", process_age_s(), resident_mb())
-
-
-async def _awaited(work: Awaitable[object]) -> None:
-    await work
 
 
 async def _first_to_end(*tasks: asyncio.Task[Any]) -> None:
@@ -231,15 +286,28 @@ def main(args: argparse.Namespace) -> int:
     log.info("%s", _whereabouts(settings, args.record))
     recorder = None
     try:
+        world = _world(settings)
         if args.record is not None:
             from daemon.record import Recorder
 
-            recorder = Recorder(args.record, settings, SystemClock())
-        asyncio.run(_run_until_signal(settings, recorder))
+            recorder = Recorder(args.record, settings, world.clock, world.lights)
+        asyncio.run(_run_until_signal(settings, world, recorder))
+    except SurveyError as error:
+        log.error("%s", error)
+        return USAGE
     except (HalError, CannotLoad) as error:
         log.error("%s", error)
-        return 1
-    return 0
+        return FAILED
+    return OK
+
+
+def _world(settings: Config) -> World:
+    """The real one, with what is stored and surveyed of the lights; raises `SurveyError`."""
+    if not settings.photodiode.fitted:
+        return World(SystemClock())
+    sample_clock = SampleClock(settings.photodiode)
+    lights = load_lights(settings, sample_clock.ppm)
+    return World(SystemClock(), warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=sample_clock)
 
 
 def _whereabouts(settings: Config, record: Path | None) -> str:
@@ -251,12 +319,12 @@ def _whereabouts(settings: Config, record: Path | None) -> str:
     return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 
 
-async def _run_until_signal(settings: Config, recorder: Recorder | None) -> None:
+async def _run_until_signal(settings: Config, world: World, recorder: Recorder | None) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    await Daemon(settings, World(SystemClock()), recorder).run(stop)
+    await Daemon(settings, world, recorder).run(stop)
 
 
 def start_log() -> None:

@@ -14,7 +14,10 @@ ENOUGH: Final = 5
 
 
 class ScanPeriod:
-    """Median time between consecutive scans: missing revolutions and stamps that run backwards do not move it."""
+    """Median time between consecutive scans: missing revolutions and stamps that run backwards do not move it.
+
+    Where there has never been a scan, blocks of light samples set the pace.
+    """
 
     def __init__(self) -> None:
         self._nominal = IDLE_PERIOD_S
@@ -38,3 +41,8 @@ class ScanPeriod:
         step = (scan.t_mono - last[1]) / (scan.seq - last[0])
         if step > 0.0:
             self._steps.append(step)
+
+    def learn_block(self, seconds: float) -> None:
+        """Take in the length of a block of light samples."""
+        if self._last is None:
+            self._nominal = seconds

@@ -10,7 +10,7 @@ from daemon.publish.snapshot import Snapshot
 from daemon.state import Memory
 from estimator import se2
 from estimator.records import Array
-from estimator.result import StepResult
+from estimator.result import Link, LinkState, StepResult
 
 Triple = tuple[float, float, float]
 
@@ -30,6 +30,7 @@ class Facts:
     overruns: int = 0
     cycle_us: int | None = None
     lidar_ok: bool | None = None
+    adc_ok: bool | None = None
     odometry_ok: bool | None = None
     fault: int = 0
 
@@ -70,14 +71,24 @@ class Painter:
             loop_counter=self._loop[0],
             loop_new=self._loop[1],
             loop_old=self._loop[2],
+            links=None if facts.adc_ok is None else len(_received(result)),
+            light_id=next((link.lamp_id for link in _received(result)), None),
             scan_rate=facts.scan_rate,
             missed=facts.missed,
             overruns=facts.overruns,
             cycle_us=facts.cycle_us,
             lidar_ok=facts.lidar_ok,
+            adc_ok=facts.adc_ok,
             odometry_ok=facts.odometry_ok,
             fault=facts.fault,
         )
+
+
+def _received(result: StepResult | None) -> tuple[Link, ...]:
+    """Links that are above the noise, strongest first."""
+    if result is None or result.lights is None:
+        return ()
+    return tuple(link for link in result.lights.links if link.state is not LinkState.FAINT)
 
 
 def _pose(result: StepResult) -> Triple:

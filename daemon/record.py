@@ -18,18 +18,21 @@ import numpy as np
 from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.disk import SegmentWriter
+from daemon.lights import Lights
 from daemon.versions import versions
 from estimator.records import Array, Command, Limits, Order
+from estimator.result import StepResult
+from hal.adc import RawSamples
 from hal.clock import Clock
 from hal.errors import HalError
 from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 from hal.port import OnData, OnLost, Port, PortOpener
-from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_scan
+from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_samples, pack_scan
 
-LIDAR: Final = 0
-"""Channel of the lidar's bytes."""
+LIDAR, PHOTODIODE = 0, 0
+"""Channels: which device of its kind."""
 
 Pose = tuple[float, float, float]
 
@@ -48,6 +51,8 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
     Attributes:
         limits: (ICP iterations, points, whether the map may be updated), None where nothing was stepped.
         odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
+        codes: `Limits.codes`, None where nothing was stepped or before there were lights.
+        samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
     """
 
     cycle: int
@@ -61,10 +66,15 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
     state: int
     odom: Pose | None = None
     map_odom: Pose | None = None
+    codes: int | None = None
+    samples: int = 0
+    light: Pose | None = None
 
     def caps(self) -> Limits | None:
         """The step's caps as the estimator takes them."""
-        return None if self.limits is None else Limits(*self.limits)
+        if self.limits is None:
+            return None
+        return Limits(*self.limits) if self.codes is None else Limits(*self.limits, self.codes)
 
     def orders(self) -> list[Command]:
         """The commands as the estimator takes them."""
@@ -101,18 +111,28 @@ def _entry(record: CycleRecord) -> CycleEntry:
         state=int(record.snapshot.state),
         odom=None if result is None else _pose(result.T_odom_base),
         map_odom=None if result is None else _pose(result.T_map_odom),
+        codes=None if limits is None else limits.codes,
+        samples=record.samples,
+        light=light_of(result),
     )
+
+
+def light_of(result: StepResult | None) -> Pose | None:
+    """Pose of the `lights` filter; None where there is none."""
+    return None if result is None or result.lights is None else _pose(result.lights.T_map_base)
 
 
 class Recorder:
     """Taps a running daemon. Every method returns at once and never raises for what a disk can do.
 
-    Hand :meth:`tap` to the driver as its port opener, :meth:`on_scan`, :meth:`on_odometry` and :meth:`on_imu` to the
-    sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
+    Hand :meth:`tap` to the driver as its port opener, :meth:`on_scan`, :meth:`on_samples`, :meth:`on_odometry` and
+    :meth:`on_imu` to the sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
     """
 
-    def __init__(self, folder: Path, config: Config, clock: Clock) -> None:
+    def __init__(self, folder: Path, config: Config, clock: Clock, lights: Lights | None = None) -> None:
         """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
+
+        ``lights``: what the estimator is told of lights, which a replay has to tell it again.
 
         Raises:
             DeviceRefused: the folder cannot be made or written.
@@ -124,6 +144,7 @@ class Recorder:
             "t_utc": clock.utc(),
             "versions": versions(),
             "config": msgspec.to_builtins(config),
+            **({} if lights is None else lights.header()),
         }
         self._clock = clock
         self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header)
@@ -149,6 +170,15 @@ class Recorder:
             then(scan)
 
         return mark
+
+    def on_samples(self, then: Callable[[RawSamples], None]) -> Callable[[RawSamples], None]:
+        """A callback for blocks of samples that keeps the block and passes it on."""
+
+        def keep(block: RawSamples) -> None:
+            self.disk.put(Kind.SAMPLES, PHOTODIODE, block.t1, pack_samples(block))
+            then(block)
+
+        return keep
 
     def on_odometry(self, then: Callable[[RawOdometry], None]) -> Callable[[RawOdometry], None]:
         """An odometry callback that keeps the reading and passes it on."""

@@ -21,12 +21,13 @@ import msgspec
 from daemon import cli
 from daemon.config import Config, Mount
 from daemon.ledger import Ledger
+from daemon.lights import Lights, SurveyError, from_header, load_lights
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused, map_files, tum
 from daemon.sources import Source, open_log, sha256_of
 from daemon.versions import versions
 from estimator.grid import Grid
-from hal.errors import HalError
+from hal.errors import DataInvalid, HalError
 
 PROGRESS_S: Final = 1.0
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
@@ -88,7 +89,7 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN) -> Outcome:
     _say(f"replay: reading {path}")
     source = open_log(path)
     used = config_for(source, config, given)
-    outcome = Outcome(source, used, Rerun(source, used))
+    outcome = Outcome(source, used, Rerun(source, used, lights_for(source, used, given)))
     outcome.seconds["read"] = time.perf_counter() - begun
     begun = time.perf_counter()
     try:
@@ -116,6 +117,21 @@ def config_for(source: Source, config: Config, given: Given) -> Config:
     x, y, yaw = source.mount
     lidar = msgspec.structs.replace(config.lidar, mount=Mount(x=x, y=y, yaw=math.degrees(yaw)))
     return msgspec.structs.replace(config, lidar=lidar)
+
+
+def lights_for(source: Source, used: Config, given: Given) -> Lights | None:
+    """What the estimator is told of lights: as recorded, unless a person has asked for another survey or none.
+
+    Raises:
+        DataInvalid: what was recorded, or the survey asked for, cannot be used.
+    """
+    if not (source.recorded and used.photodiode.fitted):
+        return None
+    asked = given.file or any(key.startswith(("lights.", "photodiode.")) for key in given.keys)
+    try:
+        return load_lights(used) if asked else from_header(source.header)
+    except (SurveyError, ValueError) as error:
+        raise DataInvalid(str(source.path), str(error), "name a survey with --set lights.survey=FILE") from error
 
 
 def _laid_over(tree: dict[str, Any], config: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
@@ -224,6 +240,7 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
             "cycles": ledger.cycles,
             "dropped": ledger.dropped,
             "odometry": rerun.readings,
+            "blocks": rerun.blocks,
             "keyframes": ledger.keyframes,
             "matched": ledger.matched,
             "outcomes": dict(ledger.outcomes),

@@ -8,18 +8,22 @@ from array import array
 from dataclasses import dataclass, field
 from typing import Final
 
-from daemon.bridge import ScanBridge
+from daemon.bridge import SampleBridge, ScanBridge
 from daemon.budget import FixedBudget
 from daemon.config import Config
 from daemon.cycle import Cycle, CycleRecord, Parts
 from daemon.ledger import Ledger
-from daemon.record import CycleEntry
+from daemon.lights import Lights, new_state
+from daemon.photodiode import BlockWatch
+from daemon.record import CycleEntry, light_of
 from daemon.sources import Event, Source, Turn
 from daemon.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
 from estimator.grid import Grid
 from estimator.records import UNLIMITED, Limits, Order, Record
 from estimator.result import StepResult
+from hal.adc import AdcStatus, RawSamples
+from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 
@@ -83,24 +87,24 @@ class Timing:
 class Rerun:
     """One log through one fresh daemon cycle: feed it every event, then ask for the results."""
 
-    def __init__(self, source: Source, config: Config) -> None:
+    def __init__(self, source: Source, config: Config, lights: Lights | None = None) -> None:
         self.ledger = Ledger()
         self.comparison = Comparison()
         self.timing = Timing()
         self.odometry_m = 0.0
-        self.readings = 0
+        self.readings = self.blocks = 0
         self.t_first = math.inf
         self._source = source
         self._clock = ReplayClock()
-        self._state = pipeline.new_state(pipeline.Settings(history=True))
+        self._state = new_state(lights, pipeline.Settings(history=True))
         self._caps = ReplayBudget()
         self._answers: dict[int, tuple[int, ...]] = {}
         self._scan: tuple[float, float] = (0.0, 0.0)
         self._odometry: RawOdometry | None = None
         self._kept: list[CycleRecord] = []
-        self.cycle: Final = Cycle(self._parts(config))
+        self.cycle: Final = Cycle(self._parts(config, lights))
 
-    def _parts(self, config: Config) -> Parts:
+    def _parts(self, config: Config, lights: Lights | None) -> Parts:
         recorded = self._source.recorded
         return Parts(
             clock=self._clock,
@@ -109,7 +113,10 @@ class Rerun:
             budget=self._caps,
             worker=ScheduledWorker(self._answers) if recorded else CycleWorker(),
             status=self._source.status,
+            lidar=config.lidar.fitted,
             odometry=config.odometry.port > 0,
+            samples=None if lights is None else SampleBridge(lights.profile),
+            blocks=None if lights is None else BlockWatch(AdcStatus(), lights.profile),
             budget_us=1e3 * config.cycle.budget_ms,
             tap=self._keep,
         )
@@ -124,8 +131,11 @@ class Rerun:
         if isinstance(event, Turn):
             self._repeat(event)
             return
-        self._arrive(event.t_rx)
-        if isinstance(event, RawScan):
+        self._arrive(event.t1 if isinstance(event, RawSamples) else event.t_rx)
+        if isinstance(event, RawSamples):
+            self.blocks += 1
+            self.cycle.inbox.put_samples(event)
+        elif isinstance(event, RawScan):
             self._scan = (self._source.stamp(event), event.t_mono)
             self.cycle.inbox.put_scan(event)
             if not self._source.recorded:
@@ -133,7 +143,7 @@ class Rerun:
         elif isinstance(event, RawOdometry):
             self._count(event)
             self.cycle.inbox.put_odometry(event)
-        else:
+        elif isinstance(event, RawImu):
             self.cycle.inbox.put_imu(event)
 
     def finish(self) -> None:
@@ -180,13 +190,18 @@ class Rerun:
         result = record.result
         pose = None if result is None else (tuple(result.T_odom_base.tolist()), tuple(result.T_map_odom.tolist()))
         recorded = None if entry.odom is None else (entry.odom, entry.map_odom)
+        light = light_of(result)
         self.comparison.cycles += 1
         if (entry.scan, entry.dropped) != (record.scan, record.dropped):
             self.comparison.note(entry.cycle, f"took scan {record.scan}, recorded is {entry.scan}")
+        elif entry.samples != record.samples:
+            self.comparison.note(entry.cycle, f"took block {record.samples}, recorded is {entry.samples}")
         elif entry.caps() != record.limits:
             self.comparison.note(entry.cycle, "stepped where the recorded cycle did not, or the other way round")
         elif pose != recorded:
             self.comparison.note(entry.cycle, f"T_odom_base, T_map_odom are {pose}, recorded are {recorded}")
+        elif light != entry.light:
+            self.comparison.note(entry.cycle, f"the pose from light is {light}, recorded is {entry.light}")
 
     def _run(self) -> CycleRecord:
         begun = time.perf_counter()

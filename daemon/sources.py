@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Final
 import msgspec
 
 from daemon.record import LIDAR, CycleEntry, decode_cycle
+from hal.adc import RawSamples
 from hal.errors import DataInvalid
 from hal.hokuyo.passive import PassiveHokuyo
 from hal.imu import RawImu
@@ -34,6 +35,7 @@ from hal.replay.recording import (
     open_recording,
     unpack_imu,
     unpack_odometry,
+    unpack_samples,
     unpack_scan,
 )
 from hal.replay.report import LogReport
@@ -50,7 +52,7 @@ class Turn:
     entry: CycleEntry
 
 
-Event = RawScan | RawOdometry | RawImu | Turn
+Event = RawScan | RawSamples | RawOdometry | RawImu | Turn
 
 
 class Source(ABC):
@@ -238,6 +240,8 @@ class RecordingSource(Source):
                 self._codec.restart()
             case Kind.SCAN:
                 return self._claim(unpack_scan(frame.payload))
+            case Kind.SAMPLES:
+                return unpack_samples(frame.payload)
             case Kind.ODOMETRY:
                 return unpack_odometry(frame.payload)
             case Kind.IMU:

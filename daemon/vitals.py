@@ -8,7 +8,6 @@ from pathlib import Path
 
 from daemon.cycle import Cycle
 from daemon.health import Vitals
-from daemon.publish.snapshot import State
 from daemon.state import Reason
 
 
@@ -19,7 +18,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         t_mono=t_mono,
         link=status.link,
         error=status.error,
-        silent=cycle.verdict.state is State.NO_LIDAR and cycle.verdict.reason is Reason.LIDAR_SILENT,
+        silent=cycle.lidar_ok(t_mono) is False and cycle.lidar_silence(t_mono) is not None,
         scans=status.scans,
         missed=status.missed + (cycle.inbox.dropped if cycle.cycles else 0),
         invalid=status.invalid,

@@ -19,11 +19,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from daemon.lights import Lights
 
 log = logging.getLogger(__name__)
 
 ROOM: Final = Path(__file__).resolve().parents[1] / "estimator"
+LIGHT: Final = ("cdma", "codes", "ekf", "light", "links", "optics", "residual")
+"""Beginnings of the names of files that are loaded only where there is a photodiode."""
+OFFLINE: Final = ("calibrate", "survey")
+"""Of those that no daemon loads."""
+TIMED_CODES: Final = 129
+TIMED_TURNS: Final = 5
 
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
@@ -35,19 +44,28 @@ class CannotLoad(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Warmth:
-    """How the warm-up went: whether kernels had to be compiled, and the seconds it took."""
+    """How the warm-up went.
+
+    Attributes:
+        compiled: kernels had to be compiled. seconds: it took. code_us: microseconds that the search for one light code
+            takes here, 0 without lights.
+    """
 
     compiled: bool
     seconds: float
+    code_us: float = 0.0
 
 
-async def warm_up(progress: Callable[[str], None] = log.info) -> Warmth:
-    """Load the estimator in a thread; ``progress`` gets a line every few seconds while kernels are being compiled."""
+async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | None = None) -> Warmth:
+    """Load the estimator in a thread; ``progress`` gets a line every few seconds while kernels are being compiled.
+
+    What belongs to light is loaded only where ``lights`` says that there is a photodiode.
+    """
     begun = time.monotonic()
-    loading = _in_thread(load)
+    loading = _in_thread(load if lights is None else partial(load, lights))
     while not loading.done():
         await asyncio.wait([loading], timeout=REPORT_S)
-        if not loading.done() and (line := _progress_line(time.monotonic() - begun)):
+        if not loading.done() and (line := _progress_line(time.monotonic() - begun, lights is not None)):
             progress(line)
     warmth = loading.result()
     gc.collect()
@@ -84,7 +102,7 @@ def _settle(done: asyncio.Future[Warmth], warmth: Warmth | None, error: Exceptio
         done.set_exception(error)
 
 
-def load() -> Warmth:
+def load(lights: Lights | None = None) -> Warmth:
     """Import and exercise the estimator under the lock. Blocks; for a thread, or for a command that may wait.
 
     Raises:
@@ -92,7 +110,7 @@ def load() -> Warmth:
     """
     begun = time.monotonic()
     try:
-        return _load_locked(begun)
+        return _load_locked(begun, lights)
     except PermissionError as error:  # raised by the compiler under the service manager's MemoryDenyWriteExecute=
         remedy = "the process must be allowed to make memory executable"
         raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
@@ -100,24 +118,29 @@ def load() -> Warmth:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
 
 
-def _load_locked(begun: float) -> Warmth:
+def _load_locked(begun: float, lights: Lights | None) -> Warmth:
     from estimator.kernel import CACHE_DIR
 
     with (CACHE_DIR / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         # the directory is named by the sources' content; numba also keys by the path they were loaded from
-        mark = CACHE_DIR / f"warm-{hashlib.sha256(str(ROOM).encode()).hexdigest()[:16]}"
+        what = "warm" if lights is None else "warm-lights"
+        mark = CACHE_DIR / f"{what}-{hashlib.sha256(str(ROOM).encode()).hexdigest()[:16]}"
         cold = not mark.exists()
         if cold:
-            log.info("first start of this version: compiling %d kernels, which takes up to a minute", kernel_count())
+            count = kernel_count(lights is not None)
+            log.info("first start of this version: compiling %d kernels, which takes up to a minute", count)
         _exercise()
+        code_us = 0.0 if lights is None else _exercise_lights(lights)
         mark.touch()
-    return Warmth(cold, time.monotonic() - begun)
+    return Warmth(cold, time.monotonic() - begun, code_us)
 
 
-def kernel_count() -> int:
-    """Kernels in the estimator's sources."""
-    return sum(path.read_text().count("\n@kernel(") for path in ROOM.glob("*.py"))
+def kernel_count(lights: bool = False) -> int:
+    """Kernels in those of the estimator's sources that a start loads, with lights or without."""
+    left_out = OFFLINE if lights else OFFLINE + LIGHT
+    paths = (path for path in ROOM.glob("*.py") if not path.name.startswith(left_out))
+    return sum(path.read_text().count("\n@kernel(") for path in paths)
 
 
 def _exercise() -> None:
@@ -135,7 +158,36 @@ def _exercise() -> None:
         step(state, [Scan(seq * 0.1, seq * 0.1 + 0.05, seq, np.zeros(3), bearing, reach, hit, 0.01)], UNLIMITED)
 
 
-def _progress_line(seconds: float) -> str:
+def _exercise_lights(lights: Lights) -> float:
+    """Steps with light in them; returns the microseconds that the search for one code takes on this computer."""
+    import numpy as np
+
+    from daemon.lights import new_state
+    from estimator.cdma import decode, new_decoder, search
+    from estimator.pipeline import step
+    from estimator.records import UNLIMITED, SampleBlock
+
+    profile, state = lights.profile, new_state(lights)
+    words = np.round(2000.0 + 500.0 * np.sin(0.9 * np.arange(round(profile.epoch_s * profile.sample_rate)) ** 1.1))
+    blocks = [
+        SampleBlock(turn * profile.epoch_s, (turn + 1) * profile.epoch_s, words, profile.sample_rate)
+        for turn in range(TIMED_TURNS)
+    ]
+    for block in blocks[:2]:
+        step(state, [block], UNLIMITED)
+    decoder = new_decoder(profile, 0.0)
+    decode(decoder, blocks[0])
+    search(decoder, TIMED_CODES)  # the first one makes the spectra of the codes
+    best = float("inf")
+    for block in blocks[1:]:
+        decode(decoder, block)
+        begun = time.perf_counter()
+        search(decoder, TIMED_CODES)
+        best = min(best, time.perf_counter() - begun)
+    return 1e6 * best / TIMED_CODES
+
+
+def _progress_line(seconds: float, lights: bool = False) -> str:
     """How far compiling has come after ``seconds``; empty until the compiler is loaded."""
     kernel = sys.modules.get("estimator.kernel")
     directory: Path | None = getattr(kernel, "CACHE_DIR", None)
@@ -145,4 +197,4 @@ def _progress_line(seconds: float) -> str:
     count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
     if count == 0:
         return f"still loading the estimator after {seconds:.0f} s"
-    return f"compiling: {count} of {kernel_count()} kernels after {seconds:.0f} s"
+    return f"compiling: {count} of {kernel_count(lights)} kernels after {seconds:.0f} s"

@@ -21,6 +21,9 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
+from hal.adc import Blemish, RawSamples
 from hal.errors import DataInvalid
 from hal.imu import RawImu
 from hal.lidar import RawScan
@@ -29,7 +32,8 @@ from hal.replay.report import LogReport
 from hal.replay.text import unreadable
 
 MAGIC: Final = b"LUMIREC\n"
-VERSION: Final = 1
+VERSION: Final = 2
+"""Version 2 added SAMPLES, and lights in the header; what version 1 wrote reads as it did."""
 SUFFIX: Final = ".lumirec"
 MARKER: Final = b"\xa5\x5a"
 LONGEST: Final = 1 << 20
@@ -42,6 +46,7 @@ _CRC: Final = struct.Struct("<I")
 _ODOMETRY: Final = struct.Struct("<5d")
 _IMU: Final = struct.Struct("<3d")
 _SCAN: Final = struct.Struct("<q3d")
+_SAMPLES: Final = struct.Struct("<q5dBxHI")
 
 
 class Kind(IntEnum):
@@ -53,6 +58,7 @@ class Kind(IntEnum):
     LOST = 4  # a port was lost; payload: why
     BAUD = 5  # the line rate was changed; payload: the new rate as text
     SCAN = 8  # a scan the driver delivered: which, and when it was measured
+    SAMPLES = 9  # a block of conversions as the photodiode's driver delivered it
     ODOMETRY = 16
     IMU = 17
     COMMAND = 18
@@ -101,6 +107,22 @@ def pack_scan(scan: RawScan) -> bytes:
 def unpack_scan(payload: bytes) -> ScanMark:
     """The mark in a SCAN record; raises `struct.error` for a payload of another length."""
     return ScanMark(*_SCAN.unpack(payload))
+
+
+def pack_samples(block: RawSamples) -> bytes:
+    """Payload of a SAMPLES record."""
+    times = (block.t0, block.t1, block.t_first, block.rate_hz, block.slack_s)
+    head = _SAMPLES.pack(block.seq, *times, block.bits, block.blemish.value, block.words.size)
+    return head + block.words.astype("<u2").tobytes()
+
+
+def unpack_samples(payload: bytes) -> RawSamples:
+    """The block in a SAMPLES record; raises `struct.error` or `ValueError` for a payload that is not one."""
+    seq, t0, t1, t_first, rate_hz, slack_s, bits, blemish, count = _SAMPLES.unpack_from(payload)
+    words = np.frombuffer(payload, dtype="<u2", offset=_SAMPLES.size).astype(np.uint16)
+    if words.size != count:
+        raise ValueError(f"{words.size} of {count} samples")
+    return RawSamples(seq, t0, t1, t_first, rate_hz, words, bits, Blemish(blemish), slack_s)
 
 
 def pack_odometry(reading: RawOdometry) -> bytes:

@@ -66,7 +66,7 @@ def test_the_format_is_what_its_description_says() -> None:
     """Byte by byte, so that a change of the format is noticed (and gets a new version)."""
     frame = pack_frame(Kind.TX, 3, 2.0, b"VV\n")
     assert frame == bytes.fromhex("a55a0203030000000000000000000040") + struct.pack("<I", 0xDA77A602) + b"VV\n"
-    assert head().startswith(b"LUMIREC\n\x01\x00")
+    assert head().startswith(b"LUMIREC\n\x02\x00")
 
 
 @pytest.mark.parametrize("cut", [1, 5, 19, 20, 21, 60])
@@ -145,8 +145,8 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
 
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
     data = bytearray(head())
-    data[8] = 2
-    with pytest.raises(DataInvalid, match=r"version 2.*newer lumiloop"):
+    data[8] = 3
+    with pytest.raises(DataInvalid, match=r"version 3.*newer lumiloop"):
         open_recording(write(tmp_path, bytes(data)))
 
 

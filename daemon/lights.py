@@ -1,0 +1,82 @@
+"""What the estimator is told of ceiling lights before it starts: the survey, the air interface, the sample clock.
+
+It is read once, kept in a recording's head, and taken from there by a replay: the survey file may have changed since.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from daemon.config import Config
+from daemon.photodiode import profile_of
+from daemon.surveyfile import SurveyError, read_survey
+from estimator.cdma_profile import PROFILES, Profile
+from estimator.lamps import Survey
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from estimator.pipeline import Settings, State
+
+__all__ = ["Lights", "SurveyError", "from_header", "load_lights", "new_state"]
+
+HEADER: Final = "lights"
+"""Key of a recording's head."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lights:
+    """A photodiode and what it looks at.
+
+    Attributes:
+        survey: lamps and receiver; without lamps in it they have to describe themselves.
+        profile: air interface. clock_ppm: stored error of the sample clock; None: to be found.
+    """
+
+    survey: Survey
+    profile: Profile
+    clock_ppm: float | None = None
+
+    def header(self) -> dict[str, Any]:
+        """What a recording keeps in its head."""
+        kept = {"survey": msgspec.to_builtins(self.survey), "profile": self.profile.name, "clock_ppm": self.clock_ppm}
+        return {HEADER: kept}
+
+
+def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | None:
+    """What the configuration says of lights; None where there is no photodiode.
+
+    Raises:
+        SurveyError: the survey cannot be used; names the place and the remedy.
+    """
+    survey = read_survey(Path(settings.lights.survey)) if settings.lights.survey else Survey()
+    return Lights(survey, profile_of(settings.photodiode), clock_ppm) if settings.photodiode.fitted else None
+
+
+def from_header(header: dict[str, Any]) -> Lights | None:
+    """What a recording was made with; None where it had no photodiode.
+
+    Raises:
+        ValueError: it is not of this version.
+    """
+    kept = header.get(HEADER)
+    if kept is None:
+        return None
+    try:
+        survey = msgspec.convert(kept["survey"], Survey)
+        return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"])
+    except (KeyError, TypeError, msgspec.ValidationError) as error:
+        raise ValueError(f"the recording's lights are not of this version ({error})") from error
+
+
+def new_state(lights: Lights | None, settings: Settings | None = None) -> State:
+    """The estimator's state for a robot that has just been switched on; loads the estimator."""
+    from estimator import pipeline
+
+    if lights is None:
+        return pipeline.new_state(settings)
+    from estimator.light import LightsSetup
+
+    return pipeline.new_state(settings, LightsSetup(lights.survey, lights.profile, lights.clock_ppm))

@@ -1,0 +1,59 @@
+"""A photodiode at rest under a few coded lamps, as words of a fake converter on a fake bus; nothing finer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.lamps import Lamp, Survey
+from hal.clock import Clock
+from hal.fake.adc import FakeAdc, FakeBuses
+from tools.sim import light_transmitter
+from tools.sim.light_waveform import Ambient, Ceiling
+
+BUS = "/dev/i2c-7"
+Floats = npt.NDArray[np.float64]
+
+CODES = (5, 17, 60, 101)
+CURRENTS_A = (2.4e-6, 1.6e-6, 0.9e-6, 0.5e-6)
+
+SURVEY = Survey(
+    tuple(
+        Lamp(100 + code, code, x, y, 2.6)
+        for code, (x, y) in zip(CODES, ((0.8, 0.5), (-1.4, 0.9), (0.6, -2.0), (-2.2, -1.8)), strict=True)
+    )
+)
+
+
+class Lit:
+    """The converter's input under lamps that never change; it may be told other lamps while it runs."""
+
+    def __init__(self, codes: Sequence[int] = CODES, currents_a: Sequence[float] = CURRENTS_A) -> None:
+        self.under(codes, currents_a)
+
+    def under(self, codes: Sequence[int], currents_a: Sequence[float] = CURRENTS_A) -> None:
+        """Other lamps from now on."""
+        lamps = [
+            light_transmitter.Lamp(
+                code=code, current_a=current, ppm=7.0 * n - 10.0, phase_chips=31.7 * n, lamp_id=code + 100,
+                position_m=(1.5 * n, 2.0 - n, 2.6), data=True,
+            )
+            for n, (code, current) in enumerate(zip(codes, currents_a, strict=False))
+        ]  # fmt: skip
+        self._ceiling = Ceiling(lamps, Ambient(current_a=20e-6), seed=3)
+
+    def __call__(self, t_mono: Floats) -> Floats:
+        """Fraction of the converter's range at each instant."""
+        ceiling = self._ceiling
+        current = ceiling._signal(t_mono) + ceiling._tones(t_mono) + ceiling._noise(t_mono.size)
+        return np.asarray(0.5 + current / ceiling.receiver.full_scale_a)
+
+
+def plugged(clock: Clock, source: Lit, chip: str = "MCP3221", address: int = 0x4D) -> tuple[FakeBuses, FakeAdc]:
+    """A fake converter on a bus of its own."""
+    device = FakeAdc(source, clock, chip=chip, address=address)
+    buses = FakeBuses(clock)
+    buses.plug(BUS, device)
+    return buses, device
