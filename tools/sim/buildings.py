@@ -71,7 +71,7 @@ def _outside(plan: Plan) -> None:
     """What is seen through the panes: a few trunks, a parapet, a wall far away."""
     for centre, radius in (((9.0, 2.0), 0.2), ((11.5, -3.0), 0.25), ((10.2, 4.5), 0.15)):
         plan.circle(centre, radius, "wood")
-    plan.line((13.0, -9.0), (13.0, -1.0), "cardboard")
+    plan.line((13.0, -9.0), (13.0, -1.0), "cardboard", top=1.1)
     plan.line((24.0, -12.0), (24.0, 14.0))
 
 
@@ -130,15 +130,15 @@ def warehouse_hall(seed: int = 0, people: int = 3) -> Building:
     for y in rows:
         for x in np.arange(6.0, 44.1, 2.7):
             for side in (-1.1, 0.0, 1.1):
-                plan.box((float(x), y + side), (0.1, 0.09), 0.0, "steel")
+                plan.box((float(x), y + side), (0.1, 0.09), 0.0, "steel", top=6.0)
         for x in np.arange(6.0, 42.0, 2.7):
             for side in (-0.55, 0.55):
                 if rng.random() < 0.6:
                     size = (float(rng.uniform(0.8, 1.2)), float(rng.uniform(0.7, 0.9)))
                     centre = (float(x) + 1.35 + float(rng.uniform(-0.5, 0.5)), y + side)
-                    plan.box(
-                        centre, size, float(rng.normal(0.0, 0.03)), str(rng.choice(["cardboard", "black", "wood"]))
-                    )
+                    yaw, material = float(rng.normal(0.0, 0.03)), str(rng.choice(["cardboard", "black", "wood"]))
+                    plan.box(centre, size, yaw, material, top=1.5)
+        _upper_shelves(plan, y, seed)
     lanes = [0.5 * (a + b) for a, b in pairwise(rows)]
     corners: list[Point] = [(3.0, 5.5)]
     for number, y in enumerate(lanes):
@@ -148,6 +148,19 @@ def warehouse_hall(seed: int = 0, people: int = 3) -> Building:
         Walker(((8.0, lanes[k % 4] + 0.9), (42.0, lanes[k % 4] + 0.9)), 1.1, 7.0 * k) for k in range(people)
     )
     return Building("warehouse_hall", plan.build(), Route(tuple(corners), 1.8), walkers, 8.0)
+
+
+def _upper_shelves(plan: Plan, y: float, seed: int) -> None:
+    """Two levels of shelves above the pallets on the floor, three bays of four loaded; drawn by chance of their own."""
+    rng = np.random.default_rng((seed, round(10 * y)))
+    for x in np.arange(6.0, 42.0, 2.7):
+        for low in (2.0, 4.0):
+            for side in (-0.55, 0.55):
+                if rng.random() < 0.75:
+                    height = float(rng.uniform(0.9, 1.7))
+                    plan.shelf(
+                        (float(x) + 0.1, float(x) + 2.6), (y + side - 0.45, y + side + 0.45), (low, low + height)
+                    )
 
 
 def _office(people: int = 6) -> Building:

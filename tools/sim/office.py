@@ -75,7 +75,7 @@ def _door(plan: Plan, rng: np.random.Generator, hinge: Point, inward: float) -> 
     opening = float(rng.choice([0.0, 0.3, 1.2, 1.55], p=[0.45, 0.1, 0.15, 0.3]))
     leaf = (DOOR * np.cos(opening), inward * DOOR * np.sin(opening))
     foot = (hinge[0], hinge[1] + inward * 0.03)
-    plan.line(foot, (foot[0] + leaf[0], foot[1] + leaf[1]), "wood")
+    plan.line(foot, (foot[0] + leaf[0], foot[1] + leaf[1]), "wood", top=2.05)
 
 
 def _glass_front(plan: Plan, room: Point, hinge: float, front: float, origin: float) -> Point:
@@ -94,17 +94,17 @@ def _furnish(plan: Plan, rng: np.random.Generator, x: Point, y: Point) -> None:
     for _ in range(int(rng.integers(1, 3))):
         cx = float(rng.uniform(x[0] + 1.0, x[1] - 1.0))
         cy = back - inward * float(rng.uniform(0.6, 2.6))
-        plan.box((cx - 0.5, cy), (0.42, 0.60), 0.0, "wood")
+        plan.box((cx - 0.5, cy), (0.42, 0.60), 0.0, "wood", top=0.7)
         for side in (-0.33, 0.33):
-            plan.circle((cx + 0.7, cy + side), 0.03, "steel")
-        plan.circle((cx + 0.1, cy - inward * 0.7), 0.04, "black")
+            plan.circle((cx + 0.7, cy + side), 0.03, "steel", top=0.7)
+        plan.circle((cx + 0.1, cy - inward * 0.7), 0.04, "black", top=0.45)
         if rng.random() < 0.25:
             for side in (-0.12, 0.12):
-                plan.circle((cx + 0.1 + side, cy - inward * 0.5), 0.07, "cloth")
+                plan.circle((cx + 0.1 + side, cy - inward * 0.5), 0.07, "cloth", top=0.5)
     if rng.random() < 0.7:
         against = x[0] + 0.3 if rng.random() < 0.5 else x[1] - 0.3
         cy = back - inward * float(rng.uniform(1.0, ROOM_DEPTH - 1.6))
-        plan.box((against, cy), (0.42, 0.9), 0.0, "black" if rng.random() < 0.2 else "wood")
+        plan.box((against, cy), (0.42, 0.9), 0.0, "black" if rng.random() < 0.2 else "wood", top=1.8)
 
 
 def _walkers(people: int) -> tuple[Walker, ...]:

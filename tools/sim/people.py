@@ -42,6 +42,11 @@ class Crowd:
             rows[2 * number : 2 * number + 2] = self._person(number, t, robot)
         return rows
 
+    def bodies(self, t: float, robot: Array) -> Array:
+        """(n, 2) where the people stand at ``t``: midway between their feet."""
+        legs = self.legs(t, robot)
+        return np.asarray(0.5 * (legs[0::2, 1:3] + legs[1::2, 1:3]))
+
     def _person(self, number: int, t: float, robot: Array) -> Array:
         walker, path, length = self._walkers[number], self._paths[number], self._lengths[number]
         walked = walker.offset_m + walker.speed * np.array([t, t + _AHEAD_S])

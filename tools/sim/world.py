@@ -65,6 +65,8 @@ class World:
         cell_start, cell_items: numbers of shapes by cell, compressed rows; cell ``iy * nx + ix``.
         frame: (x0, y0, cell size, nx, ny) of the cells; all rays must start inside.
         polished: (k, 4) rectangles ``x_min, y_min, x_max, y_max`` of polished floor; elsewhere the floor is matt.
+        tops: (n,) height of each shape, inf: up to the ceiling. Light from above sees it, a lidar does not.
+        shelves: (k, 6) boxes ``x_min, y_min, x_max, y_max, low, top`` above all lidars; only lamps see them.
     """
 
     shapes: Array
@@ -72,6 +74,8 @@ class World:
     cell_items: Index
     frame: Array
     polished: Array
+    tops: Array = field(default_factory=lambda: np.zeros(0))
+    shelves: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -114,26 +118,34 @@ class Plan:
 
     rows: list[tuple[float, float, float, float, float, float]] = field(default_factory=list)
     floors: list[tuple[float, float, float, float]] = field(default_factory=list)
+    tops: list[float] = field(default_factory=list)
+    shelves: list[tuple[float, float, float, float, float, float]] = field(default_factory=list)
 
-    def line(self, a: Point, b: Point, material: str = "wall") -> None:
-        """A surface from ``a`` to ``b``, seen from both sides."""
+    def line(self, a: Point, b: Point, material: str = "wall", top: float = np.inf) -> None:
+        """A surface from ``a`` to ``b``, seen from both sides; ``top`` is its height."""
         self.rows.append((SEGMENT, a[0], a[1], b[0], b[1], float(MATERIAL_ID[material])))
+        self.tops.append(top)
 
-    def circle(self, centre: Point, radius: float, material: str = "wall") -> None:
+    def circle(self, centre: Point, radius: float, material: str = "wall", top: float = np.inf) -> None:
         """A round column, leg or post."""
         self.rows.append((CIRCLE, centre[0], centre[1], radius, 0.0, float(MATERIAL_ID[material])))
+        self.tops.append(top)
 
-    def outline(self, points: list[Point], material: str = "wall") -> None:
+    def outline(self, points: list[Point], material: str = "wall", top: float = np.inf) -> None:
         """A closed polygon."""
         for a, b in zip(points, points[1:] + points[:1], strict=True):
-            self.line(a, b, material)
+            self.line(a, b, material, top)
 
-    def box(self, centre: Point, size: Point, yaw: float = 0.0, material: str = "wood") -> None:
+    def box(self, centre: Point, size: Point, yaw: float = 0.0, material: str = "wood", top: float = np.inf) -> None:
         """A rectangle of ``size`` (length, width) turned by ``yaw``."""
         c, s = np.cos(yaw), np.sin(yaw)
         half = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
         local = [(size[0] * u, size[1] * v) for u, v in half]
-        self.outline([(centre[0] + c * x - s * y, centre[1] + s * x + c * y) for x, y in local], material)
+        self.outline([(centre[0] + c * x - s * y, centre[1] + s * x + c * y) for x, y in local], material, top)
+
+    def shelf(self, x: Point, y: Point, z: Point) -> None:
+        """Shelves with what is on them, above all lidars: extents along x, y and height."""
+        self.shelves.append((x[0], y[0], x[1], y[1], z[0], z[1]))
 
     def wall(self, a: Point, b: Point, gaps: list[Point] | None = None, thickness: float = 0.12) -> None:
         """A thick wall along ``a``-``b`` with openings ``(from, to)`` in metres from ``a``, faces and reveals drawn."""
@@ -162,7 +174,8 @@ class Plan:
         frame = np.array([x0, y0, CELL_M, nx, ny])
         start, items = _fill_cells(shapes, frame)
         floors = np.array(self.floors, dtype=np.float64).reshape(-1, 4)
-        return World(shapes, start, items, frame, floors)
+        shelves = np.array(self.shelves, dtype=np.float64).reshape(-1, 6)
+        return World(shapes, start, items, frame, floors, np.array(self.tops), shelves)
 
 
 def _extent(shapes: Array) -> tuple[float, float, float, float]:
