@@ -125,7 +125,7 @@ class Cycle:
         self.overruns = 0
         self.verdict = Memory()
         self.result: StepResult | None = None
-        self.observer = Observer(parts.clock.now(), parts.odometry)
+        self.observer = Observer(parts.clock.now(), parts.odometry, parts.lidar, parts.samples is not None)
         self._painter = Painter(parts.map_id)
         self.cycle_us: int | None = None
         self.failing: set[int] = set()

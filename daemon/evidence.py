@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from daemon.state import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Match
+from daemon.state import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
 from daemon.witness import Witnesses
-from estimator.records import Array, Command, Odometry, Record
-from estimator.result import MatchResult, Reason, StepResult
+from estimator.records import Array, Command, LightEpoch, Odometry, Record, SampleBlock
+from estimator.result import SURPRISE, Fix, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
 
 ENOUGH_INLIERS: Final = 0.4
@@ -19,6 +19,8 @@ OPENING_S: Final = 10.0
 """A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
 ODOMETRY_SILENT_S: Final = 1.0
 """Odometry that has not arrived for this long is silent."""
+LIGHT_SILENT_S: Final = 1.0
+"""Samples that have not arrived for this long are missing; blocks come twenty times a second."""
 GUESS_S: Final = 0.5
 """A velocity carries the pose along an axis that nothing shows for this long; after that the pose is a guess there."""
 EARLY: Final = 0.01
@@ -28,9 +30,14 @@ EARLY: Final = 0.01
 class Observer:
     """Watches the cycles go by. Its memory: witnesses, when devices last spoke, what was known when all was known."""
 
-    def __init__(self, t_mono: float, odometry: bool) -> None:
-        """Start watching; ``odometry``: an odometry input is configured."""
+    def __init__(self, t_mono: float, odometry: bool, lidar: bool = True, lights: bool = False) -> None:
+        """Start watching; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
         self.witnesses = Witnesses()
+        self._lidar, self._lights = lidar, lights
+        self._t_samples = t_mono
+        self._jumps = 0
+        self._odd = self._placed = False
+        self._known = (False, False, False)
         self._t_start = t_mono
         self._odometry = odometry
         self._t_scan: float | None = None
@@ -66,11 +73,16 @@ class Observer:
         for record in records:
             if isinstance(record, Odometry):
                 self.witnesses.on_odometry(record)
+            elif isinstance(record, SampleBlock | LightEpoch):
+                self._t_samples = t_mono
         ordered = any(isinstance(record, Command) for record in records)
         match = self._match(result)
         if match is not None and result is not None:
             match = self._without_guesses(match, result, t_mono, ordered)
-        sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
+        if result is not None and result.placed:
+            sigma_m, sigma_rad = _growth(result.covariance, np.zeros((3, 3)))
+        else:
+            sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
         silence = self.silence(t_mono, period)
         late = self._t_scan is None and t_mono - self._t_start > OPENING_S
         self._unreachable |= status.link is Link.WAITING or late  # until a scan: an attempt more is no news
@@ -85,7 +97,30 @@ class Observer:
             odometry=self.odometry_ok(t_mono),
             agree=self.witnesses.agree(),
             guessed=any(self._guessed),
+            places=_places(result),
             ordered=ordered,
+            lidar=self._lidar,
+            light=self._light(t_mono, result) if self._lights else None,
+        )
+
+    def _light(self, t_mono: float, result: StepResult | None) -> Light:
+        """What light says in this cycle; a cycle without a step repeats nothing but the silence."""
+        alive = t_mono - self._t_samples <= LIGHT_SILENT_S
+        if result is None or result.lights is None:
+            return Light(alive, placed=self._placed, known=self._known)
+        lights, gap = result.lights, result.gap
+        self._placed, self._known = result.placed, _axes(result.known_axes)
+        moved = result.jumps > self._jumps and self._odd
+        self._jumps = result.jumps
+        self._odd = gap is not None and gap > SURPRISE
+        return Light(
+            alive=alive,
+            used=alive and lights.fix is Fix.GOOD and bool(lights.accepted),
+            placed=result.placed,
+            lost=lights.fix is Fix.LOST,
+            agrees=None if gap is None or not alive else not self._odd,
+            moved=moved,
+            known=self._known,
         )
 
     def _match(self, result: StepResult | None) -> Match | None:
@@ -95,9 +130,9 @@ class Observer:
         self._mapped = found.reason is not Reason.NO_MAP
         if not self._mapped:
             return None
-        x, y, yaw = (bool(axis) for axis in result.known_axes)
-        match = Match(good(found), (x, y, yaw))
-        self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(match.known))
+        match = Match(good(found), _axes(result.known_axes))
+        laser = found.known_axes if result.placed else result.known_axes  # what light has shown is no echo of the laser
+        self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
         return match
 
     def _without_guesses(self, match: Match, result: StepResult, t_mono: float, ordered: bool) -> Match:
@@ -107,7 +142,7 @@ class Observer:
         keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
         is the place in the surroundings, not in the map. An order or a loop closure ends that.
         """
-        if ordered or result.loop is not None:
+        if ordered or result.loop is not None or (result.placed and result.gap is not None and result.gap <= SURPRISE):
             self._guessed = [False] * 3
             self._t_shown = [t_mono] * 3
         for axis, known in enumerate(match.known):
@@ -139,6 +174,18 @@ class Observer:
             self._P_complete = P
             return 0.0, 0.0
         return sigma_m, sigma_rad
+
+
+def _axes(known: Array) -> tuple[bool, bool, bool]:
+    x, y, yaw = (bool(axis) for axis in known)
+    return x, y, yaw
+
+
+def _places(result: StepResult | None) -> int | None:
+    """How many places fit: light says that there are several, as long as it has not told which."""
+    if result is None or result.lights is None or result.placed:
+        return None
+    return 2 if result.lights.fix is Fix.AMBIGUOUS else None
 
 
 def _growth(P: Array, before: Array) -> tuple[float, float]:

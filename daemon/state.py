@@ -1,7 +1,8 @@
 """What is said about the pose: one pure state machine, fed once per cycle with evidence.
 
-The rule it keeps: TRACKING is only said when two witnesses agree (wheel odometry and laser about the motion of the
-last seconds) or when the laser has proved itself (matches that are good, small and know every axis, for a while).
+The rule it keeps: TRACKING is only said when two witnesses agree (light and laser about the place, wheel odometry and
+laser about the motion of the last seconds) or when one has proved itself (matches that are good, small and know every
+axis, for a while; light that goes on fitting the place). It is never said of a place that light contradicts.
 Every other state comes with a reason, and a reason comes with a remedy. Bad news counts fast, good news slowly.
 """
 
@@ -36,6 +37,10 @@ HELD_S: Final = 1.0
 LOST_M: Final = 1.0
 LOST_RAD: Final = 0.26
 """One-sigma uncertainty beyond which a pose is not worth using."""
+DARK_S: Final = 5.0
+"""Light that tells nothing for this long is a witness that is missing: the way between two lamps is shorter."""
+CONTRADICTED_S: Final = 0.3
+"""Light has to contradict the place for this long: an epoch may be spoiled by who walks by."""
 VAGUE_M: Final = 0.15
 VAGUE_RAD: Final = 0.1
 """One-sigma uncertainty beyond which TRACKING is not said."""
@@ -63,6 +68,11 @@ class Reason(IntEnum):
     SEVERAL_PLACES = 12
     SEARCHING = 13
     CONFIRMING = 14
+    LIGHT_SILENT = 15
+    LIGHT_DARK = 16
+    LIGHT_DISAGREES = 17
+    LIGHT_LOST = 18
+    UNPLACED = 19
 
 
 REASONS: Final[dict[Reason, tuple[str, str]]] = {
@@ -87,6 +97,26 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.SEVERAL_PLACES: ("several places fit", "drive on until one is left"),
     Reason.SEARCHING: ("looking for the place in the map", "wait"),
     Reason.CONFIRMING: ("scans fit again; being confirmed", "wait a few seconds"),
+    Reason.LIGHT_SILENT: (
+        "the photodiode is configured and its samples do not arrive",
+        "check its converter's power and bus; read the fault",
+    ),
+    Reason.LIGHT_DARK: (
+        "no lamp can be used",
+        "are the lamps on, is the photodiode covered, is this part of the building surveyed?",
+    ),
+    Reason.LIGHT_DISAGREES: (
+        "light and pose contradict each other about the place",
+        "wait some seconds; if it lasts or comes again: lamps moved, a wrong survey, or the laser slipped",
+    ),
+    Reason.LIGHT_LOST: (
+        "what is received does not fit the place, it is being found anew from the lamps",
+        "drive a metre or two; if it lasts, check the survey",
+    ),
+    Reason.UNPLACED: (
+        "where the robot stands and looks in the survey is not known yet",
+        "drive a metre or two in view of three lamps, or set the pose",
+    ),
 }
 """For every reason what it means and what a person can do."""
 
@@ -105,6 +135,28 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True)
+class Light:
+    """What light says, already judged by the cycle.
+
+    Attributes:
+        alive: samples arrive. used: lamps are received and used, and the place and heading they tell are good.
+        placed: it has been told by light where the map lies.
+        lost: what is received contradicts the place that light itself had told.
+        agrees: whether the light's place and the pose are the same within what both may be wrong; None: cannot be said.
+        moved: in this cycle the pose was moved to where light says, after the two had contradicted each other.
+        known: (x, y, yaw) whether the pose knows the axis, with or without a laser.
+    """
+
+    alive: bool
+    used: bool = False
+    placed: bool = False
+    lost: bool = False
+    agrees: bool | None = None
+    moved: bool = False
+    known: tuple[bool, bool, bool] = (False, False, False)
+
+
+@dataclass(frozen=True, slots=True)
 class Evidence:
     """What one cycle knows. Times in seconds of ``t_mono``.
 
@@ -120,6 +172,7 @@ class Evidence:
         agree: whether wheels and laser told the same motion lately; None where that cannot be said.
         places: how many places fit while the place is looked for (0: none yet); None: not looking.
         ordered: a person has set the pose or reset the map in this cycle.
+        lidar: there is one. light: None where no photodiode is configured.
     """
 
     t_mono: float
@@ -134,6 +187,8 @@ class Evidence:
     agree: bool | None = None
     places: int | None = None
     ordered: bool = False
+    lidar: bool = True
+    light: Light | None = None
 
 
 Streak = tuple[int, float]
@@ -152,6 +207,8 @@ class Memory:
         disagree_since: None while the witnesses do not disagree.
         doubt: the place itself has to be proved again, because nothing told the motion for a while.
         lost: the pose was given up and is not confirmed yet; implies ``doubt``.
+        lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
+        odd_since: since when light has contradicted the place; both None while it does not.
     """
 
     state: State = State.STARTING
@@ -166,6 +223,9 @@ class Memory:
     disagree_since: float | None = None
     doubt: bool = False
     lost: bool = False
+    lit_since: float | None = None
+    lit_last: float | None = None
+    odd_since: float | None = None
 
 
 def judge(memory: Memory, evidence: Evidence) -> Memory:
@@ -181,12 +241,8 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The table, gravest first."""
-    if evidence.silence is None:
-        if evidence.unreachable:
-            return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE
-        return State.STARTING, Reason.OPENING_LIDAR
-    if evidence.silence >= SILENT_PERIODS:
-        return State.NO_LIDAR, Reason.LIDAR_UNREACHABLE if evidence.unreachable else Reason.LIDAR_SILENT
+    if evidence.silence is None or evidence.silence >= SILENT_PERIODS:
+        return _say_without_laser(memory, evidence)
     if evidence.places is not None and evidence.places != 1:
         several = evidence.places > 1
         return (State.AMBIGUOUS, Reason.SEVERAL_PLACES) if several else (State.RELOCATING, Reason.SEARCHING)
@@ -200,25 +256,89 @@ def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     return _say_of_pose(memory, evidence)
 
 
+def _say_without_laser(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
+    """The part of the table for a laser that is silent or not there: light may hold the pose."""
+    light = evidence.light
+    if light is not None and light.placed:
+        return _say_of_light(memory, evidence, light)
+    if not evidence.lidar:
+        if evidence.places is not None and evidence.places > 1:
+            return State.AMBIGUOUS, Reason.SEVERAL_PLACES
+        searching = light is not None and light.alive
+        return (State.RELOCATING, Reason.UNPLACED) if searching else (State.LOST, Reason.LIGHT_SILENT)
+    if evidence.silence is None and not evidence.unreachable:
+        return State.STARTING, Reason.OPENING_LIDAR
+    return State.NO_LIDAR, _lidar_gone(evidence)
+
+
+def _lidar_gone(evidence: Evidence) -> Reason:
+    return Reason.LIDAR_UNREACHABLE if evidence.unreachable else Reason.LIDAR_SILENT
+
+
+def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[State, Reason]:
+    """The part of the table for a pose that light and odometry hold without a laser."""
+    if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
+        return State.LOST, Reason.UNCERTAIN
+    if light.lost or _contradicted(memory, evidence):
+        return State.RELOCATING, Reason.LIGHT_LOST
+    dark = evidence.t_mono - (memory.lit_last or 0.0)
+    if dark > HELD_S and not evidence.odometry:
+        return State.LOST, Reason.NO_WITNESS
+    if evidence.lidar:
+        return State.DEGRADED, _lidar_gone(evidence)
+    missing = _missing(memory, evidence)
+    if missing is not None:
+        return State.DEGRADED, missing
+    if evidence.sigma_m > VAGUE_M or evidence.sigma_rad > VAGUE_RAD or not all(memory.known):
+        return State.DEGRADED, Reason.UNCERTAIN
+    proof = RELOCATED_PROOF_S if memory.doubt else PROOF_S
+    if memory.lit_since is not None and evidence.t_mono - memory.lit_since >= proof:
+        return State.TRACKING, Reason.NONE
+    return State.DEGRADED, Reason.CONFIRMING
+
+
 def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The part of the table for a pose that is held: is it lost, degraded, unproved or good."""
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
         return State.LOST, Reason.UNCERTAIN
+    if evidence.light is not None and evidence.light.lost:
+        return State.RELOCATING if memory.failed else State.DEGRADED, Reason.LIGHT_LOST
     if memory.failed >= FAILED_SCANS:
-        if not evidence.odometry and evidence.t_mono - (memory.good_last or 0.0) > HELD_S:
+        lit = evidence.light is not None and evidence.light.used and evidence.light.placed
+        if not (evidence.odometry or lit) and evidence.t_mono - (memory.good_last or 0.0) > HELD_S:
             return State.LOST, Reason.NO_WITNESS
         return State.DEGRADED, Reason.MATCH_FAILED
+    if _contradicted(memory, evidence):
+        return State.DEGRADED, Reason.LIGHT_DISAGREES
     if not all(memory.known) and (memory.good >= AXIS_FOUND_SCANS or memory.state in HELD):
         return State.DEGRADED, Reason.UNCERTAIN if evidence.guessed else Reason.AXIS_UNKNOWN
     if memory.disagree_since is not None and evidence.t_mono - memory.disagree_since >= DISAGREE_S:
         return State.DEGRADED, Reason.WITNESSES_DISAGREE
-    if evidence.odometry is False:
-        return State.DEGRADED, Reason.ODOMETRY_SILENT
+    missing = _missing(memory, evidence)
+    if missing is not None:
+        return State.DEGRADED, missing
     if evidence.sigma_m > VAGUE_M or evidence.sigma_rad > VAGUE_RAD:
         return State.DEGRADED, Reason.UNCERTAIN
+    if evidence.light is not None and not evidence.light.placed:
+        return State.MAPPING, Reason.UNPLACED
     if memory.state is State.TRACKING or _proved(memory, evidence) or _agreed(memory, evidence):
         return State.TRACKING, Reason.NONE
     return (State.DEGRADED, Reason.CONFIRMING) if memory.state is State.DEGRADED else (State.MAPPING, Reason.UNPROVED)
+
+
+def _missing(memory: Memory, evidence: Evidence) -> Reason | None:
+    """Which configured witness has fallen silent, if any."""
+    light = evidence.light
+    if light is not None and not light.alive:
+        return Reason.LIGHT_SILENT
+    if evidence.odometry is False:
+        return Reason.ODOMETRY_SILENT
+    dark = memory.lit_last is not None and evidence.t_mono - memory.lit_last > DARK_S
+    return Reason.LIGHT_DARK if light is not None and light.placed and dark else None
+
+
+def _contradicted(memory: Memory, evidence: Evidence) -> bool:
+    return memory.odd_since is not None and evidence.t_mono - memory.odd_since >= CONTRADICTED_S
 
 
 def _clean(memory: Memory, evidence: Evidence) -> bool:
@@ -233,21 +353,54 @@ def _proved(memory: Memory, evidence: Evidence) -> bool:
 
 
 def _agreed(memory: Memory, evidence: Evidence) -> bool:
-    """Whether two witnesses tell the same motion; it says nothing about a place that is in doubt."""
+    """Whether two witnesses tell the same motion, or place; the motion says nothing about a place in doubt."""
+    light = evidence.light
+    if light is not None and light.used and light.agrees and not light.moved:
+        proof = RELOCATED_PROOF_S if memory.doubt else CLEAN_S
+        if memory.lit_since is not None and evidence.t_mono - memory.lit_since >= proof:
+            return _clean(memory, evidence)
     return _clean(memory, evidence) and evidence.agree is True and not memory.doubt
 
 
 def _remember(memory: Memory, evidence: Evidence) -> Memory:
     now = evidence.t_mono
-    if evidence.silence is not None and evidence.silence >= SILENT_PERIODS:
-        blind = not evidence.odometry and memory.good_last is not None and now - memory.good_last > HELD_S
-        forgotten = Memory(memory.state, memory.reason, lost=memory.lost, doubt=memory.doubt or blind)
-        return replace(forgotten, good_last=memory.good_last)
+    if evidence.light is not None:
+        memory = _take_light(memory, evidence.light, now)
+    if not evidence.lidar or (evidence.silence is not None and evidence.silence >= SILENT_PERIODS):
+        return _forget_laser(memory, evidence)
     since = memory.disagree_since if memory.disagree_since is not None else now
     memory = replace(memory, disagree_since=since if evidence.agree is False else None)
     if evidence.match is None:
         return memory
     return _take_good(memory, evidence.match, now) if evidence.match.good else _take_failed(memory)
+
+
+def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
+    """What is left of the memory while the laser is silent; a pose that nothing carried on is in doubt."""
+    now, light = evidence.t_mono, evidence.light
+    carried = evidence.odometry or (light is not None and light.used)
+    blind = not carried and memory.good_last is not None and now - memory.good_last > HELD_S
+    known = light.known if light is not None and light.placed else (False, False, False)
+    return replace(
+        Memory(memory.state, memory.reason, lost=memory.lost, doubt=memory.doubt or blind),
+        good_last=memory.good_last,
+        known=known,
+        lit_since=memory.lit_since,
+        lit_last=memory.lit_last,
+        odd_since=memory.odd_since,
+    )
+
+
+def _take_light(memory: Memory, light: Light, now: float) -> Memory:
+    """Remember since when light has told the place, and since when it has contradicted the pose."""
+    odd = light.agrees is False
+    memory = replace(memory, odd_since=(now if memory.odd_since is None else memory.odd_since) if odd else None)
+    if light.moved or light.lost:
+        memory = replace(memory, doubt=True, lit_since=None)
+    if light.used and light.placed and not odd:
+        begun = memory.lit_since is None or now - (memory.lit_last or now) > DARK_S
+        return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now)
+    return memory
 
 
 def _take_failed(memory: Memory) -> Memory:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from estimator import se2
+from estimator.mapframe import move_map, shift_map
 from estimator.mapping import NOTHING
 from estimator.records import Array, Command, Order
 from estimator.state import State
-
-JUMP_M, JUMP_RAD = 0.05, math.radians(1.0)
 
 
 def obey(state: State, command: Command) -> None:
@@ -40,13 +37,6 @@ def forget(state: State) -> None:
 
 def place(state: State, T_map_base: Array) -> None:
     """Move the map frame so that the robot's pose is ``T_map_base``, and everything in the map with the robot."""
-    was = se2.compose(state.T_map_odom, state.fused.T_odom_base)
     T_map_odom = se2.compose(T_map_base, se2.inverse(state.fused.T_odom_base))
-    moved = se2.compose(T_map_odom, se2.inverse(state.T_map_odom))
-    state.T_map_start = se2.compose(moved, state.T_map_start)
-    state.retired = {key: se2.compose(moved, T) for key, T in state.retired.items()}
-    for frame in state.keyframes.values():
-        frame.T_map_keyframe = se2.compose(moved, frame.T_map_keyframe)
-    x, y, yaw = se2.between(was, T_map_base).tolist()
-    state.jumps += int(math.hypot(x, y) > JUMP_M or abs(yaw) > JUMP_RAD)
-    state.T_map_odom = T_map_odom
+    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), 0)
+    move_map(state, T_map_odom)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator import motion, se2
+from estimator import absolute, motion, se2
 from estimator.linear3 import invert3
 from estimator.records import Array, Scan
 from estimator.result import MatchResult, Reason
@@ -25,9 +25,11 @@ def fuse(state: State, match: MatchResult) -> None:
     if match.ok:
         state.failures = 0
         learn_noise(state, match)
+        T_pred, P_pred = moving.T_odom_base, moving.P
         moving.T_odom_base = match.T_odom_base
-        P = moving.P * motion.learn(moving, match.correction, bool(match.known_axes.all()))
-        moving.P = invert3(invert3(P) + match.information)
+        inflated = motion.learn(moving, match.correction, bool(match.known_axes.all()))
+        moving.P = invert3(invert3(P_pred * inflated) + match.information)
+        absolute.on_match(state, T_pred, P_pred, inflated)
         if state.t_scan > -np.inf:
             made = se2.between(state.T_odom_scan, moving.T_odom_base)
             moving.gyro.learn(float(made[2]), moving.t_mono - state.t_scan)
@@ -54,8 +56,15 @@ def learn_noise(state: State, match: MatchResult) -> None:
 
 
 def covariance(state: State) -> Array:
-    """3x3 covariance of T_map_base: of the anchor, swung out to here, and of the pose relative to it."""
+    """3x3 covariance of T_map_base: of the anchor, swung out to here, and of the pose relative to it.
+
+    Once light has told where the map lies it is that of the place in the survey's frame instead.
+    """
     away = se2.between(state.T_odom_anchor, state.fused.T_odom_base)
-    P = se2.carry(state.T_odom_anchor, away, state.P_anchor) + state.fused.P
+    tie = state.absolute
+    if tie is not None and tie.placed:
+        P = tie.P
+    else:
+        P = se2.carry(state.T_odom_anchor, away, state.P_anchor) + state.fused.P
     R = se2.rotation(state.T_map_odom[2])
     return np.asarray(R @ P @ R.T)

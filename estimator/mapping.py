@@ -43,6 +43,8 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
         frame.bearing_rad = newest.bearing_rad
     state.P_anchor = turned_back(state, covariance(state))
     moving.P = NOTHING.copy()
+    if state.absolute is not None:
+        state.absolute.X = np.zeros((3, 3))
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import grid, matching, motion, se2
+from estimator import absolute, grid, matching, motion, se2
 from estimator.commands import obey
 from estimator.fusion import covariance, fuse, noise_of
 from estimator.grid import Grid
@@ -54,6 +54,7 @@ def order(record: Record) -> tuple[float, bool]:
 def predict(state: State, record: Record) -> None:
     """Bring the pose to the record's instant: by odometry, by gyro, else at constant velocity; obey a command."""
     noise = state.settings.noise
+    before = state.fused.T_odom_base, state.fused.P, state.fused.t_mono
     if state.light is not None:
         state.light.predict(record)
     match record:
@@ -61,19 +62,20 @@ def predict(state: State, record: Record) -> None:
             motion.on_odometry(state.fused, record, noise)
         case Imu():
             motion.on_imu(state.fused, record, noise)
-        case Scan():
+        case Scan() | SampleBlock() | LightEpoch():
             motion.carry_to(state.fused, record.t_end, noise)
         case Command():
             obey(state, record)
+    absolute.on_motion(state, *before)
 
 
 def see_lights(state: State, record: SampleBlock | LightEpoch) -> None:
-    """Eq. 1-7: decode the block, if it is one, and take its links into the `lights` filter.
+    """Eq. 1-7: decode the block, if it is one, take its links into the `lights` filter, and its news into the pose.
 
     Without a photodiode in the setup the record is passed over.
     """
     if state.light is not None:
-        state.light.take(record)
+        absolute.on_lights(state, state.light.take(record))
 
 
 def look_for_lamps(state: State, limits: Limits) -> None:
@@ -111,7 +113,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         T_map_odom=state.T_map_odom,
         covariance=covariance(state),
         velocity=moving.velocity.copy(),
-        known_axes=np.ones(3) if match is None else known_in_map(state, match),
+        known_axes=known_axes(state, match),
         match=match,
         keyframe=keyframe,
         loop=None,
@@ -119,13 +121,20 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         T_anchor_base=se2.between(state.T_odom_anchor, moving.T_odom_base),
         jumps=state.jumps,
         lights=None if state.light is None else state.light.result,
+        placed=state.absolute is not None and state.absolute.placed,
+        gap=None if state.absolute is None else state.absolute.gap,
     )
 
 
-def known_in_map(state: State, match: MatchResult) -> Array:
-    """The axes a match knows, in the map frame: a corridor along x of the odom frame may run along y of the map."""
-    if not match.ok:
-        return match.known_axes
+def known_axes(state: State, match: MatchResult | None) -> Array:
+    """The axes known in the map frame: in the survey by the pose's own deviation, else those that the match shows.
+
+    A corridor along x of the odom frame may run along y of the map.
+    """
+    if state.absolute is not None and state.absolute.placed:
+        return np.asarray(np.diag(covariance(state)) < absolute.KNOWN, dtype=np.float64)
+    if match is None or not match.ok:
+        return np.ones(3) if match is None else match.known_axes
     R = se2.rotation(state.T_map_odom[2])
     return matching.known_axes(R @ match.information @ R.T)
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 from estimator.cdma_epoch import BlockFlag
 from estimator.records import Array, Job
+
+SURPRISE: Final = 16.3
+"""Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) beyond which the pose and the lights' do not agree."""
 
 
 class Reason(Enum):
@@ -151,7 +155,9 @@ class StepResult:
         anchor, T_anchor_base: keyframe this pose hangs on and the pose relative to it (0 is the start), so that a
             trajectory kept as anchors follows every later correction of the map.
         jumps: how often T_map_odom moved by more than 5 cm or 1 deg at once, since the start.
-        lights: of the `lights` filter, None where there is no photodiode.
+        lights: of the `lights` filter, None where there is no photodiode. placed: light has told where the map lies;
+            before that the map frame is the start pose's. gap: squared Mahalanobis distance (3 degrees of freedom)
+            between T_map_base and the lights' own at the latest epoch, None where that cannot be said.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
@@ -168,4 +174,6 @@ class StepResult:
     T_anchor_base: Array
     jumps: int
     lights: LightsResult | None = None
+    placed: bool = False
+    gap: float | None = None
     jobs: tuple[Job, ...] = ()

@@ -16,6 +16,7 @@ from estimator.motion import Motion, MotionNoise
 from estimator.records import Array
 
 if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.absolute import Absolute
     from estimator.light import Light, LightsSetup
 
 Place = tuple[int, int, int]
@@ -52,7 +53,8 @@ class State:
 
     Attributes:
         fused: the filter whose pose is published. light: a second one, of lights and odometry without laser, beside it
-            as an independent witness; the same records predict both. None where there is no photodiode.
+            as an independent witness; the same records predict both. absolute: what ties the two together. Both None
+            where there is no photodiode.
         T_map_odom: absolute correction. T_map_start: keyframe 0, where the robot was switched on.
         keyframes: by ID, with their scans. places: their IDs by half metre square and eighth of a turn.
         retired: T_map_keyframe of those let go, where history is kept.
@@ -65,6 +67,7 @@ class State:
     settings: Settings
     fused: Motion = field(default_factory=Motion)
     light: Light | None = None
+    absolute: Absolute | None = None
     T_map_odom: Array = field(default_factory=se2.identity)
     T_map_start: Array = field(default_factory=se2.identity)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
@@ -95,7 +98,8 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
     """
     state = State(settings or Settings())
     if lights is not None:
+        from estimator.absolute import Absolute
         from estimator.light import Light
 
-        state.light = Light(lights)
+        state.light, state.absolute = Light(lights), Absolute()
     return state

@@ -1,0 +1,206 @@
+"""Where the odom frame lies in the survey: light corrects T_map_odom, and T_odom_base never hears of it.
+
+What is estimated is the error of ``T_map_base`` with its covariance ``P`` and with its covariance ``X`` with the error
+of ``T_odom_base`` against the local map (whose own covariance is ``fused.P``). Both errors grow by the same motion, so
+a scan that mends the one mends the other as far as ``X`` says; what light has mended already is not mended twice. A
+gain of zero for ``T_odom_base`` keeps it smooth and free of light (a Schmidt-Kalman filter). In a corridor the long
+axis so comes from light, in a room the laser holds the pose and light finds where the map lies.
+
+The `lights` filter uses the same odometry. Therefore only what its links have *added* is taken (`LightsResult.gained`,
+a channel filter), and no more than one filter's worth for each stretch or time over which the error of its own model
+stays the same: without that, a robot at rest would average the same wall reflection until it believed it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimator import se2
+from estimator.linear3 import invert3
+from estimator.mapframe import move_map, shift_map
+from estimator.records import Array
+from estimator.result import SURPRISE, Fix, LightsResult
+from estimator.state import State
+
+FRESH_M, FRESH_S = 0.7, 60.0
+"""Way and time after which the error of the light model (walls, floor, lamps) is another one."""
+
+DRIFT = np.array((1e-4, 1e-4, 1.2e-5))
+"""Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of."""
+
+SURPRISE_S = 1.0
+"""Light that disagrees for longer than this is believed: nothing else knows where in the building the robot is."""
+TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
+"""What stamps and lever arms make of a moving robot."""
+
+SURER = 0.25
+"""Share of the pose's generalised variance below which the lights' is taken as it is."""
+BLIND_S = 0.5
+"""Without a match for so long, light and odometry are all there is."""
+KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
+"""Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey's frame counts as known."""
+MEMORY_S = 1.0
+"""How late a light epoch may come."""
+
+
+@dataclass(slots=True, eq=False)
+class Absolute:
+    """The tie of the odom frame to the survey's frame.
+
+    Attributes:
+        placed: light has told where the map lies. P, X: see above, both 3x3, odom-aligned axes.
+        gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
+            unknown. odd_since: since when they have disagreed.
+        fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
+        since: ID of the first keyframe laid after light and pose agreed for the last time.
+        t_match: instant of the latest match. poses: T_odom_base of the last second, each with its instant.
+    """
+
+    placed: bool = False
+    P: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    X: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    gap: float | None = None
+    odd_since: float | None = None
+    fresh: float = 0.0
+    since: int = 0
+    t_match: float = -math.inf
+    poses: deque[tuple[float, Array]] = field(default_factory=deque)
+
+
+def on_motion(state: State, T_before: Array, P_before: Array, t_before: float) -> None:
+    """Let the tie's uncertainty grow by the motion that has just been predicted."""
+    tie, moving = state.absolute, state.fused
+    if tie is None:
+        return
+    x, y, _ = (moving.T_odom_base - T_before).tolist()
+    F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+    Q = moving.P - F @ P_before @ F.T
+    way, dt = math.hypot(x, y), moving.t_mono - t_before
+    tie.P = F @ tie.P @ F.T + Q + np.diag(DRIFT * way)
+    tie.X = F @ tie.X @ F.T + Q
+    tie.fresh = min(1.0, tie.fresh + way / FRESH_M + (dt / FRESH_S if math.isfinite(dt) else 0.0))
+    tie.poses.append((moving.t_mono, moving.T_odom_base))
+    while moving.t_mono - tie.poses[0][0] > MEMORY_S:
+        tie.poses.popleft()
+
+
+def on_match(state: State, T_before: Array, P_before: Array, inflated: float) -> None:
+    """Mend T_map_base by as much of the match's correction of T_odom_base as was its own error too."""
+    tie, moving = state.absolute, state.fused
+    if tie is None:
+        return
+    tie.t_match = moving.t_mono
+    if not tie.placed:
+        return
+    more = (inflated - 1.0) * P_before
+    P_odom, P, X = P_before + more, tie.P + more, tie.X + more
+    share = X @ invert3(P_odom)
+    made = moving.T_odom_base - T_before
+    made[2] = se2.wrap(made[2])
+    R = se2.rotation(state.T_map_odom[2])
+    T_map_base = se2.compose(state.T_map_odom, T_before) + R @ share @ made
+    tie.P = _symmetric(P - share @ (P_odom - moving.P) @ share.T)
+    tie.X = share @ moving.P
+    move_map(state, se2.compose(T_map_base, se2.inverse(moving.T_odom_base)))
+
+
+def on_lights(state: State, lights: LightsResult) -> None:
+    """Take an epoch of the `lights` filter."""
+    tie = state.absolute
+    assert tie is not None
+    tie.gap = None
+    if lights.fix not in (Fix.GOOD, Fix.STARTING):
+        return
+    T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
+    R = se2.rotation(state.T_map_odom[2])
+    P = R @ tie.P @ R.T
+    off = lights.T_map_base - se2.compose(state.T_map_odom, T_odom_base)
+    off[2] = se2.wrap(off[2])
+    tie.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if tie.placed else None
+    if not tie.placed or _contradicted(tie, lights) or _surer(tie, lights):
+        follow(state, lights, T_odom_base)
+    elif lights.fix is Fix.GOOD and tie.odd_since is None:
+        tie.since = state.next_key
+        gain(state, lights, T_odom_base, off)
+
+
+def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
+    """Add the information that the epoch's links have added to the `lights` filter, as far as it is news.
+
+    The links' own measurement, stripped of what the `lights` filter knew before, is ``L+ x+ - L- x-``; about the pose
+    here that is ``G (x- - x) + L+ dx`` with ``G = L+ - L-`` and the correction ``dx`` that they made.
+    """
+    tie = state.absolute
+    assert tie is not None
+    R = se2.rotation(state.T_map_odom[2])
+    L_lights = invert3(lights.covariance)
+    most = float(np.linalg.eigvals(lights.gained @ lights.covariance).real.max())
+    part = min(1.0, tie.fresh / most) if most > 0.0 and not blind(state) else 1.0
+    tie.fresh -= part * max(most, 0.0)
+    G = part * lights.gained
+    told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
+    before = R @ tie.P @ R.T
+    after = _symmetric(invert3(invert3(before) + _positive(G)))
+    keep = R.T @ after @ invert3(before) @ R
+    tie.P, tie.X = R.T @ after @ R, keep @ tie.X
+    T = se2.compose(state.T_map_odom, T_odom_base) + after @ told
+    move_map(state, se2.compose(T, se2.inverse(T_odom_base)))
+
+
+def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
+    """Take the lights' pose as it is; what was laid since light and pose agreed for the last time comes along."""
+    tie = state.absolute
+    assert tie is not None
+    T_map_odom = se2.compose(lights.T_map_base, se2.inverse(T_odom_base))
+    R = se2.rotation(T_map_odom[2])
+    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), tie.since)
+    move_map(state, T_map_odom)
+    tie.P, tie.X = R.T @ lights.covariance @ R, np.zeros((3, 3))
+    tie.placed, tie.odd_since, tie.fresh, tie.since = True, None, 0.0, state.next_key
+
+
+def blind(state: State) -> bool:
+    """Whether the laser has not told anything lately."""
+    assert state.absolute is not None
+    return state.fused.t_mono - state.absolute.t_match > BLIND_S
+
+
+def pose_at(state: State, t_mono: float) -> Array:
+    """T_odom_base at an instant of the last second, at constant twist between two predictions; the ends are held."""
+    assert state.absolute is not None
+    after = state.fused.t_mono, state.fused.T_odom_base
+    for t, T in reversed(state.absolute.poses):
+        if t <= t_mono < after[0]:
+            twist = se2.log(se2.between(T, after[1]))
+            return se2.compose(T, se2.exp(twist * ((t_mono - t) / (after[0] - t))))
+        if t < after[0]:
+            after = t, T
+    return after[1] if t_mono < after[0] else state.fused.T_odom_base
+
+
+def _contradicted(tie: Absolute, lights: LightsResult) -> bool:
+    """Whether light has disagreed with the pose for long enough to be believed."""
+    if tie.gap is None or tie.gap <= SURPRISE:
+        tie.odd_since = None
+        return False
+    tie.odd_since = lights.t_mono if tie.odd_since is None else tie.odd_since
+    return lights.t_mono - tie.odd_since >= SURPRISE_S
+
+
+def _surer(tie: Absolute, lights: LightsResult) -> bool:
+    """Whether the lights' pose is so much better known that nothing is lost by taking it as it is."""
+    return tie.odd_since is None and float(np.linalg.det(lights.covariance)) < SURER * float(np.linalg.det(tie.P))
+
+
+def _symmetric(A: Array) -> Array:
+    return np.asarray(0.5 * (A + A.T))
+
+
+def _positive(A: Array) -> Array:
+    """The nearest matrix without negative eigenvalues: rounding must not take information away."""
+    values, vectors = np.linalg.eigh(_symmetric(A))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

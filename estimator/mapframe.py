@@ -1,0 +1,29 @@
+"""Moving the map frame: the correction T_map_odom, whose jumps are counted, and what hangs on it."""
+
+from __future__ import annotations
+
+import math
+
+from estimator import se2
+from estimator.records import Array
+from estimator.state import State
+
+JUMP_M, JUMP_RAD = 0.05, math.radians(1.0)
+
+
+def move_map(state: State, T_map_odom: Array) -> None:
+    """Correct the pose; what was laid stays where it is. The robot's own move tells whether it was a jump."""
+    was = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    x, y, yaw = se2.between(was, se2.compose(T_map_odom, state.fused.T_odom_base)).tolist()
+    state.jumps += int(math.hypot(x, y) > JUMP_M or abs(yaw) > JUMP_RAD)
+    state.T_map_odom = T_map_odom
+
+
+def shift_map(state: State, moved: Array, since: int) -> None:
+    """Move the keyframes from ID ``since`` on, 0 being the start, as one piece."""
+    if since == 0:
+        state.T_map_start = se2.compose(moved, state.T_map_start)
+    state.retired = {key: T if key < since else se2.compose(moved, T) for key, T in state.retired.items()}
+    for key, frame in state.keyframes.items():
+        if key >= since:
+            frame.T_map_keyframe = se2.compose(moved, frame.T_map_keyframe)
