@@ -11,6 +11,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Generator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -39,10 +40,12 @@ class RemoteClock:
     """Translates the server's clock to ours.
 
     Every exchange bounds the difference from both sides: what we sent cannot arrive before it was sent, nor its answer.
-    The best of the latest bounds are kept for ``WINDOW`` exchanges, in which clocks drift apart by microseconds.
+    The best of the latest bounds are kept for ``WINDOW`` exchanges, in which clocks drift apart by microseconds; bounds
+    that contradict each other show that one clock has been stepped, and only the latest count.
     """
 
     WINDOW: Final = 64
+    TOLERANCE_S: Final = 1e-3
 
     def __init__(self, same: bool) -> None:
         self._same = same
@@ -50,15 +53,41 @@ class RemoteClock:
         self._high: deque[float] = deque(maxlen=self.WINDOW)
 
     def learn(self, ordered: float, received: float, sent: float, answered: float) -> None:
-        """One exchange: our times of order and answer, the server's of the same two frames."""
-        self._low.append(sent - answered)
-        self._high.append(received - ordered)
+        """One exchange: our times of order and answer, the server's of the same two frames.
+
+        Raises:
+            BadFrame: it says that it reads our clock, but not these times.
+        """
+        low, high = sent - answered, received - ordered
+        if self._same and (low > self.TOLERANCE_S or high < -self.TOLERANCE_S):
+            raise frames.BadFrame("times from before the order or after the answer")
+        if self._low and (low > min(self._high) + self.TOLERANCE_S or high < max(self._low) - self.TOLERANCE_S):
+            self._low.clear()
+            self._high.clear()
+        self._low.append(low)
+        self._high.append(high)
 
     def ours(self, theirs: float) -> float:
         """A time of the server in our clock."""
         if self._same or not self._low:
             return theirs
         return theirs - 0.5 * (max(self._low) + min(self._high))
+
+
+@dataclass(slots=True)
+class _Order:
+    """A transaction that has been ordered: when, bytes of its reads, and whether anybody still wants its answer."""
+
+    t: float
+    lengths: tuple[int, ...]
+    wanted: bool = True
+
+    def check(self, answer: frames.Done) -> None:
+        if answer.errno:
+            return
+        got = tuple(map(len, answer.reads))
+        if len(got) != len(self.lengths) or any(n > asked for n, asked in zip(got, self.lengths, strict=True)):
+            raise frames.BadFrame(f"reads of {got} bytes where {self.lengths} were ordered")
 
 
 class RemoteBus:
@@ -70,7 +99,7 @@ class RemoteBus:
         self._link: socket.socket | None = link
         self._splitter = frames.Splitter()
         self._inbox: deque[tuple[int, bytes]] = deque()
-        self._ordered: dict[int, float] = {}
+        self._ordered: dict[int, _Order] = {}
         self._early: dict[int, frames.Done] = {}
         self._number = 0
         greeting = self._greeting()
@@ -100,8 +129,9 @@ class RemoteBus:
                 yield self._collect(ahead.pop(0))
         finally:
             for number in ahead:  # their answers are thrown away when they come
-                self._ordered.pop(number, None)
                 self._early.pop(number, None)
+                if number in self._ordered:
+                    self._ordered[number].wanted = False
 
     def close(self) -> None:
         """Close the connection."""
@@ -112,7 +142,8 @@ class RemoteBus:
     def _order(self, messages: tuple[Message, ...]) -> int:
         check(messages)
         self._number = (self._number + 1) & 0xFFFFFFFF
-        self._ordered[self._number] = time.monotonic()
+        lengths = tuple(message.length for message in messages if message.length)
+        self._ordered[self._number] = _Order(time.monotonic(), lengths)
         try:
             self._open_link().sendall(frames.transfer(self._number, messages))
         except OSError as error:
@@ -122,26 +153,29 @@ class RemoteBus:
     def _collect(self, number: int) -> Transferred:
         done = self._early.pop(number, None)
         while done is None:
-            answer, answered = self._answer()
-            ordered = self._ordered.pop(answer.number, None)
-            if ordered is None:
-                continue
-            self._clock.learn(ordered, answer.received, answer.sent, answered)
-            if answer.number == number:
+            answer = self._answer()
+            if answer is not None and answer.number == number:
                 done = answer
-            else:
+            elif answer is not None:
                 self._early[answer.number] = answer
         if done.errno:
             raise OSError(done.errno, os.strerror(done.errno))
         return Transferred(self._clock.ours(done.t0), self._clock.ours(done.t1), done.reads)
 
-    def _answer(self) -> tuple[frames.Done, float]:
+    def _answer(self) -> frames.Done | None:
+        """The next answer; None for one that nobody wants any more."""
         kind, body = self._frame()
         answered = time.monotonic()
         try:
             if kind != frames.DONE:
                 raise frames.BadFrame(f"a frame of kind {kind} instead of an answer")
-            return frames.parse_done(body), answered
+            answer = frames.parse_done(body)
+            order = self._ordered.pop(answer.number, None)
+            if order is None:
+                raise frames.BadFrame(f"an answer to an order {answer.number} that there is not")
+            order.check(answer)
+            self._clock.learn(order.t, answer.received, answer.sent, answered)
+            return answer if order.wanted else None
         except frames.BadFrame as error:
             raise self._lost(OSError(errno.EPROTO, f"the bus server sent {error}")) from error
 

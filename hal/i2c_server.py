@@ -7,7 +7,9 @@
 
 In a process of its own, the thread that reads the bus competes with nobody for the interpreter, so that the times of
 its blocks are the kernel's. The bus is opened for each connection: a client that lost it comes back and has it again.
-There is no authentication: a unix socket has its mode, and a TCP port belongs on a loopback or bench address.
+There is no authentication, and whoever can connect can write to every chip of the bus. So a unix socket is for its
+owner only, and TCP is served on loopback addresses only, unless ``--anyone`` says otherwise; from another computer,
+``ssh -L 10941:127.0.0.1:10941 ROBOT`` is the better way.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ import argparse
 import asyncio
 import contextlib
 import errno
+import ipaddress
 import signal
+import socket
 import stat
 import sys
 from pathlib import Path
@@ -26,10 +30,12 @@ from hal import i2c_frames as frames
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceRefused, HalError
 from hal.i2c import AsyncBus, BusOpener, Message, Transferred, check, open_bus
+from hal.inet import resolve
 from hal.i2c_remote import clock_name, parse_address
 
 AHEAD: Final = 8
 """Transactions a client may have ordered and not been answered; further bytes of it are not read meanwhile."""
+CLIENTS: Final = 8
 
 
 class BusServer:
@@ -37,10 +43,12 @@ class BusServer:
 
     Args:
         opener: opens the bus, once for each client. bus: its name for the opener. clock: the bus's.
+        anyone: listen also where other computers can connect.
     """
 
-    def __init__(self, opener: BusOpener, bus: str, clock: Clock) -> None:
-        self._opener, self._bus, self._clock = opener, bus, clock
+    def __init__(self, opener: BusOpener, bus: str, clock: Clock, *, anyone: bool = False) -> None:
+        self._opener, self._bus, self._clock, self._anyone = opener, bus, clock, anyone
+        self._clock_name = clock_name() if isinstance(clock, SystemClock) else ""
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
         self._path: Path | None = None
@@ -49,14 +57,17 @@ class BusServer:
         """Begin to accept at ``unix:/path`` or ``tcp://host:port``; returns the address (port 0 chooses a free one).
 
         Raises:
-            DeviceRefused: not an address, in use, or not ours to use.
+            DeviceMissing: a host name that is not known.
+            DeviceRefused: not an address, in use, not ours to use, or open to other computers without ``anyone``.
         """
         address = parse_address(where)
+        if not isinstance(address, str) and not self._anyone:
+            await _check_loopback(where, *address)
         try:
             if isinstance(address, str):
+                _make_way(Path(address))
+                self._server = await asyncio.start_unix_server(self._accept, sock=_private_socket(address))
                 self._path = Path(address)
-                _make_way(self._path)
-                self._server = await asyncio.start_unix_server(self._accept, address)
                 return where
             self._server = await asyncio.start_server(self._accept, *address)
         except OSError as error:
@@ -77,6 +88,10 @@ class BusServer:
             self._path.unlink(missing_ok=True)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._clients) >= CLIENTS:
+            writer.write(frames.refused(DeviceRefused(self._bus, f"{CLIENTS} clients already", "end one of them")))
+            writer.close()
+            return
         task = asyncio.current_task()
         assert task is not None
         self._clients.add(task)
@@ -93,7 +108,7 @@ class BusServer:
             await writer.drain()
             return
         try:
-            writer.write(frames.hello(self._clock.now(), clock_name(), bus.about))
+            writer.write(frames.hello(self._clock.now(), self._clock_name, bus.about))
             await self._talk(bus, reader, writer)
         finally:
             await bus.close()
@@ -156,10 +171,36 @@ async def _put(
     return True
 
 
+async def _check_loopback(where: str, host: str, port: int) -> None:
+    if any(not ipaddress.ip_address(address).is_loopback for _, (address, _) in await resolve(host, port)):
+        remedy = "serve unix:/path or tcp://127.0.0.1:PORT, reach it by ssh -L; or say --anyone if the network is yours"
+        raise DeviceRefused(where, "everyone who can reach that address could write to all chips of the bus", remedy)
+
+
 def _make_way(path: Path) -> None:
-    if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+    """Remove the socket of a server that has died; raises `DeviceRefused` for anything else that is there."""
+    if not path.exists():
+        return
+    if not stat.S_ISSOCK(path.stat().st_mode):
         raise DeviceRefused(str(path), "there is something that is no socket", "choose another path")
+    with socket.socket(socket.AF_UNIX) as caller, contextlib.suppress(ConnectionRefusedError):
+        caller.setblocking(False)
+        with contextlib.suppress(BlockingIOError):  # so many are waiting that it certainly listens
+            caller.connect(str(path))
+        raise DeviceRefused(str(path), "another server listens there", "end it, or choose another path")
     path.unlink(missing_ok=True)
+
+
+def _private_socket(path: str) -> socket.socket:
+    """A unix socket that only its owner can connect to; `chmod` or `chgrp` it to let others in."""
+    sock = socket.socket(socket.AF_UNIX)
+    try:
+        sock.bind(path)
+        Path(path).chmod(0o600)  # before listen(), so that nobody gets in between
+    except OSError:
+        sock.close()
+        raise
+    return sock
 
 
 def say(text: str) -> None:
@@ -179,11 +220,11 @@ async def until_told(seconds: float = 0.0) -> None:
     await stop.wait()
 
 
-async def _main(bus: str, where: str) -> None:
+async def _main(bus: str, where: str, anyone: bool) -> None:
     probe = await open_bus(bus)  # what is wrong with the bus is told at once, not when the first client comes
     about = probe.about
     await probe.close()
-    server = BusServer(open_bus, bus, SystemClock())
+    server = BusServer(open_bus, bus, SystemClock(), anyone=anyone)
     try:
         say(f"{bus} {about} on {await server.listen(where)}".replace("  ", " "))
         await until_told()
@@ -196,9 +237,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m hal.i2c_server", description="Serves an I2C bus over a socket.")
     parser.add_argument("bus", help="/dev/i2c-N or adapter:NAME")
     parser.add_argument("where", help="unix:/path or tcp://host:port")
+    parser.add_argument("--anyone", action="store_true", help="serve TCP beyond this computer, without authentication")
     options = parser.parse_args(arguments)
     try:
-        asyncio.run(_main(options.bus, options.where))
+        asyncio.run(_main(options.bus, options.where, options.anyone))
     except HalError as error:
         sys.stderr.write(f"{error}\n")
         return 2

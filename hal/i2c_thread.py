@@ -11,6 +11,7 @@ bus server of its own process (:mod:`hal.i2c_server`) does not have them.
 from __future__ import annotations
 
 import asyncio
+import errno
 import threading
 from collections.abc import Callable
 from contextlib import closing
@@ -98,13 +99,15 @@ class ThreadedBus:
         return self._about
 
     async def transfer(self, messages: tuple[Message, ...]) -> Transferred:
-        """Carry out one transaction; raises `OSError`."""
+        """Carry out one transaction; raises `OSError`, ENODEV after the bus was closed."""
+        self._check_open()
         future: asyncio.Future[Transferred] = self._loop.create_future()
         self._jobs.put(_Once(messages, future, self._post))
         return await future
 
     async def stream(self, messages: tuple[Message, ...], on_read: OnRead) -> None:
         """Repeat one transaction until cancelled; raises the `OSError` that ends it."""
+        self._check_open()
         ended: asyncio.Future[None] = self._loop.create_future()
         job = _Stream(messages, on_read, ended, self._post)
         self._jobs.put(job)
@@ -122,6 +125,10 @@ class ThreadedBus:
             await asyncio.wait_for(self._ended.wait(), CLOSE_S)
         except TimeoutError:
             return
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise OSError(errno.ENODEV, "the bus is closed")
 
     # in the thread
 

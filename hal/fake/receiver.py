@@ -46,6 +46,7 @@ class _Options:
     control: Path | None
     seconds: float
     seed: int
+    anyone: bool
 
 
 def _number(text: str) -> int:
@@ -65,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
     add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
+    add("--anyone", action="store_true", help="serve TCP beyond this computer")
     add("--seed", type=int, default=0, help="of noise, jitter and faults left to chance")
     return parser
 
@@ -92,7 +94,7 @@ async def _serve(options: _Options) -> None:
     device = _device(options)
     buses = FakeBuses(SystemClock())
     buses.plug(BUS, device)
-    server = BusServer(buses, BUS, SystemClock())
+    server = BusServer(buses, BUS, SystemClock(), anyone=options.anyone)
     schedule = FaultSchedule({"adc": device})
     control = None
     try:

@@ -57,7 +57,7 @@ class LevelInput:
 
 
 async def ask(bus: AsyncBus, address: int, query: Query) -> bytes | None:
-    """Read a register; None where the chip does not acknowledge, as often as it is asked.
+    """Read a register; None where the chip does not acknowledge, or not all bytes come, as often as it is asked.
 
     Raises:
         OSError: for everything else; EIO counts as a missing acknowledgement, some adapters know no other error.
@@ -69,7 +69,8 @@ async def ask(bus: AsyncBus, address: int, query: Query) -> bytes | None:
             if error.errno not in _NOT_ACKNOWLEDGED:
                 raise
         else:
-            return done.reads[0]
+            if len(done.reads[0]) == query.length:
+                return done.reads[0]
     return None
 
 
