@@ -19,7 +19,7 @@ class Blemish(Flag):
 
     NONE = 0
     STRETCHED = auto()  # took longer than its bits: returned late, or samples inside are not evenly spaced
-    CLIPPED = auto()  # words at either rail
+    CLIPPED = auto()  # words at either rail, or as close to one as an amplifier gets
     STUCK = auto()  # the same word over and over
     MISALIGNED = auto()  # upper bits set: shifted or lost bits, or a bus that floats
     SHORT = auto()  # fewer words than asked for

@@ -229,6 +229,8 @@ class RemoteBus:
         self._ordered.clear()
         if error.errno in (errno.ETIMEDOUT, errno.EPROTO, errno.ENODEV):
             return error
+        if isinstance(error, ConnectionError):
+            return OSError(errno.ENODEV, "the bus server has closed the connection")
         return OSError(errno.ENODEV, f"the connection to the bus server is lost: {error.strerror or error}")
 
 

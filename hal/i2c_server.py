@@ -30,8 +30,8 @@ from hal import i2c_frames as frames
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceRefused, HalError
 from hal.i2c import AsyncBus, BusOpener, Message, Transferred, check, open_bus
-from hal.inet import resolve
 from hal.i2c_remote import clock_name, parse_address
+from hal.inet import resolve
 
 AHEAD: Final = 8
 """Transactions a client may have ordered and not been answered; further bytes of it are not read meanwhile."""

@@ -26,6 +26,8 @@ from hal.i2c_memory import LoopBus
 
 MIDDLE: Final = 0.5
 """What an AC-coupled input rests at."""
+OWN_NOISE: Final = 1.1e-4
+"""One sigma of amplifier and converter without any light, as a fraction of the supply: 0.45 words of 12 bits."""
 
 CHIPS: Final[dict[str, Callable[[SampleSource], FakeChip]]] = {
     "MCP3221": Mcp3221,
@@ -57,6 +59,7 @@ class FakeAdc:
         seed: int = 0,
     ) -> None:
         self._source, self._clock = source, clock
+        self._noise = np.random.default_rng(seed)
         self.address = address
         self.bus = FakeBus(adapter, clock.now, seed=seed)
         self._chip = CHIPS[chip](self._signal)
@@ -135,10 +138,13 @@ class FakeAdc:
     def _signal(self, t_mono: Times) -> npt.NDArray[np.float64]:
         """The light as the faults in force leave it."""
         if self.orders.on("dark") or self.orders.on("saturated"):
-            return np.full_like(t_mono, MIDDLE)
+            return MIDDLE + OWN_NOISE * self._noise.standard_normal(t_mono.size)
         fraction = self._source(t_mono)
         clip = self.orders.on("clip")
-        return MIDDLE + clip.number("gain") * (fraction - MIDDLE) if clip else fraction
+        if not clip:
+            return fraction
+        stop = clip.number("stop")
+        return np.clip(MIDDLE + clip.number("gain") * (fraction - MIDDLE), stop, 1.0 - stop)
 
 
 class _Handle:

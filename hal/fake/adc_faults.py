@@ -51,8 +51,12 @@ ADC: Vocabulary = {
     "floats": Word("every bit reads 1", "strikes"),
     "shift": Word("`bits` clocks too few: everything is shifted", "strikes", {"bits": Parameter(1, 1, 15)}),
     # light
-    "clip": Word("the signal is `gain` times as large", "lasts", {"gain": Parameter(20.0, 1.0, 1e6)}),
-    "dark": Word("no light", "lasts"),
+    "clip": Word(
+        "the signal is `gain` times as large, and the amplifier stops `stop` of the supply short of either rail",
+        "lasts",
+        {"gain": Parameter(20.0, 1.0, 1e6), "stop": Parameter(0.004, 0.0, 0.4)},
+    ),
+    "dark": Word("no light: only the electronics' own noise", "lasts"),
     "saturated": Word("so much light that the amplifier stands at its limit", "lasts"),
 }
 """By word. ``off stuck garbage wrong slow delayed intermittent`` mean what they mean for any device."""

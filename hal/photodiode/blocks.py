@@ -12,6 +12,10 @@ from hal.adc import Blemish
 
 STUCK_RUN: Final = 64
 """Equal words in a row, not at a rail, beyond which nothing alive is being converted (3 ms at 22 ksps)."""
+RAIL_BITS: Final = 7
+"""Words within 1/128 of the range of a rail count as clipped: amplifiers stop up to 25 mV short of their supply."""
+QUIET_WORDS: Final = 1.5
+"""Standard deviation of a block below which there is nothing in it but the converter's own noise (0.5 words)."""
 RELEASED: Final = 0xFFFF
 """What a bus reads as when nobody pulls it down."""
 
@@ -24,6 +28,7 @@ class Census:
         clipped: share of words at a rail. misaligned: share of words with spare bits set.
         stuck: whether one value, not at a rail, makes up a run of at least STUCK_RUN words.
         constant: whether the whole block is one value, wherever that is.
+        quiet: nothing is in the block but noise of the converter itself, and it is not at a rail.
         floated: every bit of the block is 1.
     """
 
@@ -31,6 +36,7 @@ class Census:
     misaligned: float = 0.0
     stuck: bool = False
     constant: bool = False
+    quiet: bool = False
     floated: bool = False
 
 
@@ -73,7 +79,8 @@ def _released_at_end(raw: npt.NDArray[np.uint16]) -> int:
 
 
 def _count(words: npt.NDArray[np.uint16], top: int, misaligned: float, floated: bool) -> Census:
-    at_rail = (words == 0) | (words == top)
+    margin = (top + 1) >> RAIL_BITS
+    at_rail = (words <= margin) | (words >= top - margin)
     starts = np.concatenate(([0], np.flatnonzero(words[1:] != words[:-1]) + 1))
     lengths = np.diff(starts, append=words.size)
     longest = int(lengths[~at_rail[starts]].max(initial=0))
@@ -82,5 +89,6 @@ def _count(words: npt.NDArray[np.uint16], top: int, misaligned: float, floated: 
         misaligned=misaligned,
         stuck=longest >= min(STUCK_RUN, max(words.size, 2)),
         constant=starts.size == 1 < words.size,
+        quiet=not at_rail.any() and float(np.std(words)) < QUIET_WORDS,
         floated=floated,
     )

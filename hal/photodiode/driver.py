@@ -27,6 +27,7 @@ from hal.photodiode.follow import Followed, Follower
 from hal.photodiode.judge import Judge
 from hal.photodiode.level import PERIOD_S, LevelInput, LevelMeter, ask
 from hal.photodiode.sampler import Sampler, describe
+from hal.photodiode.silence import WatchedBus
 from hal.photodiode.timebase import SLOWER
 from hal.photodiode.trouble import explain, policy_for
 
@@ -115,7 +116,8 @@ class PhotodiodeAdc:
     async def _connection(self, on_samples: Callable[[RawSamples], None]) -> None:
         """Open, stream, recover on the open bus as long as that makes sense; raises to have it opened anew."""
         self._status.link = Link.OPENING
-        bus = await self._opener(self._bus)
+        bus = WatchedBus(await self._opener(self._bus), self._block_s, self._explain, self._note_silence)
+        listening = asyncio.create_task(bus.listen())
         found: Capability | None = None
         try:
             while True:
@@ -126,10 +128,13 @@ class PhotodiodeAdc:
                 except OSError as error:
                     await self._mend(bus, error)
         finally:
+            listening.cancel()
             await bus.close()
 
     async def _prepare(self, bus: AsyncBus) -> Capability:
         """Find the chip, make sure that it is the right one, and measure what the adapter can do."""
+        if self._status.link is Link.STREAMING:
+            self._status.link = Link.OPENING
         await bus.transfer((read(self._address, 2),))
         chip, address = self._chip, self._address
         problem = chip.judge(tuple([await ask(bus, address, query) for query in chip.queries]))
@@ -166,7 +171,7 @@ class PhotodiodeAdc:
             self._count(followed)
             on_samples(followed.block)
 
-        follower = Follower(self._bus, sampler, self._judge, pass_on, self._note, self._kept_s)
+        follower = Follower(sampler, self._judge, pass_on, self._kept_s)
         jobs = [asyncio.create_task(bus.stream((read(self._address, found.length),), follower.take))]
         if self._meter is not None:
             jobs.append(asyncio.create_task(self._measure_level(bus, self._meter)))
@@ -219,19 +224,27 @@ class PhotodiodeAdc:
         self._retries[number] = tries + 1
         self._faults += 1
         if tries >= policy.retries:
-            raise explain(error, self._bus, self._chip.name, self._address) from error
+            raise self._explain(error) from error
         if policy.pause_s:
             await asyncio.sleep(policy.pause_s)
         if policy.calm:
             with contextlib.suppress(OSError):
                 await bus.transfer((read(self._address, 2),))
 
+    def _explain(self, error: OSError) -> HalError:
+        return explain(error, self._bus, self._chip.name, self._address)
+
     def _note(self, error: HalError) -> None:
-        """Nothing comes; keep the error for the status."""
-        self._status.link, self._status.error = Link.WAITING, error
+        """The bus has to be opened anew; keep why for the status."""
         self._attempts += 1
+        self._note_silence(error, True)
+
+    def _note_silence(self, error: HalError, certain: bool) -> None:
+        """Nothing comes, whatever is being done about it."""
+        self._status.link, self._status.error = Link.WAITING, error
         self._faults += 1
-        self._tell(error)
+        if certain:
+            self._tell(error)
 
     def _tell(self, error: HalError) -> None:
         """Log each kind of problem once, until good blocks come again."""

@@ -5,16 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from hal.adc import RawSamples
-from hal.errors import DeviceFault, HalError
+from hal.errors import HalError
 from hal.i2c import Transferred
 from hal.photodiode.judge import Judge
 from hal.photodiode.sampler import Sampler
-
-SILENCE_S: Final = 3.0
-"""Without a transaction for this long, one hangs in the kernel: everything that can time out has done so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,32 +36,20 @@ class Follower:
     """Takes the transactions of one stream.
 
     Args:
-        device: the bus, for errors. sampler: makes blocks. judge: looks at many of them. on_block: gets each.
-        on_hang: told while nothing comes and nothing fails.
+        sampler: makes blocks. judge: looks at many of them. on_block: gets each.
         kept_s: what was measured of the adapter is kept at least this long, however doubtful it has become.
     """
 
-    def __init__(
-        self,
-        device: str,
-        sampler: Sampler,
-        judge: Judge,
-        on_block: OnBlock,
-        on_hang: Callable[[HalError], None],
-        kept_s: float,
-    ) -> None:
-        self._device, self._sampler, self._judge = device, sampler, judge
-        self._on_block, self._on_hang = on_block, on_hang
+    def __init__(self, sampler: Sampler, judge: Judge, on_block: OnBlock, kept_s: float) -> None:
+        self._sampler, self._judge, self._on_block = sampler, judge, on_block
         self._loop = asyncio.get_running_loop()
         self._trouble: asyncio.Future[HalError | None] = self._loop.create_future()
-        self._deadline = self._loop.time() + SILENCE_S
         self._kept_until = self._loop.time() + kept_s
 
     def take(self, done: Transferred, dropped: int) -> None:
         """One transaction, from the bus."""
         if self._trouble.done():
             return
-        self._deadline = self._loop.time() + SILENCE_S
         block, census = self._sampler.take(done, dropped)
         verdict = self._judge.look(block, census)
         self._on_block(Followed(block, verdict.sound, dropped, verdict.error))
@@ -81,12 +66,7 @@ class Follower:
         """
         watched: list[asyncio.Future[Any]] = [self._trouble, *jobs]
         while True:
-            left = self._deadline - self._loop.time()
-            if left <= 0.0:
-                self._on_hang(self._say_hang())
-                self._deadline = self._loop.time() + SILENCE_S
-                continue
-            await asyncio.wait(watched, timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(watched, return_when=asyncio.FIRST_COMPLETED)
             if self._trouble.done():
                 error = self._trouble.result()
                 if error is None:
@@ -95,10 +75,3 @@ class Follower:
             for job in jobs:
                 if job.done():
                     job.result()
-
-    def _say_hang(self) -> HalError:
-        return DeviceFault(
-            self._device,
-            f"a transaction has not returned for {SILENCE_S:g} s",
-            "the adapter's driver hangs: unbind and bind it, or restart the computer",
-        )

@@ -64,7 +64,7 @@ class Judge:
     def __init__(self, device: str, chip: BlockChip, address: int, level: Level) -> None:
         self._device, self._level = device, level
         self._where = f"{chip.name} at {address:#04x}"
-        self._flat, self._clipped = _Lasting(), _Lasting()
+        self._frozen, self._quiet, self._clipped = _Lasting(), _Lasting(), _Lasting()
         self._garbled = 0
         self._refreshed = float("-inf")
 
@@ -75,19 +75,23 @@ class Judge:
             again = self._garbled >= GARBLED_BLOCKS
             return Verdict(sound=False, error=self._say_garbled(census) if again else None, again=again)
         self._garbled = 0
-        flat = self._flat.lasts(block.t1, census.stuck or census.constant)
+        frozen = self._frozen.lasts(block.t1, census.stuck or census.constant)
+        quiet = self._quiet.lasts(block.t1, census.quiet)
         clipped = self._clipped.lasts(block.t1, census.clipped >= CLIPPED_SHARE)
-        if flat:
-            return self._judge_flat(block.t1, at_rail=census.clipped == 1.0)
+        if frozen:
+            return self._judge_frozen(block.t1, at_rail=census.clipped == 1.0)
+        if quiet:
+            return Verdict(sound=True, error=self._say_nothing(self._level(), frozen=False))
         return Verdict(sound=True, error=self._say_clipped() if clipped else None)
 
-    def _judge_flat(self, now: float, at_rail: bool) -> Verdict:
+    def _judge_frozen(self, now: float, at_rail: bool) -> Verdict:
         level = self._level()
         explained = not at_rail and level is not None and (level >= DAZZLED or level <= DARK)
         again = not explained and now - self._refreshed >= REFRESH_S
         if again:
             self._refreshed = now
-        return Verdict(sound=True, error=self._say_at_rail() if at_rail else self._say_flat(level), again=again)
+        error = self._say_at_rail() if at_rail else self._say_nothing(level, frozen=True)
+        return Verdict(sound=True, error=error, again=again)
 
     def _say_garbled(self, census: Census) -> HalError:
         if census.floated:
@@ -113,15 +117,20 @@ class Judge:
             "check the wire from amplifier to converter, its supply, and that it is this kind of chip",
         )
 
-    def _say_flat(self, level: float | None) -> HalError:
+    def _say_nothing(self, level: float | None, *, frozen: bool) -> HalError:
+        """There is no signal: what that means depends on the mean light, and on whether the words move at all."""
         if level is None:
-            problem = "constant words: no light at all, or so much that the amplifier is saturated, or a dead converter"
+            problem = "no signal: no light at all, or so much that the amplifier is saturated"
+            problem += ", or a dead converter" if frozen else ""
             remedy = "look at photodiode and lamps; a DC channel (ADS1115) would tell which"
         elif level >= DAZZLED:
             problem, remedy = "dazzled: the amplifier is saturated", "shade the photodiode or lower the gain"
         elif level <= DARK:
             problem, remedy = "dark: no light reaches the photodiode", "look for a cover, a broken cable, lamps off"
-        else:
+        elif frozen:
             problem = "constant words, though there is light: the converter or its input is dead"
             remedy = "switch its power off and on; check the wire from amplifier to converter"
+        else:
+            problem = "there is light, but no lamp in it: nothing flickers"
+            remedy = "look whether coded lamps are on and in view; check the coupling capacitor"
         return DeviceFault(self._device, f"{self._where}: {problem}", remedy)

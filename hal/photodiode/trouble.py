@@ -37,7 +37,9 @@ _ABSENT: Final = Policy(
     retries=3,
     pause_s=0.01,
 )
-_UNPLUGGED: Final = Policy(DeviceMissing, "the adapter is gone", "plug it in again; it is reopened by itself")
+_UNPLUGGED: Final = Policy(
+    DeviceMissing, "the adapter is gone", "plug it in, or start its server, again; it is reopened by itself"
+)
 _NOT_ALLOWED: Final = Policy(DeviceRefused, "permission denied", "add the user to group i2c and log in again")
 _TOO_MUCH: Final = Policy(
     DeviceRefused, "the adapter does not do such reads", "use an I2C controller of the processor itself"

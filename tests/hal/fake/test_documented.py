@@ -5,20 +5,31 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
+from hal.fake.adc_faults import ADC
+from hal.fake.faults import Vocabulary
+from hal.fake.i2c_adapters import ADAPTERS
 from hal.fake.lidar_faults import LIDAR
 from hal.fake.models import MODELS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "fake-devices.md").read_text(encoding="utf-8")
 
 
-def test_every_word_has_its_row() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| (\w+) \| (.*) \| (.*) \|$", PAGE, re.MULTILINE)
-    assert [row[0] for row in rows] == list(LIDAR)
+@pytest.mark.parametrize(("heading", "vocabulary"), [("Lidar", LIDAR), ("Light receiver", ADC)])
+def test_every_word_has_its_row(heading: str, vocabulary: Vocabulary) -> None:
+    section = PAGE.split(f"\n### {heading}\n")[1].split("\n#")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (\w+) \| (.*) \| (.*) \|$", section, re.MULTILINE)
+    assert [row[0] for row in rows] == list(vocabulary)
     for name, kind, parameters, text in rows:
-        word = LIDAR[name]
+        word = vocabulary[name]
         assert (kind, text) == (word.kind, word.help)
         assert parameters == ", ".join(f"`{key}` {rule.default!r}" for key, rule in word.parameters.items())
 
 
 def test_every_model_is_named() -> None:
     assert all(name in PAGE for name in MODELS)
+
+
+def test_every_adapter_is_named() -> None:
+    assert all(f"`{name}`" in PAGE for name in ADAPTERS)

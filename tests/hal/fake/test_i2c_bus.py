@@ -206,7 +206,9 @@ def test_dark_and_dazzled_differ_in_the_dc_channel_only(what: str, level: int) -
     device.add_level(lambda t: np.full_like(t, 0.3))
     device.bus.transfer((write(0x48, b"\x01\x42\x83"),))
     order(device, what=what)
-    assert set(words(device.bus.transfer(BLOCK))) == {2048}
+    found = words(device.bus.transfer(BLOCK))
+    assert abs(found.mean() - 2047.5) < 0.2
+    assert 0.3 < found.std() < 0.7  # the electronics' own noise
     device._clock.t += 1.0  # type: ignore[attr-defined]  # the clock of this test
     (answer,) = device.bus.transfer((write(0x48, b"\x00"), read(0x48, 2))).reads
     assert int.from_bytes(answer, "big") == level
@@ -216,7 +218,7 @@ def test_clip() -> None:
     device = adc()
     order(device, what="clip")
     found = words(device.bus.transfer(BLOCK))
-    assert np.mean((found == 0) | (found == 4095)) > 0.8
+    assert np.mean((found == 16) | (found == 4079)) > 0.8  # as far as the amplifier gets
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def words_of(text: str, asked: int = 0) -> tuple[list[int], Blemish]:
     ("text", "words"),
     [
         ("08 00", [2048]),  # Vin = VDD / 2
-        ("00 01 0f fe", [1, 4094]),
+        ("00 21 0f de", [33, 4062]),
         ("01 23 04 56 07 89 0a bc", [0x123, 0x456, 0x789, 0xABC]),
         ("01 23 04", [0x123]),  # half a word is none
     ],
@@ -38,6 +38,8 @@ def test_words(text: str, words: list[int]) -> None:
     ("text", "blemish"),
     [
         ("00 00 08 00", Blemish.CLIPPED),
+        ("00 20 08 00", Blemish.CLIPPED),  # 26 mV of 3.3 V: as far as an amplifier gets
+        ("08 00 0f df", Blemish.CLIPPED),
         ("0f ff 08 00", Blemish.CLIPPED),
         ("18 00 08 01", Blemish.MISALIGNED),
         ("88 00 08 01", Blemish.MISALIGNED),  # an ADC121C021's alert flag, which is switched off
@@ -190,3 +192,23 @@ def test_words_are_right_aligned_unsigned() -> None:
     words, _, _ = inspect(b"\x0f\xfe\x00\x02", 4, 0xF000, 12)
     assert words.dtype == np.uint16
     assert words.tolist() == [4094, 2]
+
+
+@pytest.mark.parametrize(
+    ("sigma", "mean", "quiet"),
+    [(0.45, 2048, True), (1.0, 1900, True), (3.0, 2048, False), (0.0, 2048, True), (1.0, 20, False)],
+)
+def test_noise_alone_is_quiet(sigma: float, mean: float, quiet: bool) -> None:
+    """A real converter in the dark does not repeat one word, and an amplifier at a rail is not dark."""
+    words = np.round(mean + sigma * np.random.default_rng(1).standard_normal(1111)).astype(">u2")
+    _, blemish, census = inspect(words.tobytes(), words.nbytes, MCP.spare, MCP.bits)
+    assert census.quiet is quiet
+    assert (Blemish.CLIPPED in blemish) == (mean < 32)
+    assert (Blemish.STUCK in blemish) == (sigma == 0.0)
+
+
+def test_the_weakest_lamp_in_view_is_not_quiet() -> None:
+    """At the edge of the view a lamp 2.6 m above has 67 nA of 50 uA: 5.5 words."""
+    chips = np.repeat(np.random.default_rng(2).choice([-1.0, 1.0], 250), 4)
+    words = np.round(2048 + 5.5 * chips + 0.45 * np.random.default_rng(3).standard_normal(1000)).astype(">u2")
+    assert not inspect(words.tobytes(), words.nbytes, MCP.spare, MCP.bits)[2].quiet

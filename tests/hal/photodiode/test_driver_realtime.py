@@ -86,7 +86,7 @@ def test_errors_of_the_kernel(monkeypatch: pytest.MonkeyPatch, caplog: pytest.Lo
 
     on_kernel(body, monkeypatch)
     assert [record.getMessage() for record in caplog.records] == [
-        "photodiode: /dev/i2c-1: the adapter is gone (plug it in again; it is reopened by itself)",
+        "photodiode: /dev/i2c-1: the adapter is gone (plug it in, or start its server, again; it is reopened by itself)",
         "/dev/i2c-1: MCP3221 at 0x4d delivers again",
     ]
 
@@ -105,7 +105,7 @@ def test_a_kernel_driver_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_transaction_that_hangs_in_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop goes on, the status says so, and no second thread is started on the bus meanwhile."""
-    monkeypatch.setattr("hal.photodiode.follow.SILENCE_S", 0.4)
+    monkeypatch.setattr("hal.photodiode.silence.HANG_S", 0.4)
 
     async def body(bench: Bench, linux: Kernel) -> None:
         driver = bench.driver()
