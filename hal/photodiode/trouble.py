@@ -38,7 +38,7 @@ _ABSENT: Final = Policy(
     pause_s=0.01,
 )
 _UNPLUGGED: Final = Policy(
-    DeviceMissing, "the adapter is gone", "plug it in, or start its server, again; it is reopened by itself"
+    DeviceMissing, "the adapter is gone", "plug it in, or start its server, again; it is reopened"
 )
 _NOT_ALLOWED: Final = Policy(DeviceRefused, "permission denied", "add the user to group i2c and log in again")
 _TOO_MUCH: Final = Policy(

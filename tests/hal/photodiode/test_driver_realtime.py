@@ -86,7 +86,7 @@ def test_errors_of_the_kernel(monkeypatch: pytest.MonkeyPatch, caplog: pytest.Lo
 
     on_kernel(body, monkeypatch)
     assert [record.getMessage() for record in caplog.records] == [
-        "photodiode: /dev/i2c-1: the adapter is gone (plug it in, or start its server, again; it is reopened by itself)",
+        "photodiode: /dev/i2c-1: the adapter is gone (plug it in, or start its server, again; it is reopened)",
         "/dev/i2c-1: MCP3221 at 0x4d delivers again",
     ]
 
