@@ -1,0 +1,70 @@
+"""The experiment on static grids: its locator is right, nothing leaks between halves, and it reaches its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimator.optics import expected
+from tools.experiments import static
+from tools.experiments.static import Taught
+from tools.experiments.vlp import STATIC_LAMPS, Campaign
+
+
+@pytest.fixture
+def artificial() -> Campaign:
+    """Strengths from the model itself at 49 places."""
+    x, y = np.meshgrid(np.linspace(0.4, 4.6, 7), np.linspace(0.4, 4.6, 7))
+    places = np.column_stack((x.ravel(), y.ravel(), np.full(49, 0.5)))
+    data = Campaign("artificial", np.array(STATIC_LAMPS), places, np.ones((49, 5)), None)
+    survey = static.nominal(data)
+    rss = [expected(survey.lamps, survey, np.array((p[0], p[1], 0.0))).amplitude for p in places]
+    return replace(data, rss=1e6 * np.array(rss))
+
+
+def test_the_locator_finds_places_from_nothing(artificial: Campaign) -> None:
+    taught = Taught(static.nominal(artificial), None, 0.02)
+    everywhere = np.arange(0, 49, 5)
+    found = static.errors(taught, artificial, everywhere, 1e-6)
+    assert found.max() < 0.01
+
+
+def test_nothing_leaks_between_halves(artificial: Campaign) -> None:
+    """Whatever is written into the half that is to be located, what was taught by the other stays the same."""
+    train, test = static.halves(artificial, None)
+    assert not set(train) & set(test)
+    spoiled = artificial.rss.copy()
+    spoiled[test] *= np.random.default_rng(1).uniform(0.1, 9.0, spoiled[test].shape)
+    both = (artificial, replace(artificial, rss=spoiled))
+    one, other = (static.teach(data, train, static.unit_of(data, train)) for data in both)
+    assert one.survey == other.survey
+    assert one.residuals is not None
+    assert other.residuals is not None
+    assert np.array_equal(one.residuals.mean, other.residuals.mean)
+    assert np.array_equal(one.residuals.sigma, other.residuals.sigma)
+    assert one.residuals.noise == other.residuals.noise
+
+
+def test_the_ten_places_follow_from_coordinates_alone(artificial: Campaign) -> None:
+    ten = static.named(artificial)
+    assert len(set(ten.tolist())) == 10
+    assert np.array_equal(ten, static.named(replace(artificial, rss=artificial.rss[::-1])))
+    assert artificial.places[ten[0], :2] == pytest.approx((2.5, 2.5))
+    corners = {tuple(artificial.places[i, :2].round(1)) for i in ten[1:5]}
+    assert corners == {(0.4, 0.4), (0.4, 4.6), (4.6, 0.4), (4.6, 4.6)}
+
+
+@pytest.mark.slow
+def test_real_places(log_root: Path) -> None:
+    del log_root
+    first, second = static.split(("RSS", None, True)), static.split(("RSS_0923", None, True))
+    assert len(first) == 73
+    assert len(second) == 81
+    assert np.median(first) < 0.05
+    assert np.percentile(first, 90) < 0.12
+    assert np.median(second) < 0.07
+    assert np.median(static.across(("RSS", "RSS_0923", "gains and receiver"))) < 0.13
+    assert np.median(static.across(("RSS_0923", "RSS", "gains and receiver"))) < 0.13
