@@ -129,6 +129,7 @@ class Cycle:
         self._painter = Painter(parts.map_id)
         self.cycle_us: int | None = None
         self.failing: set[int] = set()
+        self._blocks = 0
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
@@ -198,12 +199,20 @@ class Cycle:
         if bridge is None or watch is None:
             return []
         records: list[Record] = []
+        self._blocks += len(samples)
         for raw in samples:
             if (block := bridge.block(raw)) is not None:
                 watch.on_block(raw)
                 self.period.learn_block(watch.seconds)
                 records.append(block)
         return records
+
+    def blocks_lost(self) -> int:
+        """Blocks of light samples that came to nothing: lost on their way, damaged, or without a cycle to take them."""
+        bridge, watch = self.parts.samples, self.parts.blocks
+        if bridge is None or watch is None:
+            return 0
+        return watch.status.dropped + bridge.unfit + self.inbox.blocks_dropped
 
     def lidar_silence(self, t_mono: float) -> float | None:
         """Scan periods since the last scan; None before the first."""
@@ -252,6 +261,8 @@ class Cycle:
             cycle_us=self.cycle_us,
             lidar_ok=alive,
             adc_ok=None if parts.blocks is None else parts.blocks.ok(t_mono),
+            blocks=self._blocks,
+            blocks_lost=self.blocks_lost(),
             odometry_ok=self.observer.odometry_ok(t_mono),
             fault=parts.fault(),
         )

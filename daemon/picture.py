@@ -6,14 +6,17 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from daemon.publish.snapshot import Snapshot
+from daemon.publish.lights import ROWS
+from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot
 from daemon.state import Memory
 from estimator import se2
 from estimator.records import Array
-from estimator.result import Link, LinkState, StepResult
+from estimator.result import Fix, Link, LinkState, StepResult
 
 Triple = tuple[float, float, float]
 
+UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
+"""Links that are listed and not received."""
 LONGEST_CARRY_PERIODS: Final = 3.0
 """A velocity is not carried further than this many scan periods; beyond, nothing is predicted."""
 
@@ -31,6 +34,8 @@ class Facts:
     cycle_us: int | None = None
     lidar_ok: bool | None = None
     adc_ok: bool | None = None
+    blocks: int = 0
+    blocks_lost: int = 0
     odometry_ok: bool | None = None
     fault: int = 0
 
@@ -73,6 +78,7 @@ class Painter:
             loop_old=self._loop[2],
             links=None if facts.adc_ok is None else len(_received(result)),
             light_id=next((link.lamp_id for link in _received(result)), None),
+            light=None if facts.adc_ok is None else _light(result, facts),
             scan_rate=facts.scan_rate,
             missed=facts.missed,
             overruns=facts.overruns,
@@ -88,7 +94,33 @@ def _received(result: StepResult | None) -> tuple[Link, ...]:
     """Links that are above the noise, strongest first."""
     if result is None or result.lights is None:
         return ()
-    return tuple(link for link in result.lights.links if link.state is not LinkState.FAINT)
+    return tuple(link for link in result.lights.links if link.state not in UNHEARD)
+
+
+def _light(result: StepResult | None, facts: Facts) -> LightPicture:
+    """What lights alone say."""
+    if result is None or result.lights is None:
+        return LightPicture(blocks=facts.blocks, blocks_lost=facts.blocks_lost)
+    lights = result.lights
+    placed = lights.fix not in (Fix.NONE, Fix.LOST)
+    sigma = [math.sqrt(variance) if variance >= 0.0 else math.nan for variance in lights.covariance.diagonal().tolist()]
+    return LightPicture(
+        fix=LightFix[lights.fix.name],
+        used=len(lights.accepted),
+        t_mono=lights.t_mono if math.isfinite(lights.t_mono) else None,
+        pose=_triple(lights.T_map_base) if placed else None,
+        sigma=(sigma[0], sigma[1], sigma[2]) if placed else None,
+        floor=lights.floor,
+        clock_ppm=lights.clock_ppm,
+        blocks=facts.blocks,
+        blocks_lost=facts.blocks_lost,
+        links=tuple(_link(link) for link in lights.links[:ROWS]),
+    )
+
+
+def _link(link: Link) -> LightLink:
+    use = LinkUse[link.state.name] if link.state.name in LinkUse.__members__ else LinkUse.OTHER
+    return LightLink(link.code, link.lamp_id, use, link.amplitude, link.residual)
 
 
 def _pose(result: StepResult) -> Triple:

@@ -6,18 +6,20 @@ Standard library only, so that it starts at once on any computer.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import socket
 import struct
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from daemon.publish import registers
+from daemon.publish import lights, registers
 from daemon.publish.points import Value
-from daemon.publish.snapshot import State
+from daemon.publish.snapshot import LightFix, LinkUse, State
 
 if TYPE_CHECKING:
     from daemon.config import Config
@@ -74,7 +76,7 @@ class Reader:
         """
         for _ in range(_TRIES):
             try:
-                answer = self._ask()
+                answer = self._ask(0, registers.BLOCK_WORDS)
             except TimeoutError:
                 continue
             except OSError as error:
@@ -82,15 +84,25 @@ class Reader:
                     f"{self._where}: {error.strerror}; nothing serves Modbus there: start `lumiloop run`, or name the "
                     "right HOST:PORT"
                 ) from error
-            return self._reading(answer)
+            reading = self._reading(answer)
+            return reading if reading["links"] is None else reading | self._lights()
         raise NoAnswer(
             f"{self._where}: no answer within {_TRIES * _TIMEOUT_S:g} s; check that the daemon runs, that its `bind` "
             "is not the loopback address of another computer, and that no firewall drops UDP"
         )
 
-    def _ask(self) -> bytes:
+    def _lights(self) -> Reading:
+        """The block of lights; nothing where the daemon is of a version without it."""
+        for _ in range(_TRIES):
+            with contextlib.suppress(OSError, ValueError):
+                reading = lights.decode_lights(self._ask(lights.ADDRESS, lights.BLOCK_WORDS)[_ANSWER.size :])
+                del reading["seq"]
+                return reading
+        return {}
+
+    def _ask(self, address: int, count: int) -> bytes:
         self._transaction = self._transaction % 0xFFFF + 1
-        self._sock.send(_REQUEST.pack(self._transaction, 0, 6, 1, _READ_INPUT, 0, registers.BLOCK_WORDS))
+        self._sock.send(_REQUEST.pack(self._transaction, 0, 6, 1, _READ_INPUT, address, count))
         deadline = time.monotonic() + _TIMEOUT_S
         while time.monotonic() < deadline:
             answer = self._sock.recv(512)
@@ -179,7 +191,22 @@ def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
         "devices": registers.decode_bits(registers.DEVICES, reading["devices"]),
         "stalled": stalled,
     }
-    return {**reading, **spelled}
+    if "light_fix" in reading:
+        spelled |= {"light_fix": _fix(reading), "light_links": [dict(link) for link in _links(reading)]}
+    return {key: value for key, value in reading.items() if not key.startswith("link_")} | spelled
+
+
+def _fix(reading: Reading) -> str | None:
+    number = reading["light_fix"]
+    return None if number is None else _name(LightFix, number)
+
+
+def _links(reading: Reading) -> Iterator[dict[str, Any]]:
+    """Every link in view, strongest first."""
+    for row in range(1, lights.ROWS + 1):
+        if (code := reading[f"link_{row}_code"]) is not None:
+            link = {name: reading[f"link_{row}_{name}"] for name in ("lamp", "use", "strength", "residual")}
+            yield {"code": code, **link, "use": _name(LinkUse, link["use"])}
 
 
 def as_table(reading: Reading, stalled: bool) -> str:
@@ -196,18 +223,22 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("age", _number(reading["age"], "s")),
         ("map", f"id {reading['map_id']}, {reading['jumps']} jumps"),
         ("loops", _loops(reading)),
-        ("lights", _lights(reading)),
+        *_lights(reading),
         ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
         ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget"),
         ("devices", _devices(reading["devices"])),
         ("snapshot", f"{reading['seq']}, {_date(reading['t_utc'])}"),
     ]
-    return "\n".join(f"{label:<10} {text}" for label, text in rows)
+    return "\n".join(f"{label:<10} {text}".rstrip() for label, text in rows)
 
 
 def _state(number: Value) -> str:
+    return _name(State, number)
+
+
+def _name(table: type[IntEnum], number: Value) -> str:
     try:
-        return State(int(number or 0)).name
+        return table(int(number or 0)).name
     except ValueError:
         return f"unknown to this reader ({number})"
 
@@ -239,12 +270,28 @@ def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) 
     return f"{_number(x, unit)}, {_number(y, unit)}, {_angle(yaw)}{per}"
 
 
-def _lights(reading: Reading) -> str:
+def _lights(reading: Reading) -> list[tuple[str, str]]:
+    """How many lamps, what lights alone say, and a line for every link."""
     if reading["links"] is None:
-        return "no photodiode configured"
-    return f"{reading['links']} in view" + (
-        f", strongest {light}" if (light := reading["light_id"]) is not None else ""
+        return [("lights", "no photodiode configured")]
+    strongest = reading["light_id"]
+    rows = [("lights", f"{reading['links']} in view" + ("" if strongest is None else f", strongest lamp {strongest}"))]
+    if "light_fix" not in reading:
+        return rows
+    names = ("light_sigma_x", "light_sigma_y", "light_sigma_yaw")
+    rows.append(
+        ("light fix", f"{_fix(reading)}, {reading['light_used']} used, age {_number(reading['light_age'], 's')}")
     )
+    rows.append(("light pose", _pose(reading, "light")))
+    rows.append(("", f"sigma {_triple(reading, names, 'm', '')}"))
+    links = list(_links(reading))
+    if links:
+        rows.append(("links", f"{'lamp':>6} {'code':>5} {'strength':>12} {'residual':>9}  use"))
+    for link in links:
+        lamp = "-" if link["lamp"] is None else link["lamp"]
+        residual = "-" if link["residual"] is None else f"{100.0 * math.expm1(link['residual']):+.1f} %"
+        rows.append(("", f"{lamp:>6} {link['code']:>5} {1e9 * link['strength']:>9.2f} nA {residual:>9}  {link['use']}"))
+    return rows
 
 
 def _pose(reading: Reading, frame: str) -> str:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.health import FAULTS
-from daemon.publish import holding, modbus, registers, requests
+from daemon.publish import holding, lights, modbus, registers, requests
 from daemon.publish.points import Layout, Point, Rule
-from daemon.publish.snapshot import State
+from daemon.publish.snapshot import LightFix, LinkUse, State
 from daemon.state import REASONS
 from hal import input_codec, inputs
 
@@ -43,11 +43,11 @@ def _describe(point: Point) -> str:
     return f"{point.label[0].upper()}{point.label[1:]}. {point.text}{wraps}".strip()
 
 
-def _body_rows(start: int, step: int) -> list[tuple[str, ...]]:
-    """Rows of the common body; `start` and `step` turn a word offset into a register address or a byte."""
+def _rows(layout: Layout, start: int, step: int) -> list[tuple[str, ...]]:
+    """Rows of a layout; `start` and `step` turn a word offset into a register address or a byte."""
     return [
         (str(start + step * offset), f"`{p.name}`", p.wire.name, _step(p), _not_known(p), _describe(p))
-        for offset, p in zip(registers.BODY.offsets, registers.BODY.points, strict=True)
+        for offset, p in zip(layout.offsets, layout.points, strict=True)
     ]
 
 
@@ -109,7 +109,7 @@ def modbus_page() -> str:
     block = [
         ("0", "`magic`", "uint16", "", "", f"0x{registers.MODBUS_MAGIC:04X} (\"LL\")."),
         ("1", "`version`", "uint16", "", "", f"Version of this table: {registers.VERSION}."),
-        *_body_rows(registers.BODY_ADDRESS, 1),
+        *_rows(registers.BODY, registers.BODY_ADDRESS, 1),
         (str(end), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
     ]  # fmt: skip
     first = registers.MIRROR_ADDRESS
@@ -150,10 +150,60 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 
 {table(("address", "name", "type", "unit", "meaning"), mirror)}
 
+{_lights()}
 {_writing()}
 ## Limits
 
 {_limits()}
+"""
+
+
+_USES: Final[dict[LinkUse, str]] = {
+    LinkUse.OTHER: "something that this version does not know",
+    LinkUse.ACCEPTED: "used",
+    LinkUse.OCCLUDED: "weaker than it can be here: something stands in its way",
+    LinkUse.REJECTED: "stronger than it can be here, or from the wrong place: moved, or exchanged",
+    LinkUse.RIM: "at the edge of the receiver's field of view",
+    LinkUse.FAINT: "not above the noise",
+    LinkUse.TWIN: "two lamps of this code are in view",
+    LinkUse.UNSURVEYED: "no lamp of this code is known",
+    LinkUse.MISSING: "not received, though it must be here: dead, or covered",
+}
+_FIXES: Final[dict[LightFix, str]] = {
+    LightFix.NONE: "no lamps in view, or too few",
+    LightFix.STARTING: "position known, heading and strengths still being found",
+    LightFix.GOOD: "position and heading known",
+    LightFix.HELD: "carried on by odometry alone, every link is paused",
+    LightFix.AMBIGUOUS: "several places fit",
+    LightFix.LOST: "what is received contradicts the position: starting anew",
+}
+
+
+def _lights() -> str:
+    first, width = lights.ADDRESS, lights.ROW_WORDS
+    last = first + lights.BLOCK_WORDS - 1
+    head = [row for row in _rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if not row[1].startswith("`link_")]
+    start = lights.BODY_ADDRESS + lights.BLOCK.offsets[len(head)]
+    rows = [row for row in _rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if row[1].startswith("`link_1_")]
+    block = [
+        (str(first), "`magic`", "uint16", "", "", f"0x{lights.MAGIC:04X} (\"LI\")."),
+        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {lights.VERSION}."),
+        *head,
+        *rows,
+        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
+    ]  # fmt: skip
+    words, links = lights.BLOCK_WORDS, lights.ROWS
+    return f"""## Lights: input registers {first} to {last}
+
+The lamps in view, strongest first, and the position from lights alone, which the laser never touches. Read
+**{words} registers from address {first} in one request**. There are {links} links, the strongest first; link k
+begins at {start} + {width} (k - 1), and the table shows the first.
+
+{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+
+{table(("`light_fix`", "name", "meaning"), [(str(fix.value), fix.name, _FIXES[fix]) for fix in LightFix])}
+
+{table(("`link_..._use`", "name", "meaning"), [(str(use.value), use.name, _USES[use]) for use in LinkUse])}
 """
 
 
@@ -206,10 +256,12 @@ def udp_page() -> str:
     rows = [
         ("0", "`magic`", "4 bytes", "", "", f'"{registers.DATAGRAM_MAGIC.decode()}".'),
         ("4", "`version`", "uint16", "", "", f"{registers.VERSION}."),
-        ("6", "`length`", "uint16", "", "", f"Bytes of the whole datagram, {registers.DATAGRAM_SIZE} or more."),
-        *_body_rows(registers.BODY_OFFSET, 2),
+        ("6", "`length`", "uint16", "", "", f"Bytes of the whole datagram, {registers.DATAGRAM_SIZE} or more; "
+         f"{registers.SMALLEST_DATAGRAM} from programs that knew no lights, which sent no more than `devices`."),
+        *_rows(registers.BODY, registers.BODY_OFFSET, 2),
+        *_rows(lights.TAIL, registers.TAIL_OFFSET, 2),
         ("length - 4", "`crc`", "uint32", "", "", f"CRC-32 of all bytes before it (at {crc} in this version)."),
-    ]
+    ]  # fmt: skip
     return f"""{_NOTICE}
 # UDP
 
@@ -224,7 +276,8 @@ reader in C is `tools/clients/listen_pose.c`.
 
 {table(("byte", "name", "type", "step", "not known", "meaning"), rows)}
 
-States, reasons, faults and the bits of `flags` and `devices` are those of [Modbus](modbus.md).
+States, reasons, faults, the numbers of `light_fix` and the bits of `flags` and `devices` are those of
+[Modbus](modbus.md), where every single link can be read too.
 
 ## Odometry and IMU datagrams
 

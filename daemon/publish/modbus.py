@@ -16,10 +16,12 @@ import socket
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from daemon.publish import registers
 from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
+from daemon.publish.lights import encode_lights
 from daemon.publish.requests import MAX_FRAME, Responder, frame_size
 from daemon.publish.snapshot import Snapshot, State
 from hal import inet
@@ -310,7 +312,8 @@ class ModbusPublisher:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; never waits."""
-        self._responder.show(registers.encode_block(snapshot), registers.encode_mirror(snapshot))
+        make_lights = partial(encode_lights, snapshot)
+        self._responder.show(registers.encode_block(snapshot), registers.encode_mirror(snapshot), make_lights)
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:
         """Tell the client what became of its command."""

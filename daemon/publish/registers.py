@@ -4,8 +4,10 @@ The points of :data:`BODY` are the same, in the same order and scale, in both fo
 around them differ::
 
     Modbus    magic u16, version u16 | BODY, big-endian, high word first  | seq_end u32        64 registers at 0
-    datagram  "LUMI",    version u16, length u16 | BODY, little-endian    | CRC-32             132 bytes
+    datagram  "LUMI",    version u16, length u16 | BODY, TAIL, little-endian | CRC-32          156 bytes
     mirror    seq u32 | float32 of every scaled point, covariance | seq_end u32                at 100
+
+TAIL, and a block of registers with every link, are in :mod:`daemon.publish.lights`.
 
 Every 32- and 64-bit point is naturally aligned in the datagram. The contract: a point never moves and never changes its
 meaning under the same version number (a frozen copy of the layout is compared in the tests). A datagram may grow at its
@@ -21,6 +23,7 @@ from collections.abc import Callable
 from operator import attrgetter
 from typing import Final
 
+from daemon.publish.lights import TAIL
 from daemon.publish.points import I16, I32, U16, U32, U64, FloatPoint, Layout, Point, Rule, Value
 from daemon.publish.snapshot import Snapshot, State
 
@@ -206,7 +209,10 @@ _MIRROR_PLAN: Final = tuple((p.encode, p.value) for p in MIRROR)
 _DATAGRAM_HEAD: Final = struct.Struct("<4sHH")
 _CRC: Final = struct.Struct("<I")
 BODY_OFFSET: Final = _DATAGRAM_HEAD.size
-DATAGRAM_SIZE: Final = BODY_OFFSET + BODY.little.size + _CRC.size
+TAIL_OFFSET: Final = BODY_OFFSET + BODY.little.size
+SMALLEST_DATAGRAM: Final = TAIL_OFFSET + _CRC.size
+"""Without a tail, as the first programs of this version sent it."""
+DATAGRAM_SIZE: Final = SMALLEST_DATAGRAM + TAIL.little.size
 
 
 def encode_block(snapshot: Snapshot) -> bytes:
@@ -224,7 +230,7 @@ def encode_mirror(snapshot: Snapshot) -> bytes:
 def encode_datagram(snapshot: Snapshot) -> bytes:
     """The UDP pose datagram (little-endian, CRC-32 of everything before it at the end)."""
     head = _DATAGRAM_HEAD.pack(DATAGRAM_MAGIC, VERSION, DATAGRAM_SIZE)
-    data = head + BODY.little.pack(*BODY.raw(snapshot))
+    data = head + BODY.little.pack(*BODY.raw(snapshot)) + TAIL.little.pack(*TAIL.raw(snapshot))
     return data + _CRC.pack(zlib.crc32(data))
 
 
@@ -264,12 +270,14 @@ def decode_mirror(mirror: bytes) -> dict[str, Value]:
 
 
 def decode_datagram(data: bytes) -> dict[str, Value]:
-    """Values by name from a pose datagram; bytes that a later minor revision put behind the body are skipped.
+    """Values by name from a pose datagram; bytes that a later minor revision put behind it are skipped.
+
+    Values that an earlier program did not send are left out.
 
     Raises:
         ValueError: not a pose datagram, another version, damaged.
     """
-    if len(data) < DATAGRAM_SIZE or data[:4] != DATAGRAM_MAGIC:
+    if len(data) < SMALLEST_DATAGRAM or data[:4] != DATAGRAM_MAGIC:
         raise ValueError("not a lumiloop pose datagram")
     _, version, length = _DATAGRAM_HEAD.unpack_from(data)
     if version != VERSION:
@@ -279,7 +287,10 @@ def decode_datagram(data: bytes) -> dict[str, Value]:
     (crc,) = _CRC.unpack_from(data, length - _CRC.size)
     if crc != zlib.crc32(data[: length - _CRC.size]):
         raise ValueError("damaged datagram: CRC-32 differs")
-    return BODY.values(BODY.little.unpack_from(data, BODY_OFFSET))
+    values = BODY.values(BODY.little.unpack_from(data, BODY_OFFSET))
+    if length >= DATAGRAM_SIZE:
+        values |= TAIL.values(TAIL.little.unpack_from(data, TAIL_OFFSET))
+    return values
 
 
 def decode_bits(table: tuple[Bit, ...], word: Value) -> dict[str, bool]:

@@ -11,6 +11,7 @@ Answered: 3 and 4 (read holding, read input registers: both show the published b
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Final
 
 from pymodbus.constants import ExcCodes
@@ -28,6 +29,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterResponse,
 )
 
+from daemon.publish import lights
 from daemon.publish.holding import Holding, Refused
 from daemon.publish.registers import MIRROR_ADDRESS
 
@@ -66,10 +68,16 @@ class Responder:
         self._holding = holding
         self._framer = FramerSocket(DecodePDU(is_server=True))
         self._shown: tuple[bytes, bytes] = (b"", b"")
+        self._make_lights: Callable[[], bytes] = bytes
+        self._lights: bytes | None = None
 
-    def show(self, block: bytes, mirror: bytes) -> None:
-        """Put both blocks in place at once: no answer ever mixes two snapshots."""
+    def show(self, block: bytes, mirror: bytes, make_lights: Callable[[], bytes] = bytes) -> None:
+        """Put all blocks in place at once: no answer ever mixes two snapshots.
+
+        ``make_lights`` makes the block of lights of the same snapshot; it is called when that is read.
+        """
         self._shown = (block, mirror)
+        self._make_lights, self._lights = make_lights, None
 
     def answer(self, frame: bytes) -> bytes:
         """The answer to one whole frame, which :func:`frame_size` has found good."""
@@ -119,7 +127,11 @@ class Responder:
         )
 
     def _registers(self, address: int, count: int, holding: bool) -> bytes:
-        for start, memory in zip((0, MIRROR_ADDRESS), self._shown, strict=True):
+        shown = [(0, self._shown[0]), (MIRROR_ADDRESS, self._shown[1])]
+        if lights.ADDRESS <= address < lights.ADDRESS + lights.BLOCK_WORDS:
+            self._lights = self._lights if self._lights is not None else self._make_lights()
+            shown = [(lights.ADDRESS, self._lights)]
+        for start, memory in shown:
             if start <= address and 2 * (address - start + count) <= len(memory):
                 return memory[2 * (address - start) : 2 * (address - start + count)]
         if holding and self._holding is not None:

@@ -23,6 +23,71 @@ class State(IntEnum):
     RELOCATING = 7  # looking for the place
 
 
+class LightFix(IntEnum):
+    """How far the position from lights has come (`estimator.result.Fix`). Numbers are part of the contract."""
+
+    NONE = 0  # no lamps in view, or too few
+    STARTING = 1  # position known, heading and gains still being found
+    GOOD = 2  # position and heading known
+    HELD = 3  # carried on by odometry alone, every link is paused
+    AMBIGUOUS = 4  # several places fit
+    LOST = 5  # what is received contradicts the position: starting anew
+
+
+class LinkUse(IntEnum):
+    """What a received lamp is used for (`estimator.result.LinkState`). Numbers are part of the contract."""
+
+    OTHER = 0  # something that this version does not know
+    ACCEPTED = 1  # used
+    OCCLUDED = 2  # weaker than it can be here: something stands in its way
+    REJECTED = 3  # stronger than it can be here: moved, exchanged, or its code in use twice
+    RIM = 4  # at the edge of the field of view
+    FAINT = 5  # not above the noise
+    TWIN = 6  # two lamps of this code are in view
+    UNSURVEYED = 7  # no lamp of this code is known
+    MISSING = 8  # not received, though it must be here: dead, or covered
+
+
+@dataclass(frozen=True, slots=True)
+class LightLink:
+    """One lamp in view.
+
+    Attributes:
+        code: as received. lamp_id: None where it is not clear which lamp. use: what it is used for.
+        strength: amplitude of the modulated photocurrent, A. residual: ln(received / expected).
+    """
+
+    code: int
+    lamp_id: int | None
+    use: LinkUse
+    strength: float
+    residual: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LightPicture:
+    """What lights alone say, without the laser; None: not known.
+
+    Attributes:
+        fix: how far the position has come. used: links it rests on.
+        t_mono: end of the latest usable block of samples. pose: T_map_base. sigma: of x, y, yaw (m, rad).
+        floor: diffuse light, part of a lamp's own. clock_ppm: error of the sample clock.
+        blocks, blocks_lost: received since the start, and those of them of no use.
+        links: strongest first.
+    """
+
+    fix: LightFix = LightFix.NONE
+    used: int = 0
+    t_mono: float | None = None
+    pose: tuple[float, float, float] | None = None
+    sigma: tuple[float, float, float] | None = None
+    floor: float | None = None
+    clock_ppm: float | None = None
+    blocks: int = 0
+    blocks_lost: int = 0
+    links: tuple[LightLink, ...] = ()
+
+
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """What is published after one cycle. SI units, `T_map_base` unless said otherwise; None: not known.
@@ -37,7 +102,8 @@ class Snapshot:
         reason: index into the table of reasons (daemon/state.py), 0: none.
         jumps: how often T_map_odom jumped. map_id: identity of the map frame, 0: not known.
         loop_counter: accepted loop closures; loop_new, loop_old: keyframe IDs of the latest, None before the first.
-        links: light links in view; None where no photodiode is configured. light_id: the strongest's ID.
+        links: lights in view; None where no photodiode is configured. light_id: the strongest's lamp ID.
+        light: what lights alone say; None where no photodiode is configured.
         scan_rate: scans per second. missed: scans lost. overruns: cycles over budget. cycle_us: last cycle's duration.
         lidar_ok, adc_ok, odometry_ok: None where not configured.
         fault: number of the gravest present fault, 0: none.
@@ -62,6 +128,7 @@ class Snapshot:
     loop_old: int | None = None
     links: int | None = None
     light_id: int | None = None
+    light: LightPicture | None = None
     scan_rate: float | None = None
     missed: int = 0
     overruns: int = 0

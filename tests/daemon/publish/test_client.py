@@ -17,6 +17,7 @@ from daemon.config import Config, ModbusConfig
 from daemon.publish import client, registers
 from daemon.publish.snapshot import Snapshot, State
 from tests.daemon.publish.network import publishing
+from tests.daemon.publish.test_lights import picture
 from tests.daemon.publish.test_registers import snapshot
 
 
@@ -51,13 +52,39 @@ def test_a_person_reads_the_table(capsys: pytest.CaptureFixture[str]) -> None:
         "map pose   x 1.2345 m, y -2.3456 m, yaw 171.89 deg  (not observed: y)\n",
         "sigma      0.0200 m, 0.0100 m, 0.57 deg\n",
         "loops      2, latest: keyframe 70001 to 12\n",
-        "lights     4 in view, strongest 77\n",
+        "lights     4 in view, strongest lamp 77\n",
         "scans      39.92 Hz, 100000 missed\n",
         "devices    lidar ok, odometry NOT OK\n",
         "2023-11-14 22:13:20 UTC\n",
     ):
         assert line in shown
     assert "STANDS STILL" not in shown
+
+
+def test_a_person_sees_the_links_beside_the_pose(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(light=picture(), links=3), advance=False) == 0
+    shown = capsys.readouterr().out
+    for line in (
+        "map pose   x 1.2345 m, y -2.3456 m, yaw 171.89 deg",
+        "light fix  GOOD, 5 used, age 0.0500 s\n",
+        "light pose x -1.2345 m, y 7.2500 m, yaw -159.46 deg\n",
+        "           sigma 0.0211 m, 0.0300 m, 0.57 deg\n",
+        "links        lamp  code     strength  residual  use\n",
+        "             1017    17   1250.00 nA    -3.1 %  ACCEPTED\n",
+        "                -    60    500.00 nA         -  TWIN\n",
+        "            65000   101      3.10 nA   -96.2 %  OCCLUDED\n",
+    ):
+        assert line in shown, shown
+
+
+def test_a_daemon_of_a_version_without_the_block_of_lights_is_read_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("daemon.publish.modbus.encode_lights", lambda snapshot: b"")
+    assert run_against(snapshot(light=picture(), links=3), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "lights     3 in view" in shown
+    assert "light fix" not in shown
 
 
 def test_a_daemon_whose_cycle_stands_still_is_shown_as_such(capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,6 +124,16 @@ def test_a_program_reads_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert reading["flags"]["loop_closed"] is True
     assert reading["devices"]["adc_fitted"] is False
     assert reading["stalled"] is False
+
+
+def test_a_program_reads_the_links(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=0, fault=0, light=picture()), advance=False, json=True) == 0
+    reading = json.loads(capsys.readouterr().out)
+    assert reading["light_fix"] == "GOOD"
+    assert reading["light_x"] == -1.2345
+    assert reading["light_links"][1] == {"code": 60, "lamp": None, "use": "TWIN", "strength": 5e-7, "residual": None}
+    assert len(reading["light_links"]) == 3
+    assert not [key for key in reading if key.startswith("link_")]
 
 
 def test_watching_goes_on_until_interrupted(

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.publish import registers
+from daemon.publish import lights, registers
 from daemon.publish.points import I16, U16, U32, U64, Point, Rule
-from daemon.publish.snapshot import Snapshot, State
+from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State
 
 FROZEN = Path(__file__).parent / "frozen"
 
@@ -52,6 +52,30 @@ snapshots = st.builds(
     adc_ok=maybe_bool,
     odometry_ok=maybe_bool,
     fault=count,
+    light=st.none()
+    | st.builds(
+        LightPicture,
+        fix=st.sampled_from(LightFix),
+        used=count,
+        t_mono=st.none() | any_float,
+        pose=triple,
+        sigma=triple,
+        floor=st.none() | any_float,
+        clock_ppm=st.none() | any_float,
+        blocks=count,
+        blocks_lost=count,
+        links=st.lists(
+            st.builds(
+                LightLink,
+                code=count,
+                lamp_id=st.none() | count,
+                use=st.sampled_from(LinkUse),
+                strength=any_float,
+                residual=st.none() | any_float,
+            ),
+            max_size=3,
+        ).map(tuple),
+    ),
 )
 
 
@@ -95,6 +119,9 @@ def test_sizes_are_those_promised() -> None:
     assert len(registers.encode_block(snapshot())) == 2 * registers.BLOCK_WORDS
     assert len(registers.encode_datagram(snapshot())) == registers.DATAGRAM_SIZE
     assert len(registers.encode_mirror(snapshot())) == 2 * registers.MIRROR_WORDS
+    assert len(lights.encode_lights(snapshot())) == 2 * lights.BLOCK_WORDS
+    assert lights.BLOCK_WORDS <= 125, "the lights must be readable in one request"
+    assert registers.MIRROR_ADDRESS + registers.MIRROR_WORDS <= lights.ADDRESS
     assert registers.BLOCK_WORDS <= registers.MIRROR_ADDRESS
     assert registers.MIRROR_WORDS <= 125, "the mirror must be readable in one request"
 
@@ -102,10 +129,12 @@ def test_sizes_are_those_promised() -> None:
 def test_wide_points_are_aligned_in_the_datagram() -> None:
     for offset, point in zip(registers.BODY.offsets, registers.BODY.points, strict=True):
         assert (registers.BODY_OFFSET + 2 * offset) % (point.wire.bits // 8) == 0, point.name
+    for offset, point in zip(lights.TAIL.offsets, lights.TAIL.points, strict=True):
+        assert (registers.TAIL_OFFSET + 2 * offset) % (point.wire.bits // 8) == 0, point.name
 
 
 def test_names_are_unique() -> None:
-    for points in (registers.BODY.points, registers.MIRROR):
+    for points in (registers.BODY.points + lights.TAIL.points, registers.MIRROR, lights.BLOCK.points):
         names = [p.name for p in points]
         assert len(set(names)) == len(names)
 
@@ -134,10 +163,10 @@ def test_block_by_hand() -> None:
 
 def test_datagram_by_hand() -> None:
     data = registers.encode_datagram(snapshot())
-    assert data[:8] == b"LUMI\x01\x00\x84\x00"
+    assert data[:8] == b"LUMI\x01\x00\x9c\x00"
     assert struct.unpack_from("<IHH", data, 8) == (70_000, 3, 7)
     assert struct.unpack_from("<3i", data, 40) == (12345, -23456, 3_000_000)
-    assert struct.unpack_from("<I", data, 128) == (zlib.crc32(data[:128]),)
+    assert struct.unpack_from("<I", data, 152) == (zlib.crc32(data[:152]),)
 
 
 def test_readings_are_in_si_units() -> None:
@@ -184,7 +213,10 @@ def test_what_is_not_known_says_so() -> None:
 def test_no_snapshot_breaks_an_encoder(taken: Snapshot) -> None:
     block = registers.decode_block(registers.encode_block(taken))
     datagram = registers.decode_datagram(registers.encode_datagram(taken))
-    assert block == datagram
+    assert block == {name: datagram[name] for name in block}
+    seen = lights.decode_lights(lights.encode_lights(taken))
+    assert {p.name: seen[p.name] for p in lights.TAIL.points} == {p.name: datagram[p.name] for p in lights.TAIL.points}
+    assert all(value is None or math.isfinite(value) for value in seen.values())
     mirror = registers.decode_mirror(registers.encode_mirror(taken))
     assert all(value is None or math.isfinite(value) for value in mirror.values())
 
@@ -333,6 +365,7 @@ def test_the_contract_is_the_frozen_one() -> None:
     path = FROZEN / f"layout_v{registers.VERSION}.json"
     assert path.exists(), f"version {registers.VERSION} has no frozen copy: write layout() to {path.name}"
     frozen, now = json.loads(path.read_text()), layout()
+    assert now.pop("datagram_bytes") >= frozen.pop("datagram_bytes"), "a datagram may grow at its end"
     for key in ("flags", "devices"):
         assert now.pop(key)[: len(frozen[key])] == frozen.pop(key), key
     states = frozen.pop("states")
