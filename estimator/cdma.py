@@ -154,7 +154,7 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
     tracks, lsb = decoder.tracks, decoder.profile.front_end.lsb_a
     links = tracks.confirmed if not flags & UNUSABLE else np.empty(0, np.int64)
     code, amplitude, variance = tracks.code[links], tracks.amplitude[links], tracks.amplitude_var[links]
-    twin = np.array([np.count_nonzero(code == c) > 1 for c in code], bool)
+    twin = np.count_nonzero(code[:, None] == code, axis=1) > 1
     faint = tracks.faint(links)
     return LightEpoch(
         t_begin=block.t_begin,

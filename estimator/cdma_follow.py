@@ -31,6 +31,9 @@ LAG_VAR: Final = 0.05**2
 STAMP_MARGIN_S: Final = 120e-6
 """Lags are looked for so far beyond what the block's two stamps leave open."""
 
+PATIENCE: Final = 2
+"""Noisy blocks in a row from which nothing is learned; what disturbs more than those is there to stay."""
+
 SPURIOUS: Final = 0.01
 """Of the strongest lamp: below this, errors of the template's shape can look like lamps."""
 
@@ -79,12 +82,16 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
         return BlockFlag.NONE, replace(sampled, y=sampled.clean)
     excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
     flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
-    if not flags & BlockFlag.STALLED:
-        _learn(decoder, solved)
+    noisy = bool(flags & BlockFlag.NOISY)
+    if noisy and decoder.odd < PATIENCE:
+        _weigh(decoder, solved.fit)
+    elif not flags & BlockFlag.STALLED:
+        _weigh(decoder, solved.fit)
+        _read(decoder, solved)
         if solved.fit.clearest > CLEAR:  # else all are dark, and the lag found is chance
             clocks.update(solved.lag + solved.fit.lag - float(clocks.state[0]), excess, solved.fit)
             tracks.learn_phases(tracks.slots, solved.fit)
-        _live_and_die(decoder, solved, suspicious=bool(flags & BlockFlag.NOISY))
+        _live_and_die(decoder, solved, suspicious=noisy)
     if flags in (BlockFlag.NONE, BlockFlag.CLIPPED) and len(tracks.confirmed):
         decoder.shape.learn(solved.block, solved.prior, solved.fit)
     return flags, replace(solved.block, y=solved.fit.residual)
@@ -136,17 +143,20 @@ def _listen(decoder: Decoder, fit: Fit) -> None:
         decoder.usual_noise = usual + (0.1 if change > 0.0 else 0.5) * change
 
 
-def _learn(decoder: Decoder, solved: _Solved) -> None:
-    """Amplitudes and data bits."""
+def _weigh(decoder: Decoder, fit: Fit) -> None:
+    """Amplitudes."""
+    tracks, slots = decoder.tracks, decoder.tracks.slots
+    tracks.amplitude[slots], tracks.amplitude_var[slots] = fit.amplitude, fit.amplitude_var
+    decoder.noise = float(np.sqrt(fit.noise_var))
+
+
+def _read(decoder: Decoder, solved: _Solved) -> None:
+    """Data bits, and frames that are complete."""
     tracks, fit, slots = decoder.tracks, solved.fit, decoder.tracks.slots
     first = tracks.first_period(slots, solved.lag, -float(solved.block.x[0]))
-    tracks.amplitude[slots], tracks.amplitude_var[slots] = fit.amplitude, fit.amplitude_var
     tracks.rings.add(slots, first, fit.soft, fit.soft_var)
-    for slot, period in zip(slots, first, strict=True):
-        frame = tracks.rings.frame(int(slot), int(tracks.code[slot]), int(period))
-        if frame is not None:
-            tracks.frames[slot] = frame
-    decoder.noise = float(np.sqrt(fit.noise_var))
+    for slot, frame in tracks.rings.frames(slots, tracks.code[slots], first):
+        tracks.frames[slot] = frame
 
 
 def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:

@@ -8,12 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-
 VERSION: Final = 0
 SYNC: Final = 0xEB90
 SYNC_BITS: Final = 16
@@ -107,61 +101,3 @@ def decode_ring(ring: int, code: int) -> LampFrame | None:
                 if turned & 0xFFFF == _checksum(payload, code) and payload >> PAYLOAD_BITS - 2 == VERSION:
                     return _payload(payload)
     return None
-
-
-KNOWN: Final = 3.0
-"""A bit counts as received when its sign is so many standard deviations clear; the CRC finds up to three wrong ones."""
-
-FADE: Final = 0.7
-"""Weight of what the repetition before said of the same bit: a lamp that is told something new is believed in 9 s."""
-
-RETRY: Final = 29
-"""New bits before another attempt at a frame that failed its check: a quarter of it."""
-
-
-class BitRings:
-    """Soft bits of all tracked lamps, folded on the frame's length, so that weak lamps gain by repetition."""
-
-    def __init__(self, capacity: int) -> None:
-        self._sum: Array = np.zeros((capacity, FRAME_BITS))
-        self._weight: Array = np.zeros((capacity, FRAME_BITS))
-        self._last: Index = np.full((capacity, FRAME_BITS), -1)
-        self._due: Index = np.zeros(capacity, np.int64)
-
-    def forget(self, slot: int) -> None:
-        """Start anew in a slot that another lamp takes."""
-        self._sum[slot], self._weight[slot], self._last[slot], self._due[slot] = 0.0, 0.0, -1, 0
-
-    def add(self, slots: Index, period: Index, soft: Array, variance: Array) -> None:
-        """Take in what one block says.
-
-        Args:
-            slots: (L,).
-            period: (L,) running number of the first code period touched, not folded.
-            soft: (L, P) amplitude times sign of each period touched.
-            variance: (L, P), inf where not touched.
-        """
-        touched = np.isfinite(variance)
-        index = (period[:, None] + np.arange(soft.shape[1]))[touched]
-        rows = np.broadcast_to(slots[:, None], soft.shape)[touched]
-        at = index % FRAME_BITS
-        keep = np.where(self._last[rows, at] == index, 1.0, FADE)
-        self._sum[rows, at] = keep * self._sum[rows, at] + (soft / variance)[touched]
-        self._weight[rows, at] = keep * self._weight[rows, at] + 1.0 / variance[touched]
-        self._last[rows, at] = index
-
-    def before(self, slots: Index, period: Index) -> tuple[Array, Array]:
-        """Sum and weight gathered so far for one running period of each lamp; 0 if it is new. Both (L,)."""
-        at = period % FRAME_BITS
-        same = self._last[slots, at] == period
-        return np.where(same, self._sum[slots, at], 0.0), np.where(same, self._weight[slots, at], 0.0)
-
-    def frame(self, slot: int, code: int, period: int) -> LampFrame | None:
-        """Try to read the frame; ``period`` is the running number now, which paces the attempts."""
-        if period < self._due[slot] or not np.all(np.abs(self._sum[slot]) > KNOWN * np.sqrt(self._weight[slot])):
-            return None
-        if not np.all(self._weight[slot]):
-            return None
-        self._due[slot] = period + RETRY
-        bits = "".join("1" if s < 0 else "0" for s in self._sum[slot])
-        return decode_ring(int(bits, 2), code)

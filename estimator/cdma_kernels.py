@@ -1,4 +1,4 @@
-"""The loops of the light decoder that run over samples. All arrays are the caller's; nothing is allocated."""
+"""The loops of the light decoder that run over samples. Large arrays are the caller's."""
 
 from __future__ import annotations
 
@@ -48,6 +48,10 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
             while n < n_samples and x[n] < limit:
                 u = max(phase + rate * x[n], 0.0)
                 k = min(np.uint64(u), np.uint64(length - 1))  # unsigned: no test for indices from the end
+                if sign == 0.0 and (k > 0 or before == 0.0):
+                    value[n] = slope[n] = 0.0
+                    n += 1
+                    continue
                 at = (u - k) * steps
                 j = np.uint64(at + 0.5)
                 own = code[k] * sign
@@ -62,19 +66,66 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
     return bounds
 
 
-@kernel("void(f8[:,::1], i8, f8[:,::1])")
-def gram(rows: F8, free: int, out: F8) -> None:
+@kernel("void(f8[:,:,::1], i8[:,::1], i8[:,::1], f8[:,::1], f8[::1], i8, i8[:,::1], f8[:,::1])")
+def cut(waves: F8, bounds: I8, index: I8, data: F8, drive: F8, tail: int, extent: I8, out: F8) -> None:
+    """Cut waveforms into one row per lamp and code period touched, each with the tail that reaches beyond its end.
+
+    Args:
+        waves: (2, 2 * L, N) of :func:`columns` without data signs: even periods of all lamps, then odd periods.
+        bounds: (L, P + 1) of the same.
+        index: (2, K) lamp and period of each row.
+        data: (2, N) what was received, and time.
+        drive: (L,) amplitude of lamps whose sign is certain from correlation alone; 0 for the others.
+        tail: samples by which a period outlasts itself.
+        extent: (2, K) first sample of each row and the one behind its last.
+        out: (K + 2, N) the rows; then the derivative of all driven lamps together, and that times time.
+    """
+    n_lamps, n_samples, last = bounds.shape[0], waves.shape[2], index.shape[1]
+    mixed = out[last]
+    mixed[:] = 0.0
+    for r in range(last):
+        i, p = index[0, r], index[1, r]
+        low, high = bounds[i, p], min(bounds[i, p + 1] + tail, n_samples)
+        value, slope = waves[0, (p % 2) * n_lamps + i], waves[1, (p % 2) * n_lamps + i]
+        row = out[r]
+        row[:low] = 0.0
+        row[high:] = 0.0
+        total = 0.0
+        for k in range(low, high):
+            row[k] = value[k]
+            total += value[k] * data[0, k]
+        extent[0, r], extent[1, r] = low, high
+        if drive[i] > 0.0:
+            weight = drive[i] if total >= 0.0 else -drive[i]
+            for k in range(low, high):
+                mixed[k] += weight * slope[k]
+    for k in range(n_samples):
+        out[last + 1, k] = mixed[k] * data[1, k]
+
+
+@kernel("void(f8[:,::1], i8[:,::1], i8, f8[:,::1])")
+def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
     """Inner products of all M rows with the first ``free`` rows, in tiles of 2 x 4; ``out`` is (M, free).
 
     Not left to BLAS: its threads would fight with the daemon's for two cores and can take 50 times as long.
+
+    Args:
+        rows: (M, N).
+        extent: (2, M) first sample of each row that may not be zero, and the one behind the last.
+        free: how many rows to multiply with.
+        out: (M, free).
     """
     last = rows.shape[0] - 1
+    low, high = extent[0], extent[1]
     for i in range(0, last + 1, 2):
         i1 = min(i + 1, last)
-        a0, a1 = rows[i], rows[i1]
         for j in range(0, min(i1 + 1, free), 4):
             j1, j2, j3 = min(j + 1, last), min(j + 2, last), min(j + 3, last)
-            b0, b1, b2, b3 = rows[j], rows[j1], rows[j2], rows[j3]
+            begin = max(min(low[i], low[i1]), min(min(low[j], low[j1]), min(low[j2], low[j3])))
+            end = min(max(high[i], high[i1]), max(max(high[j], high[j1]), max(high[j2], high[j3])))
+            end = max(begin, end)
+            a0, a1 = rows[i, begin:end], rows[i1, begin:end]
+            b0, b1, b2, b3 = rows[j, begin:end], rows[j1, begin:end], rows[j2, begin:end], rows[j3, begin:end]
             s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
             t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
             for n in range(a0.shape[0]):
@@ -96,6 +147,43 @@ def gram(rows: F8, free: int, out: F8) -> None:
     for i in range(free):
         for j in range(i):
             out[j, i] = out[i, j]
+
+
+@kernel("void(f8[:,::1], i8, f8[:,::1])")
+def gram(rows: F8, free: int, out: F8) -> None:
+    """Inner products of all M rows, none of them known to be short, with the first ``free`` rows."""
+    extent = np.zeros((2, rows.shape[0]), np.int64)
+    extent[1] = rows.shape[1]
+    gram_within(rows, extent, free, out)
+
+
+@kernel("f8[::1](f8[:,::1], f8[::1])")
+def inner(rows: F8, row: F8) -> F8:
+    """(M,) inner products of (M, N) rows with one row."""
+    out = np.empty(rows.shape[0])
+    for i in range(rows.shape[0]):
+        a, total = rows[i], 0.0
+        for n in range(a.shape[0]):
+            total += a[n] * row[n]
+        out[i] = total
+    return out
+
+
+@kernel("f8[::1](f8[::1], f8[:,::1])")
+def mixed(weights: F8, rows: F8) -> F8:
+    """(N,) sum of (M, N) rows, each times its weight."""
+    out = np.zeros(rows.shape[1])
+    count = rows.shape[0]
+    for i in range(0, count - 3, 4):
+        a, b, c, d = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
+        wa, wb, wc, wd = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
+        for n in range(out.shape[0]):
+            out[n] += (wa * a[n] + wb * b[n]) + (wc * c[n] + wd * d[n])
+    for i in range(count - count % 4, count):
+        a = rows[i]
+        for n in range(out.shape[0]):
+            out[n] += weights[i] * a[n]
+    return out
 
 
 @kernel("void(f8[:,::1])")
@@ -152,3 +240,55 @@ def detect(correlation: F4, n_samples: int, period: float, sums: F4, out: F8) ->
             if sums[k] > sums[best]:
                 best = k
         out[c, 0], out[c, 1], out[c, 2], out[c, 3] = best - 1, sums[best], sums[best - 1], sums[best + 1]
+
+
+@kernel("void(f4[:,::1], f8[:,::1], i8, f8, f8[::1])")
+def align(correlation: F4, lamps: F8, n_samples: int, period: float, score: F8) -> None:
+    """How well lamps together fit a common shift, in half samples from ``-(S // 2)``: sum of |correlation|.
+
+    Args:
+        correlation: (L, F) of the block with one period of each lamp's code, as for :func:`detect`.
+        lamps: (2, L) sample at which a code period of each lamp should begin, within [0, period); weight.
+        n_samples: of the block.
+        period: samples per code period.
+        score: (S,) for each shift towards earlier samples.
+    """
+    size, middle = correlation.shape[1], score.shape[0] // 2
+    for s in range(score.shape[0]):
+        total = 0.0
+        for i in range(correlation.shape[0]):
+            where = lamps[0, i] - 0.5 * (s - middle)
+            where -= period * math.ceil(where / period)  # the last that begins before the block, or with it
+            while where < n_samples:
+                low = math.floor(where)
+                share, at = where - low, (low + size) % size
+                value = (1.0 - share) * correlation[i, at] + share * correlation[i, (at + 1) % size]
+                total += lamps[1, i] * abs(value)
+                where += period
+        score[s] = total
+
+
+@kernel("void(i8[::1], i8[::1], f8[:,::1], f8[:,::1], f8, f8[:,:,::1], i8[:,::1])")
+def fold(slots: I8, period: I8, soft: F8, variance: F8, fade: float, rings: F8, last: I8) -> None:
+    """Add soft bits to those of the same place in the frame.
+
+    Args:
+        slots: (L,) rows of the rings.
+        period: (L,) running number of the first code period touched.
+        soft: (L, P) amplitude times sign of each period touched.
+        variance: (L, P), inf where not touched.
+        fade: weight of what an earlier repetition said.
+        rings: (2, capacity, bits) sum of soft / variance, and of 1 / variance.
+        last: (capacity, bits) running number of the period last added to each place.
+    """
+    bits = last.shape[1]
+    for i in range(slots.shape[0]):
+        row = slots[i]
+        for p in range(soft.shape[1]):
+            if variance[i, p] < np.inf:
+                index = period[i] + p
+                at = index % bits
+                keep = 1.0 if last[row, at] == index else fade
+                rings[0, row, at] = keep * rings[0, row, at] + soft[i, p] / variance[i, p]
+                rings[1, row, at] = keep * rings[1, row, at] + 1.0 / variance[i, p]
+                last[row, at] = index

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma_kernels import gram
+from estimator.cdma_kernels import gram, inner
 
 Array = npt.NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class Mains:
 
     def learn(self, y: Array) -> None:
         """Follow the flicker of an undisturbed block, for the next one."""
-        self._follow(np.einsum("ij,j->i", self.rows(y), y), GAIN, JUMP)
+        self._follow(inner(self.rows(y), y), GAIN, JUMP)
 
     def masked(self, times: Array, mask: Array) -> Array:
         """Orthonormal rows for a block with samples left out or a bent time base; ``times`` in samples."""
@@ -109,7 +109,7 @@ class Mains:
         for hertz in FUNDAMENTALS_HZ:
             self._frequency = self._nominal = hertz / self._rate
             for _ in range(3):
-                self._follow(np.einsum("ij,j->i", self._fresh(len(y)), y), 1.0, PULL)
-            left = np.einsum("ij,j->i", self._fresh(len(y)), y)
+                self._follow(inner(self._fresh(len(y)), y), 1.0, PULL)
+            left = inner(self._fresh(len(y)), y)
             tried.append((float(y @ y - left @ left), self._frequency, self._nominal))
         _, self._frequency, self._nominal = min(tried)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Fit, Prior, Sampled
-from estimator.cdma_kernels import columns, gram, invert
+from estimator.cdma_kernels import columns, cut, gram, gram_within, inner, invert, mixed
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -23,6 +23,9 @@ LEADER: Final = 0.4
 
 SURE: Final = 4.0
 """A data sign is certain when it is so many standard deviations clear."""
+
+ALIKE: Final = 0.1
+"""Relative change of a lamp's strength within a block that surprises nobody."""
 
 LONG_PIECE: Final = 0.25
 """A code period of which the block holds at least this share gets its likelier sign in any case."""
@@ -67,24 +70,20 @@ class Signs:
 
 def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     """Solve for the amplitude of each lamp in each code period touched, at the phases of the prior."""
-    waves, bounds, place, leads = _waves(block, prior, table)
+    waves, bounds = _waves(block, prior, table)
     size = np.diff(bounds, axis=1)
-    lamp, period = np.nonzero(size)
-    k, n, clean = len(lamp), len(block.x), block.clean
-    tail = int(2.0 / (block.x[1] - block.x[0]))
+    touched = size > 0
+    touched[:, 0] = True  # if by nothing else, by the tail of its last chip
+    period, lamp = np.nonzero(touched.T)  # in order of time: neighbours in the Gram matrix cover the same samples
+    k, n = len(lamp), len(block.x)
     stack = stacked(block, k + 2)
-    stack[: k + 1] = 0.0
-    for row, (i, p) in enumerate(zip(lamp.tolist(), period.tolist(), strict=True)):
-        if leads[i]:
-            piece, wave = slice(bounds[i, p], bounds[i, p + 1] + tail), place[i, p % 2]
-            stack[row, piece] = waves[0, wave, piece]
-            sign = np.sign(np.einsum("i,i->", waves[0, wave, piece], clean[piece]))
-            stack[k, piece] += sign * prior.amplitude[i] * waves[1, wave, piece]
-        else:
-            piece = slice(bounds[i, p], bounds[i, p + 1])
-            stack[row, piece] = waves[0, place[i, 0], piece]
-    stack[k + 1] = stack[k] * block.x
-    normal, right, power = reduced(stack, k + 2)
+    extent = np.zeros((2, len(stack)), np.int64)
+    extent[1] = n
+    drive = np.where(prior.amplitude > LEADER * np.max(prior.amplitude), prior.amplitude, 0.0)
+    tail = int(2.0 / (block.x[1] - block.x[0]))
+    data, index = np.stack([block.clean, block.x]), np.stack([lamp, period])
+    cut(waves, bounds, index, data, drive, tail, extent, stack)
+    normal, right, power = reduced(stack, k + 2, extent)
     normal[range(k), range(k)] += 1e-3  # a thousandth of a sample's worth: pieces of one sample
     normal[k, k] *= 1.001
     normal[k + 1, k + 1] *= 1.001
@@ -94,25 +93,21 @@ def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     return Pieces(lamp, period, size, stack[: k + 2], found, np.maximum(normal.diagonal()[:k], 1e-12), noise_var)
 
 
-def _waves(block: Sampled, prior: Prior, table: Array) -> tuple[Array, Index, Index, npt.NDArray[np.bool_]]:
-    """Waveforms without data signs, bounds (L, P + 1), rows of each lamp's even and odd periods (L, 2), and who leads.
+def _waves(block: Sampled, prior: Prior, table: Array) -> tuple[Array, Index]:
+    """Waveforms (2, 2 * L, N) without data signs, of even periods and then of odd ones, and bounds (L, P + 1).
 
-    A chip's tail reaches into the next code period, with the sign of its own; where the sign changes that is a fifth of
-    a weak lamp's light. So the leaders' odd periods are computed without the even ones and the other way round.
+    A chip's tail reaches into the next code period with the sign of its own, hence one without the other.
     """
     n_lamps, length = prior.chips.shape
-    touched = int((block.x[-1] - block.x[0]) / length) + 3  # one spare for corrections of the clock
-    leads: npt.NDArray[np.bool_] = prior.amplitude > LEADER * np.max(prior.amplitude)
-    first, second = np.arange(n_lamps), np.arange(n_lamps)
-    second[leads] = n_lamps + np.arange(np.count_nonzero(leads))
-    order = np.append(first, np.flatnonzero(leads))
-    signs = np.ones((len(order), touched))
-    signs[np.flatnonzero(leads), 1::2] = 0.0
-    signs[n_lamps:, ::2] = 0.0
-    waves = np.empty((2, len(order), len(block.x)))
-    lamps = np.ascontiguousarray(prior.lamps()[:, order])
-    bounds = columns(prior.chips[order], lamps, block.samples, signs, table, waves)
-    return waves, bounds[:n_lamps], np.stack([first, second], axis=1), leads
+    touched = (
+        int((block.x[-1] - block.x[0]) / length) + 4
+    )  # a tail in front, and one spare for corrections of the clock
+    signs = np.zeros((2 * n_lamps, touched))
+    signs[:n_lamps, ::2] = 1.0
+    signs[n_lamps:, 1::2] = 1.0
+    waves = np.empty((2, 2 * n_lamps, len(block.x)))
+    chips, lamps = np.concatenate([prior.chips, prior.chips]), np.tile(prior.lamps(), 2)
+    return waves, columns(chips, lamps, block.samples, signs, table, waves)[:n_lamps]
 
 
 def stacked(block: Sampled, free: int) -> Array:
@@ -123,15 +118,20 @@ def stacked(block: Sampled, free: int) -> Array:
     return stack
 
 
-def reduced(stack: Array, free: int) -> tuple[Array, Array, float]:
+def reduced(stack: Array, free: int, extent: Index | None = None) -> tuple[Array, Array, float]:
     """Normal matrix and right side of the first ``free`` rows with the mains rows eliminated; power of y likewise.
 
-    ``stack``: unknowns' rows, then the orthonormal mains rows, then y.
+    Args:
+        stack: unknowns' rows, then the orthonormal mains rows, then y.
+        free: number of unknowns.
+        extent: (2, M) where rows are not zero; None: everywhere.
     """
     out = np.empty((len(stack), free))
-    gram(stack, free, out)
-    inside = np.ascontiguousarray(out[free:-1].T)
-    y_inside = np.einsum("ij,j->i", stack[free:-1], stack[-1])
+    if extent is None:
+        gram(stack, free, out)
+    else:
+        gram_within(stack, extent, free, out)
+    inside, y_inside = np.ascontiguousarray(out[free:-1].T), inner(stack[free:-1], stack[-1])
     overlap = np.empty((free, free))
     gram(inside, free, overlap)
     power = np.einsum("i,i->", stack[-1], stack[-1]) - np.einsum("i,i->", y_inside, y_inside)
@@ -141,7 +141,7 @@ def reduced(stack: Array, free: int) -> tuple[Array, Array, float]:
 def without(block: Sampled, prior: Prior, table: Array) -> Array:
     """What is left of a block when these lamps are taken out near these phases; (N,), mains taken out as well."""
     pieces = solve_pieces(block, prior, table)
-    return block.project(block.y - np.einsum("i,ij->j", pieces.found, pieces.rows))
+    return block.project(block.y - mixed(pieces.found, pieces.rows))
 
 
 def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
@@ -156,11 +156,27 @@ def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
     weight[:, 0] += prior.bit_weight
     whole = prior.chips.shape[1] * len(block.x) / (block.x[-1] - block.x[0])
     long = pieces.size > LONG_PIECE * whole
-    settled = (np.abs(total) > SURE * np.sqrt(weight)) | long | (pieces.size == 0)
+    settled = _settled(prior, soft, variance, long)
+    settled[:, 1:] |= pieces.size[:, 1:] == 0
     lag = float(np.clip(pieces.found[-2], -REACH, REACH))
     clock = float(np.clip(pieces.found[-1], -REACH / block.x[-1], REACH / block.x[-1]))
     signs = np.where(total < 0, -1.0, 1.0) * settled
     return Signs(signs, soft, variance, lag, clock, pieces.noise_var)
+
+
+def _settled(prior: Prior, soft: Array, variance: Array, long: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(L, P) periods whose sign is certain: by what the last block said, or by length.
+
+    A short piece must be both clear and as strong as the rest of its lamp: what disturbs a block's last samples must
+    not pass for a sign.
+    """
+    weight = np.where(long, 1.0 / variance, 0.0)
+    usual = np.sum(np.abs(soft) * weight, axis=1) / np.maximum(np.sum(weight, axis=1), 1e-30)
+    sigma, strength = np.sqrt(variance), np.abs(soft)
+    alike = np.abs(strength - usual[:, None]) < SURE * sigma + ALIKE * usual[:, None]
+    settled: npt.NDArray[np.bool_] = long | (alike & (strength > SURE * sigma))
+    settled[:, 0] |= np.abs(prior.bit_sum) > SURE * np.sqrt(prior.bit_weight)
+    return settled
 
 
 SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Prior, Sampled
-from estimator.cdma_kernels import columns, detect
+from estimator.cdma_kernels import align, columns, detect
 from estimator.cdma_pieces import without
 from estimator.cdma_profile import Profile
 from estimator.cdma_template import pulse_energy, pulse_table
@@ -193,20 +193,13 @@ class Search:
         self._prepare(codes, clock)
         correlation = self._correlation(self._cache[codes], _spectrum(y, self._size))
         period = self._profile.length * spc
-        shift = np.arange(-np.ceil(2 * window * spc) - 1, np.ceil(2 * window * spc) + 2) * 0.5
-        begin = (0.5 * (n - 1) - phase * spc) % period
-        at = begin[:, None] + np.arange(-1, int(n / period) + 2) * period
-        where = at[:, :, None] - shift
-        low = np.floor(where).astype(np.int64)
-        share = where - low
-        rows = np.arange(len(codes))[:, None, None]
-        value = (1 - share) * correlation[rows, low % self._size] + share * correlation[rows, (low + 1) % self._size]
-        inside = (where > -period) & (where < n)
-        score = np.einsum("i,ips->s", amplitude, np.abs(value) * inside)
-        best = int(np.clip(np.argmax(score), 1, len(shift) - 2))
+        half = int(np.ceil(2 * window * spc)) + 1
+        score = np.empty(2 * half + 1)
+        align(correlation, np.stack([(0.5 * (n - 1) - phase * spc) % period, amplitude]), n, period, score)
+        best = int(np.clip(np.argmax(score), 1, 2 * half - 1))
         bend = 2 * score[best] - score[best - 1] - score[best + 1]
         fine = 0.25 * (score[best + 1] - score[best - 1]) / max(bend, 1e-9)
-        return float(shift[best] + np.clip(fine, -0.25, 0.25)) / spc
+        return float(0.5 * (best - half) + np.clip(fine, -0.25, 0.25)) / spc
 
     def _fit_size(self, n: int) -> None:
         """FFT length for blocks of ``n`` samples; another length empties the kept spectra."""

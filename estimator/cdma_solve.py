@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Fit, Prior, Sampled
-from estimator.cdma_kernels import columns, invert
+from estimator.cdma_kernels import columns, invert, mixed
 from estimator.cdma_pieces import REACH, Signs, data_signs, reduced, stacked
 
 Array = npt.NDArray[np.float64]
@@ -62,7 +62,7 @@ class _Newton:
                 break
         weights = np.delete(theta, 2 * n)
         weights[n : 2 * n] = scale * (theta[n : 2 * n] + theta[2 * n])
-        residual = self.block.project(self.block.y - np.einsum("i,ij->j", weights, self.rows))
+        residual = self.block.project(self.block.y - mixed(weights, self.rows))
         return Fit(
             amplitude=self.amplitude,
             amplitude_var=variance[:n],
@@ -78,7 +78,7 @@ class _Newton:
             soft=self.first.soft,
             soft_var=self.first.soft_var,
             signs=self.first.signs,
-            mixed_slope=np.einsum("i,ij->j", self.amplitude, self.rows[n : 2 * n]),
+            mixed_slope=mixed(self.amplitude, self.rows[n : 2 * n]),
         )
 
     def _build(self) -> None:
@@ -89,10 +89,10 @@ class _Newton:
             x[at:] += chips
         samples, lamps = np.stack([x, block.mask]), prior.lamps(self.common[0] + self.phase)
         columns(prior.chips, lamps, samples, self.first.signs, self.table, self.rows[: 2 * n].reshape(2, n, len(x)))
-        mixed = np.einsum("i,ij->j", self.amplitude, self.rows[n : 2 * n])
-        self.rows[2 * n] = mixed * block.x
+        slope = mixed(self.amplitude, self.rows[n : 2 * n])
+        self.rows[2 * n] = slope * block.x
         for k, at in enumerate(block.steps):
-            self.rows[2 * n + 1 + k] = mixed
+            self.rows[2 * n + 1 + k] = slope
             self.rows[2 * n + 1 + k, :at] = 0.0
         lamp, period = self.loose
         if len(lamp):
@@ -140,9 +140,10 @@ class _Newton:
         own = np.clip(theta[n : 2 * n], -REACH, REACH)
         rest = np.clip(theta[2 * n : 2 * n + 2 + more], -REACH, REACH)
         rest[1] = np.clip(rest[1], -REACH / self.block.x[-1], REACH / self.block.x[-1])
-        moved = own + rest[0]
+        behind = 1.0 - np.array(self.block.steps, np.float64) / len(self.block.x)
+        moved = own + rest[0] + float(np.einsum("i,i->", behind, rest[2:]))
         strong = np.abs(theta[:n]) > 5.0 * sigma
-        self.amplitude = np.abs(theta[:n]) * (1.0 + self.bend * np.minimum(moved, 2 * SETTLED) ** 2)
+        self.amplitude = np.abs(theta[:n]) * (1.0 + self.bend * np.minimum(np.abs(moved), 2 * SETTLED) ** 2)
         self.phase = self.phase + own
         self.common = self.common + rest
         return float(max([*np.abs(moved[strong]), abs(rest[1]) * self.block.x[-1], *np.abs(rest[2:])]))

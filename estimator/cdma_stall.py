@@ -90,8 +90,12 @@ def judge(block: Sampled, fit: Fit, usual_noise: float) -> Verdict:
     rest = max(left - explained, 1e-12) / len(block.y)
     bent = explained / PARTS > BENT * rest and float(np.max(np.abs(overlap / energy))) > SMALLEST
     loud = usual_noise > 0.0 and fit.noise_var > (LOUD * usual_noise) ** 2
-    slow = _two_chips(fit.residual)
-    return Verdict(bent, loud, loud and float(np.einsum("i,i->", slow, slow)) > SMOOTH * left)
+    return Verdict(bent, loud, loud and _slow_energy(fit.residual) > SMOOTH * left)
+
+
+def _slow_energy(row: Array) -> float:
+    slow = _two_chips(row)
+    return float(np.einsum("i,i->", slow, slow))
 
 
 def _two_chips(row: Array) -> Array:

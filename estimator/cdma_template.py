@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Fit, Prior, Sampled
-from estimator.cdma_kernels import columns
+from estimator.cdma_kernels import columns, mixed
 from estimator.cdma_profile import Profile
 
 Array = npt.NDArray[np.float64]
@@ -97,7 +97,7 @@ class Shape:
         lamps = prior.lamps(fit.phase + fit.lag)
         lamps[1] *= 1.0 + fit.clock
         columns(prior.chips, lamps, block.samples, fit.signs, self._derivative, waves)
-        change = np.einsum("i,ij->j", fit.amplitude, waves[0])
+        change = mixed(fit.amplitude, waves[0])
         columns(prior.chips, lamps, block.samples, fit.signs, self.table, waves)
         seen = change = block.project(change)
         for wave in np.einsum("i,kij->kj", fit.amplitude, waves):  # amplitude and delay have been solved for

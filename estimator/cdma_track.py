@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Fit, Prior
-from estimator.cdma_frame import BitRings, LampFrame
+from estimator.cdma_frame import LampFrame
 from estimator.cdma_profile import Profile
+from estimator.cdma_rings import BitRings
 from estimator.codes import gold_codes
 
 Array = npt.NDArray[np.float64]
@@ -204,9 +205,12 @@ class Tracks:
         self.rings.forget(slot)
 
     def first_period(self, slots: Index, lag: float, span: float) -> Index:
-        """Running number of the code period of the first sample, which lies ``span`` chips before the middle."""
+        """Running number of the code period heard first in a block that begins ``span`` chips before the middle.
+
+        A period is still heard one chip after its end (its last chip's tail), with a data sign of its own.
+        """
         begin = self.phase[slots] + lag - (1.0 + self.rate[slots]) * span
-        return np.floor(begin / self.length).astype(np.int64)
+        return np.floor((begin - 1.0) / self.length).astype(np.int64)
 
     def prior(self, slots: Index, lag: float, lag_var: float, clock_var: float, span: float) -> Prior:
         """Prediction for a block whose middle is now."""

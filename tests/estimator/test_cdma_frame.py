@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimator.cdma_frame import FRAME_BITS, BitRings, LampFrame, crc16, decode_ring, encode
+from estimator.cdma_frame import FRAME_BITS, LampFrame, crc16, decode_ring, encode
+from estimator.cdma_rings import BitRings
 from tools.sim.light_transmitter import Lamp
 
 WHOLE = (1 << FRAME_BITS) - 1
@@ -94,9 +95,7 @@ def listen(rings: BitRings, soft: np.ndarray, sigma: float, first: int) -> list[
     found = []
     for k in range(len(soft) - 1):
         rings.add(np.array([2]), np.array([first + k]), soft[None, k : k + 2], sigma**2 / np.array([[0.4, 0.6]]))
-        frame = rings.frame(2, 77, first + k)
-        if frame is not None:
-            found.append((k, frame))
+        found += [(k, frame) for _, frame in rings.frames(np.array([2]), np.array([77]), np.array([first + k]))]
     return found
 
 
@@ -126,5 +125,5 @@ def test_a_forgotten_slot_knows_nothing() -> None:
     rings = BitRings(4)
     listen(rings, soft_bits(encode(FRAME, 77), 0, 2 * FRAME_BITS, 1.0, 0.05, 1), 0.05, 0)
     rings.forget(2)
-    assert rings.frame(2, 77, 10_000) is None
+    assert not rings.frames(np.array([2]), np.array([77]), np.array([10_000]))
     assert rings.before(np.array([2]), np.array([3]))[1] == 0.0

@@ -78,6 +78,71 @@ def test_gram_is_the_matrix_product(rows: int, free: int) -> None:
     np.testing.assert_allclose(out, data @ data[:free].T, atol=1e-12)
 
 
+def test_gram_of_rows_that_are_mostly_zero() -> None:
+    rng = np.random.default_rng(3)
+    data, extent = np.zeros((9, 40)), np.zeros((2, 9), np.int64)
+    for k, (low, high) in enumerate([(0, 9), (3, 3), (0, 40), (20, 31), (39, 40), (8, 21), (0, 1), (0, 40), (12, 30)]):
+        data[k, low:high] = rng.normal(size=high - low)
+        extent[:, k] = low, high
+    out = np.empty((9, 7))
+    cdma_kernels.gram_within(data, extent, 7, out)
+    np.testing.assert_allclose(out, data @ data[:7].T, atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 4, 6])
+def test_inner_and_mixed_are_products_with_a_vector(rows: int) -> None:
+    rng = np.random.default_rng(rows)
+    data, row, weights = rng.normal(size=(rows, 23)), rng.normal(size=23), rng.normal(size=rows)
+    np.testing.assert_allclose(cdma_kernels.inner(data, row), data @ row, atol=1e-12)
+    np.testing.assert_allclose(cdma_kernels.mixed(weights, data), weights @ data, atol=1e-12)
+
+
+def test_cut_puts_each_period_into_a_row_of_its_own() -> None:
+    rng, n = np.random.default_rng(4), 60
+    waves, bounds = rng.normal(size=(2, 4, n)), np.array([[0, 0, 33, 60], [0, 21, 58, 60]])
+    index = np.array([[0, 1, 0, 1, 0, 1], [0, 0, 1, 1, 2, 2]])
+    data, drive = rng.normal(size=(2, n)), np.array([3.0, 0.0])
+    extent, out = np.zeros((2, 6), np.int64), np.full((8, n), np.nan)
+    cdma_kernels.cut(waves, bounds, index, data, drive, 5, extent, out)
+    driven = np.zeros(n)
+    for row, i, p, low, high in zip(out, *index, *extent, strict=False):
+        expected = np.zeros(n)
+        piece = slice(bounds[i, p], min(bounds[i, p + 1] + 5, n))
+        expected[piece] = waves[0, 2 * (p % 2) + i, piece]
+        np.testing.assert_array_equal(row, expected)
+        assert (low, high) == (piece.start, piece.stop)
+        driven[piece] += drive[i] * np.sign(expected @ data[0]) * waves[1, 2 * (p % 2) + i, piece]
+    np.testing.assert_allclose(out[6], driven)
+    np.testing.assert_allclose(out[7], driven * data[1])
+
+
+def test_fold_weighs_what_was_said_before() -> None:
+    rings, last = np.zeros((2, 3, 10)), np.full((3, 10), -1)
+    soft, variance = np.array([[4.0, -6.0, 9.9]]), np.array([[2.0, 3.0, np.inf]])
+    cdma_kernels.fold(np.array([1]), np.array([19]), soft, variance, 0.5, rings, last)
+    cdma_kernels.fold(np.array([1]), np.array([20]), np.array([[1.0]]), np.array([[1.0]]), 0.5, rings, last)
+    cdma_kernels.fold(np.array([1]), np.array([29]), np.array([[1.0]]), np.array([[4.0]]), 0.5, rings, last)
+    np.testing.assert_allclose(rings[0, 1, [9, 0, 1]], [0.5 * 2.0 + 0.25, -2.0 + 1.0, 0.0])
+    np.testing.assert_allclose(rings[1, 1, [9, 0, 1]], [0.5 * 0.5 + 0.25, 1 / 3 + 1.0, 0.0])
+    assert not rings[:, [0, 2]].any()
+    assert last[1, [9, 0, 1]].tolist() == [29, 20, -1]
+
+
+def test_align_finds_the_shift_that_lamps_share() -> None:
+    period, n = 37.4, 90
+    correlation = np.zeros((2, 140), np.float32)
+    begin, shift = np.array([5.0, 30.0]), 1.5
+    for row, at in zip(correlation, begin - shift, strict=True):
+        for p in range(-1, 4):
+            where = at + p * period
+            if -period < where < n:
+                row[int(np.floor(where)) % 140] += 1.0 - where % 1.0
+                row[int(np.floor(where) + 1) % 140] += where % 1.0
+    score = np.empty(13)
+    cdma_kernels.align(correlation, np.stack([begin, np.array([2.0, 1.0])]), n, period, score)
+    assert 0.5 * (np.argmax(score) - 6) == shift
+
+
 def test_invert_and_what_it_does_to_a_dependent_unknown() -> None:
     data = np.random.default_rng(1).normal(size=(6, 20))
     matrix = data @ data.T

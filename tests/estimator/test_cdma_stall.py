@@ -50,10 +50,6 @@ def test_without_flicker_the_lamps_alone_tell() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=False,
-    reason="known defect: after a stall about one clean block in two thousand is flagged NOISY; no amplitude is wrong",
-)
 def test_a_thousand_stalled_blocks() -> None:
     for seed in range(5):
         run = Run(ceiling(60 + seed))
@@ -77,6 +73,17 @@ def test_undisturbed_blocks_are_not_flagged() -> None:
     run = Run(ceiling(7))
     run.settle(20)
     assert all(epoch.block == BlockFlag.NONE for _, epoch in run.blocks(100))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_thousand_undisturbed_blocks_are_not_flagged(seed: int) -> None:
+    """Code periods that begin or end with a block's first or last samples come once in a few hundred blocks."""
+    run = Run(ceiling(seed))
+    run.settle(30)
+    for _, epoch in run.blocks(2000):
+        assert epoch.block == BlockFlag.NONE
+        assert sorted(epoch.ids) == sorted(run.codes())
 
 
 def test_a_new_lamp_is_not_taken_for_a_stall() -> None:
