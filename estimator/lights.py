@@ -1,0 +1,301 @@
+"""The `lights` filter: odometry and lamps, never laser; pose, heading, and what the lamps and sensors are off by.
+
+    predict -> (start) -> name the lamps -> linearise -> gate -> absorb -> decide -> result
+
+It is the independent witness beside the laser and gives the paper's T_1 and virtual consistent components. Equations
+are in optics.py (1, 2, 7), ekf.py and ekf_links.py (5-7); docs/lights.md leads from one to the other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from estimator import ekf, ekf_links, lights_motion, se2
+from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
+from estimator.lamps import Survey
+from estimator.lights_absent import absent
+from estimator.lights_catalogue import catalogue_of
+from estimator.lights_links import Sight, judge, relearn, settled, sights, table, view_of
+from estimator.lights_start import begin, decide, headings, mixture, new_track, places
+from estimator.lights_state import Corrections, Lights, LightsSettings, Track
+from estimator.linear3 import invert3
+from estimator.records import Array, Imu, Odometry
+from estimator.result import Fix, LightsResult, Link, LinkState
+
+__all__ = ["Lights", "LightsSettings", "carry_to", "new_lights", "place", "predict", "reset", "result", "update"]
+
+HELD_S = 1.0
+"""After so long without a usable link the pose is said to be held."""
+LOST_S = 2.0
+LOST_SHARE = 0.5
+"""When more than this share of the links contradicts for so long, another place is looked for."""
+DRIFTED_M = 0.7
+"""A place less certain than that is not corrected but looked for anew: the equations are too bent there."""
+ITERATE_M, ITERATE_RAD = 0.03, 0.03
+ITERATIONS = 4
+LEVEL_S = 2.0
+LEVEL_DROP = 0.98
+
+
+def new_lights(
+    survey: Survey, settings: LightsSettings | None = None, corrections: Corrections | None = None
+) -> Lights:
+    """A filter that has seen nothing yet.
+
+    Args:
+        survey: lamps and receiver; without lamps in it, they have to describe themselves.
+        settings: one set for every building.
+        corrections: a residual map of this building, or None.
+
+    Raises:
+        ValueError: the survey is impossible.
+    """
+    return Lights(survey, settings or LightsSettings(), catalogue_of(survey), corrections=corrections)
+
+
+def predict(lights: Lights, record: Odometry | Imu) -> None:
+    """Move by odometry or gyro; a reading that is no number, or comes from the past, is passed over."""
+    if not (math.isfinite(record.t_begin) and math.isfinite(record.t_end)):
+        return
+    if isinstance(record, Odometry):
+        lights_motion.on_odometry(lights, record)
+    else:
+        lights_motion.on_imu(lights, record)
+
+
+def carry_to(lights: Lights, t_mono: float) -> None:
+    """Bring the pose to an instant at the present velocity; an instant in the past changes nothing."""
+    if math.isfinite(t_mono):
+        lights_motion.carry_to(lights, t_mono)
+
+
+def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
+    """Somebody says where the robot is: one hypothesis there, what is known of gains and sensors is kept.
+
+    Args:
+        lights: all of the filter.
+        T_map_base: (x, y, yaw).
+        covariance: 3x3; m^2, rad^2.
+    """
+    if not (np.isfinite(T_map_base).all() and np.isfinite(covariance).all()):
+        return
+    old = lights.tracks[0] if lights.tracks else None
+    keep_gains(lights)
+    lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old)]
+    lights.t_lost, lights.lost = math.inf, False
+
+
+def reset(lights: Lights) -> None:
+    """Forget the place and everything learned about lamps; those that described themselves stay known."""
+    lights.tracks, lights.gains, lights.absent = [], {}, {}
+    lights.t_lost, lights.lost, lights.level, lights.result = math.inf, False, None, None
+
+
+def update(lights: Lights, epoch: LightEpoch, level: float | None = None) -> LightsResult:
+    """Take an epoch of light in, on time or late (up to a second), and say what is known after it.
+
+    Args:
+        lights: all of the filter.
+        epoch: decoded light. One without a usable block brings no links.
+        level: photocurrent of the DC channel (A), where there is one: light that is taken away shows there too.
+    """
+    middle = 0.5 * (epoch.t_begin + epoch.t_end)
+    if not math.isfinite(middle):
+        return result(lights)
+    carry_to(lights, middle)
+    usable = not epoch.block & UNUSABLE and len(epoch.ids) > 0
+    seen: list[Sight] = []
+    gained, gained_by = np.zeros((3, 3)), np.zeros(3)
+    if usable:
+        drop = level_dropped(lights, level)
+        look_around(lights, epoch)
+        single = len(lights.tracks) == 1
+        before = (lights.tracks[0].x[:3].copy(), lights.tracks[0].P[:3, :3].copy()) if single else None
+        seen = take_in(lights, epoch, middle, drop)
+        if before is not None and lights.tracks:
+            gained, gained_by = gain(before, lights.tracks[0])
+        follow_up(lights, epoch, seen)
+    if not lights.tracks:
+        seen = sights(lights, epoch, 0.0, 0.0) if usable else []
+    lights.t_epoch = max(lights.t_epoch, epoch.t_end)
+    lights.result = describe(lights, [sight.link for sight in seen], epoch)
+    lights.result = replace(lights.result, gained=gained, gained_by=gained_by)
+    return lights.result
+
+
+def result(lights: Lights) -> LightsResult:
+    """What is known now: the latest links, the pose carried on since."""
+    if lights.result is None:
+        return describe(lights, [], None)
+    fresh = describe(lights, list(lights.result.links), None)
+    old = lights.result
+    return replace(fresh, accepted=old.accepted, block=old.block, clock_ppm=old.clock_ppm)
+
+
+def level_dropped(lights: Lights, level: float | None) -> bool:
+    """Whether the DC channel says that light was taken away just now."""
+    if level is None or not math.isfinite(level):
+        return False
+    mean = level if lights.level is None else lights.level
+    lights.level = mean + (level - mean) * min(1.0, 0.05 / LEVEL_S)
+    return level < LEVEL_DROP * mean
+
+
+def look_around(lights: Lights, epoch: LightEpoch) -> None:
+    """Start where there is no hypothesis; start again where the only one has become too vague."""
+    yaws, sigma = headings(lights.settings.headings)
+    if len(lights.tracks) == 1:
+        track = lights.tracks[0]
+        if math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0)) < DRIFTED_M:
+            return
+        if track.P[2, 2] < 0.35**2:
+            yaws, sigma = np.array((float(track.x[2]),)), math.sqrt(float(track.P[2, 2])) + 0.05
+    elif lights.tracks:
+        return
+    found = places(lights, epoch)
+    if found:
+        keep_gains(lights)
+        begin(lights, found, yaws, sigma)
+        lights.way_epoch = lights.course.way
+
+
+def keep_gains(lights: Lights) -> None:
+    """Remember the lamps' gains beyond the hypothesis that learned them, if it was worth believing."""
+    if len(lights.tracks) != 1 or not settled(lights.tracks[0]):
+        return
+    track = lights.tracks[0]
+    for lamp_id, slot in track.slots.items():
+        at, sigma = ekf.FIRST + 2 * slot, lights.catalogue.by_id[lamp_id].sigma_ln
+        lights.gains[lamp_id] = (float(track.x[at]), min(float(track.P[at, at]) + 0.03**2, sigma**2))
+
+
+def take_in(lights: Lights, epoch: LightEpoch, middle: float, drop: bool) -> list[Sight]:
+    """The epoch's links into every hypothesis; returns how the likeliest one sees them."""
+    back = lights_motion.back_to(lights, middle)
+    way, dt = lights.course.way - lights.way_epoch, middle - lights.t_epoch
+    lights.way_epoch = lights.course.way
+    views: list[tuple[Track, list[Sight]]] = []
+    for track in lights.tracks:
+        age(lights, track, way, dt)
+        seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
+        likelihood = absorb(lights, track, seen, view_of(lights, back), drop)
+        track.weight += likelihood if way > 0.0 else 0.0  # standing still, strengths say nothing of the heading
+        views.append((track, seen))
+    if len(lights.tracks) > 1:
+        decide(lights)
+    return next((seen for track, seen in views if lights.tracks and track is lights.tracks[0]), [])
+
+
+def age(lights: Lights, track: Track, way: float, dt: float) -> None:
+    """What was wrong with the model a while ago is something else here; gains wander; so do sensor errors."""
+    model, n = lights.settings.model, track.n
+    dt = min(max(dt, 0.0), 1e6) if math.isfinite(dt) else 0.0
+    keep, grow = np.ones(n), np.zeros(n)
+    fade = math.exp(-way / model.fade_m - dt / model.fade_s)
+    keep[ekf.FIRST + 1 : n : 2], grow[ekf.FIRST + 1 : n : 2] = fade, 1.0 - fade * fade
+    grow[ekf.FIRST : n : 2] = model.gain_m**2 * way
+    grow[ekf.COMMON], grow[ekf.FLOOR] = model.common_m**2 * way, model.floor_m**2 * way
+    grow[ekf.GYRO] = 1e-8 * min(dt, 10.0)
+    ekf.fade(track.x, track.P, n, keep, grow)
+
+
+def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, drop: bool) -> float:
+    """One hypothesis takes the links in; iterated while the step is so large that the equations bend."""
+    kept, links = table(lights, track, seen)
+    if not kept:
+        return 0.0
+    out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
+    ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
+    judge(lights, track, kept, out, drop)
+    x0, P0 = track.x.copy(), track.P.copy()
+    likelihood = ekf_links.absorb(track.x, track.P, track.n, x0, links, out)
+    around = x0
+    for _ in range(ITERATIONS):
+        step = track.x[:3] - around[:3]
+        if math.hypot(*step[:2].tolist()) < ITERATE_M and abs(se2.wrap(float(step[2]))) < ITERATE_RAD:
+            break
+        around, white = track.x.copy(), out[:, ekf_links.WHITE].copy()
+        ekf_links.linearise(around, P0, links, track.lamps, view, out)
+        out[:, ekf_links.WHITE] = white
+        track.x[:], track.P[:] = x0, P0
+        ekf_links.absorb(track.x, track.P, track.n, around, links, out)
+    return likelihood
+
+
+def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:
+    """Information that links added to the pose, and the correction they made; only the positive part of the former."""
+    x, P = before
+    more = invert3(np.ascontiguousarray(track.P[:3, :3])) - invert3(np.ascontiguousarray(P))
+    values, vectors = np.linalg.eigh(0.5 * (more + more.T))
+    step = track.x[:3] - x
+    step[2] = se2.wrap(float(step[2]))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T), step
+
+
+def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
+    """Note what was used; when most links contradict for long, look for another place that explains them better."""
+    if len(lights.tracks) != 1:
+        return
+    states = [sight.link.state for sight in seen]
+    used, against = (states.count(s) for s in (LinkState.ACCEPTED, LinkState.REJECTED))
+    against += states.count(LinkState.OCCLUDED)
+    now = lights.course.t_mono
+    if used:
+        lights.t_used = now
+    relearn(lights, lights.tracks[0])
+    if against <= LOST_SHARE * (used + against):
+        lights.t_lost = math.inf
+        return
+    lights.t_lost = min(lights.t_lost, now)
+    if now - lights.t_lost < LOST_S:
+        return
+    lights.t_lost = now
+    found = places(lights, epoch)
+    if found and found[0].fits >= used + 2:
+        keep_gains(lights)
+        begin(lights, found, *headings(lights.settings.headings))
+        lights.lost = True
+
+
+def describe(lights: Lights, links: list[Link], epoch: LightEpoch | None) -> LightsResult:
+    """Put the state into words."""
+    pose, P, floor = np.zeros(3), np.zeros((3, 3)), 0.0
+    if lights.tracks:
+        pose, P = mixture(lights.tracks)
+        floor = math.exp(float(lights.tracks[0].x[ekf.FLOOR]))
+    fix = fix_of(lights, P)
+    if fix is Fix.GOOD:
+        lights.lost = False
+    if epoch is not None:
+        links = absent(lights, links, pose, fix)
+    return LightsResult(
+        t_mono=lights.t_epoch,
+        fix=fix,
+        T_map_base=pose,
+        covariance=0.5 * (P + P.T),
+        links=tuple(links),
+        accepted=frozenset(k.lamp_id for k in links if k.state is LinkState.ACCEPTED and k.lamp_id is not None),
+        gained=np.zeros((3, 3)),
+        gained_by=np.zeros(3),
+        floor=floor,
+        block=epoch.block if epoch is not None else BlockFlag.NONE,
+        clock_ppm=epoch.clock_ppm if epoch is not None else None,
+        t_pose=lights.course.t_mono,
+    )
+
+
+def fix_of(lights: Lights, P: Array) -> Fix:
+    """How far the position has come."""
+    if not lights.tracks:
+        return Fix.NONE
+    spread = math.sqrt(max(float(P[0, 0] + P[1, 1]), 0.0))
+    if len(lights.tracks) > 1:
+        if lights.lost and lights.course.way == lights.way_start:
+            return Fix.LOST
+        return Fix.AMBIGUOUS if spread > 0.8 else Fix.STARTING
+    if lights.course.t_mono - lights.t_used > HELD_S:
+        return Fix.HELD
+    return Fix.GOOD if spread < 0.5 and P[2, 2] < 0.25**2 else Fix.STARTING

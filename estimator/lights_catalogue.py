@@ -1,0 +1,93 @@
+"""Which lamps there are: those of the survey, and those that described themselves in their data frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimator.cdma_frame import LampFrame
+from estimator.lamps import Lamp, Survey
+from estimator.optics import pack_lamps
+from estimator.records import Array
+
+CONTRADICTION_M = 0.3
+"""A lamp whose own word differs from the survey by more is another one, or was moved, or one of the two is wrong."""
+CONTRADICTION_LN = 0.25
+FRAME_SIGMA_LN = 0.15
+"""A lamp knows its rated power, not what is left of it."""
+
+
+def lamp_of(frame: LampFrame, code: int) -> Lamp:
+    """A lamp as it describes itself; where it does not tell its half angle, the usual one is taken."""
+    lamp = Lamp(frame.lamp_id, code, frame.x_m, frame.y_m, frame.z_m, sigma_ln=FRAME_SIGMA_LN)
+    order = lamp.order
+    if 1.0 <= frame.half_angle_deg < 90.0:
+        order = -math.log(2.0) / math.log(math.cos(math.radians(frame.half_angle_deg)))
+    power = frame.power_w if frame.power_w > 0.0 else lamp.power_w
+    return Lamp(lamp.lamp_id, code, lamp.x, lamp.y, lamp.z, power, order, sigma_ln=FRAME_SIGMA_LN)
+
+
+def contradicts(frame: LampFrame, code: int, lamp: Lamp) -> bool:
+    """Whether a lamp says something else of itself than the survey does."""
+    away = math.dist((frame.x_m, frame.y_m, frame.z_m), (lamp.x, lamp.y, lamp.z))
+    power = abs(math.log(frame.power_w / lamp.power_w)) if frame.power_w > 0.0 and lamp.power_w > 0.0 else 0.0
+    return code != lamp.code or away > CONTRADICTION_M or power > CONTRADICTION_LN + 3.0 * lamp.sigma_ln
+
+
+@dataclass(slots=True, eq=False)
+class Catalogue:
+    """Lamps by number and by code.
+
+    Attributes:
+        by_id, by_code: the lamps. surveyed: numbers of those that the survey names. rows: by number, for the kernels.
+    """
+
+    depth: float
+    by_id: dict[int, Lamp] = field(default_factory=dict)
+    by_code: dict[int, list[Lamp]] = field(default_factory=dict)
+    surveyed: set[int] = field(default_factory=set)
+    rows: dict[int, Array] = field(default_factory=dict)
+
+    def add(self, lamp: Lamp) -> None:
+        """Take a lamp in; one of the same number is replaced."""
+        old = self.by_id.get(lamp.lamp_id)
+        if old is not None:
+            self.by_code[old.code].remove(old)
+        self.by_id[lamp.lamp_id] = lamp
+        self.by_code.setdefault(lamp.code, []).append(lamp)
+        self.rows[lamp.lamp_id] = np.ascontiguousarray(pack_lamps([lamp], self.depth)[0])
+
+    def learn(self, frame: LampFrame, code: int) -> tuple[Lamp, bool]:
+        """The lamp that says this of itself, and whether the survey (which wins) knows it otherwise."""
+        known = self.by_id.get(frame.lamp_id)
+        if known is None or (frame.lamp_id not in self.surveyed and contradicts(frame, code, known)):
+            self.add(lamp_of(frame, code))
+            known = self.by_id[frame.lamp_id]
+        return known, frame.lamp_id in self.surveyed and contradicts(frame, code, known)
+
+    def candidates(self, code: int) -> list[Lamp]:
+        """All lamps of a code."""
+        return self.by_code.get(code, [])
+
+
+def catalogue_of(survey: Survey) -> Catalogue:
+    """The survey's lamps.
+
+    Raises:
+        ValueError: two lamps have one number.
+    """
+    catalogue = Catalogue(survey.depth)
+    for lamp in survey.lamps:
+        if lamp.lamp_id in catalogue.by_id:
+            raise ValueError(f"the survey has lamp {lamp.lamp_id} twice; lamp numbers must be unique in the building")
+        catalogue.add(lamp)
+        catalogue.surveyed.add(lamp.lamp_id)
+    return catalogue
+
+
+def near(lamps: Iterable[Lamp], x: float, y: float) -> list[Lamp]:
+    """Lamps by their horizontal distance from a point, nearest first."""
+    return sorted(lamps, key=lambda lamp: math.hypot(lamp.x - x, lamp.y - y))

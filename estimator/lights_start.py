@@ -1,0 +1,214 @@
+"""The start: places by maximum likelihood, a hypothesis for each with several headings, until motion has decided."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator import ekf, ekf_start, se2
+from estimator.cdma_epoch import LightEpoch
+from estimator.lamps import Lamp
+from estimator.lights_links import DIFFUSE, Sight, rim_amplitude, sights
+from estimator.lights_state import Lights, Track
+from estimator.optics import pack_lamps, pack_receiver
+from estimator.records import Array
+from estimator.result import LinkState
+
+LEAST = 3
+"""Links without which there is no start: two leave two places, and their gains are not known."""
+STEP_M = 0.35
+APART_M = 0.8
+"""Minima nearer to each other than that are one; the filter finds its bottom."""
+PLACES = 6
+RIVAL = 9.0
+"""A place whose cost is larger than the best one's by less than this is kept as a rival."""
+SEEDS = 3
+SIGMA_M = 0.4
+GIVEN_UP = 15.0
+"""A hypothesis whose ln probability is worse than the best one's by so much is dropped."""
+SAME_M, SAME_RAD = 0.15, 0.25
+REVERSE = 1.0
+"""What a hypothesis loses in ln probability with every epoch in which it drives backward without wheels that say so:
+strengths alone cannot tell a robot that drives from its mirror image that reverses."""
+MOVED_M = 0.3
+"""Way before which no heading is believed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the receiver can be: x, y (m), cost, common ln gain, and how many of how many links fit."""
+
+    x: float
+    y: float
+    cost: float
+    gain: float
+    fits: int
+    of: int
+
+
+def places(lights: Lights, epoch: LightEpoch) -> list[Place]:
+    """All places at which an epoch's direct links fit, best first; none when too few links are direct or fit."""
+    found: list[Place] = []
+    tried: set[tuple[int, ...]] = set()
+    for seed in seeds(lights, epoch):
+        used = direct(lights, epoch, seed)
+        key = tuple(sorted(sight.lamp.lamp_id for sight in used if sight.lamp is not None))
+        if len(used) < LEAST or key in tried:
+            continue
+        tried.add(key)
+        found += minima(lights, used)
+    good = sorted((p for p in found if p.fits >= LEAST and 2 * p.fits >= p.of), key=lambda p: p.cost)
+    kept: list[Place] = []
+    for place in good:
+        apart = all(math.hypot(place.x - k.x, place.y - k.y) > APART_M for k in kept)
+        if apart and place.cost < good[0].cost + RIVAL and len(kept) < PLACES:
+            kept.append(place)
+    return kept
+
+
+def seeds(lights: Lights, epoch: LightEpoch) -> list[Lamp]:
+    """Every lamp that one of the strongest links can come from."""
+    out: dict[int, Lamp] = {}
+    order = [i for i in np.argsort(-epoch.amplitude) if np.isfinite(epoch.amplitude[i])]
+    for i in order[:SEEDS]:
+        frame, code = epoch.lamps[i], int(epoch.ids[i])
+        lamps = [lights.catalogue.learn(frame, code)[0]] if frame is not None else lights.catalogue.candidates(code)
+        out.update({lamp.lamp_id: lamp for lamp in lamps})
+    return list(out.values())
+
+
+def direct(lights: Lights, epoch: LightEpoch, seed: Lamp) -> list[Sight]:
+    """The links that have come straight, each from the lamp it comes from if the receiver is near ``seed``."""
+    used = []
+    for sight in sights(lights, epoch, seed.x, seed.y):
+        if sight.lamp is None or sight.link.state is not LinkState.ACCEPTED:
+            continue
+        gain = lights.gains.get(sight.lamp.lamp_id, (0.0, 0.0))[0]
+        if sight.link.amplitude > DIFFUSE * math.exp(gain) * rim_amplitude(lights, sight.lamp):
+            used.append(sight)
+    return used
+
+
+def minima(lights: Lights, used: list[Sight]) -> list[Place]:
+    """The lowest places of a grid around the strongest lamp."""
+    lamps = [sight.lamp for sight in used if sight.lamp is not None]
+    table = pack_lamps(lamps, lights.survey.depth)
+    receiver = replace(lights.survey.receiver, x=0.0, y=0.0, slope_x=0.0, slope_y=0.0)
+    links = np.zeros((len(used), 2))
+    for i, (sight, lamp) in enumerate(zip(used, lamps, strict=True)):
+        gain, variance = lights.gains.get(lamp.lamp_id, (0.0, lamp.sigma_ln**2))
+        lean = math.hypot(lights.survey.receiver.slope_x, lights.survey.receiver.slope_y)
+        links[i] = math.log(sight.link.amplitude) - gain, variance + 0.06**2 + (1.5 * lean) ** 2
+    reach = (lamps[0].z - receiver.z) * math.tan(min(receiver.half_fov_rad, 1.3)) + STEP_M
+    poses = grid(lamps[0].x, lamps[0].y, max(reach, 1.0))
+    out = np.zeros((len(poses), 3))
+    ekf_start.search(table, pack_receiver(receiver), links, poses, lights.survey.floor, out)
+    found: list[Place] = []
+    for g in np.argsort(out[:, 0])[: len(poses) // 4]:
+        x, y = float(poses[g, 0]), float(poses[g, 1])
+        if all(math.hypot(x - p.x, y - p.y) > APART_M for p in found):
+            found.append(Place(x, y, float(out[g, 0]), float(out[g, 1]), int(out[g, 2]), len(used)))
+        if len(found) >= PLACES:
+            break
+    return found
+
+
+def grid(x: float, y: float, reach: float) -> Array:
+    """Poses in a circle around a point."""
+    axis = np.arange(-reach, reach + STEP_M, STEP_M)
+    u, v = np.meshgrid(axis, axis)
+    inside = np.hypot(u, v) <= reach
+    return np.ascontiguousarray(np.column_stack([x + u[inside], y + v[inside], np.zeros(int(inside.sum()))]))
+
+
+def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> None:
+    """Put up one hypothesis for every place and heading; what is known of gains and sensor errors is kept."""
+    old = lights.tracks[0] if lights.tracks else None
+    lights.tracks = []
+    for place in found:
+        for yaw in yaws.tolist():
+            rx = lights.survey.receiver
+            arm = se2.apply(np.array((0.0, 0.0, yaw)), np.array(((rx.x, rx.y),)))[0]
+            T = np.array((place.x - arm[0], place.y - arm[1], se2.wrap(yaw)))
+            track = new_track(lights, T, np.diag((SIGMA_M**2, SIGMA_M**2, sigma_yaw**2)), old)
+            track.weight = -0.5 * place.cost
+            lights.tracks.append(track)
+    lights.way_start = lights.course.way
+
+
+def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track | None) -> Track:
+    """A hypothesis at a pose, independent of everything else; motion errors and the floor as an old one knew them."""
+    track, motion, model = Track(), lights.settings.motion, lights.settings.model
+    track.x[:3], track.P[:3, :3] = T_map_base, covariance
+    if not lights.course.wheels:
+        begun = (motion.speed, motion.sideways, 0.5)
+        track.P[ekf.SPEED, ekf.SPEED], track.P[ekf.SIDE, ekf.SIDE], track.P[ekf.TURN, ekf.TURN] = (v**2 for v in begun)
+    variance = {
+        ekf.SCALE: motion.scale,
+        ekf.TURN_SCALE: motion.turn_scale,
+        ekf.CURVE: motion.curve,
+        ekf.GYRO: motion.gyro_bias,
+        ekf.COMMON: model.common,
+        ekf.FLOOR: model.floor_ln,
+        ekf.LEAN_X: model.tilt,
+        ekf.LEAN_Y: model.tilt,
+    }
+    track.x[ekf.FLOOR] = math.log(max(lights.survey.floor, 1e-4))
+    for j, sigma in variance.items():
+        track.P[j, j] = sigma**2
+        if old is not None:
+            track.x[j], track.P[j, j] = old.x[j], min(2.0 * float(old.P[j, j]) + (0.2 * sigma) ** 2, sigma**2)
+    return track
+
+
+def headings(count: int) -> tuple[Array, float]:
+    """Evenly spread headings and the sigma with which they cover the circle."""
+    return np.asarray(2.0 * math.pi / count * np.arange(count)), 0.5 * 2.0 * math.pi / count
+
+
+def decide(lights: Lights) -> None:
+    """Order hypotheses by probability, merge those that have met, drop the hopeless, end the start when one is left."""
+    if not lights.course.wheels:
+        for track in lights.tracks:
+            sigma = math.sqrt(max(float(track.P[ekf.SPEED, ekf.SPEED]), 0.0))
+            track.weight -= REVERSE * (track.x[ekf.SPEED] < -max(0.08, 2.0 * sigma))
+    lights.tracks.sort(key=lambda track: -track.weight)
+    kept: list[Track] = []
+    for track in lights.tracks:
+        if track.weight < lights.tracks[0].weight - GIVEN_UP:
+            break
+        twin = next((k for k in kept if same(k, track)), None)
+        if twin is None:
+            kept.append(track)
+        else:
+            twin.weight = float(np.logaddexp(twin.weight, track.weight))
+    chances = probabilities(kept)
+    driven = lights.course.way - lights.way_start > MOVED_M
+    if driven and chances[0] > lights.settings.decided and math.sqrt(kept[0].P[2, 2]) < 0.3:
+        kept = kept[:1]
+    lights.tracks = kept
+
+
+def same(a: Track, b: Track) -> bool:
+    """Whether two hypotheses have become one."""
+    near = math.hypot(*(a.x[:2] - b.x[:2]).tolist()) < SAME_M
+    return near and abs(se2.wrap(float(a.x[2] - b.x[2]))) < SAME_RAD and a.slots.keys() == b.slots.keys()
+
+
+def probabilities(tracks: list[Track]) -> Array:
+    """Of each hypothesis, summing to one."""
+    weights = np.array([track.weight for track in tracks])
+    chances = np.exp(weights - weights.max())
+    return np.asarray(chances / chances.sum())
+
+
+def mixture(tracks: list[Track]) -> tuple[Array, Array]:
+    """Pose of the likeliest hypothesis, and the covariance of all of them around it."""
+    best, P = tracks[0].x[:3].copy(), np.zeros((3, 3))
+    for track, chance in zip(tracks, probabilities(tracks).tolist(), strict=True):
+        off = track.x[:3] - best
+        off[2] = se2.wrap(float(off[2]))
+        P += chance * (track.P[:3, :3] + np.outer(off, off))
+    return best, P

@@ -1,0 +1,206 @@
+"""The `lights` filter as others use it: it starts, tracks, pauses, recovers, and says what it knows."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from estimator import lights as lf
+from estimator import se2
+from estimator.cdma_epoch import BlockFlag
+from estimator.lamps import Survey
+from estimator.records import Array, Imu
+from estimator.result import Fix, LightsResult, LinkState
+from tests.estimator.light_room import LAMPS, SURVEY, Room, circle, drive, wheels
+
+pytestmark = pytest.mark.jit
+
+
+def off(result: LightsResult, truth: Array) -> tuple[float, float]:
+    """Error in m and rad."""
+    x, y, yaw = (result.T_map_base - truth).tolist()
+    return math.hypot(x, y), abs(se2.wrap(yaw))
+
+
+def follow(filter_: lf.Lights, room: Room, seconds: float, start: float = 0.0) -> list[LightsResult]:
+    out = []
+    for _, odometry, epoch in drive(room, circle, seconds, start):
+        lf.predict(filter_, odometry)
+        out.append(lf.update(filter_, epoch))
+    return out
+
+
+def states(result: LightsResult) -> dict[int | None, LinkState]:
+    return {link.lamp_id: link.state for link in result.links}
+
+
+def test_nothing_is_known_before_the_first_epoch() -> None:
+    result = lf.result(lf.new_lights(SURVEY))
+    assert result.fix is Fix.NONE
+    assert result.links == ()
+    assert result.t_mono == -math.inf
+
+
+def test_it_starts_by_itself_and_finds_place_and_heading() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    results = follow(filter_, Room(), 10.0)
+    assert results[0].fix is Fix.STARTING
+    assert math.sqrt(results[0].covariance[2, 2]) > 1.0  # any heading
+    good = next(k for k, result in enumerate(results) if result.fix is Fix.GOOD)
+    assert good < 60
+    error, heading = off(results[-1], circle(10.0))
+    assert error < 0.04
+    assert heading < math.radians(3.0)
+    assert results[-1].accepted
+    assert results[-1].accepted <= {lamp.lamp_id for lamp in LAMPS}
+
+
+def test_standing_still_it_says_that_it_does_not_know_the_heading() -> None:
+    filter_, room = lf.new_lights(SURVEY), Room()
+    for k in range(200):
+        result = lf.update(filter_, room.epoch(0.1 * k, circle(0.0)))
+    assert result.fix is Fix.STARTING
+    assert math.sqrt(result.covariance[2, 2]) > 1.0
+
+
+def test_gains_of_lamps_are_learned() -> None:
+    dim = tuple(dataclasses.replace(lamp, power_w=1.2) if lamp.lamp_id == 6 else lamp for lamp in LAMPS)
+    filter_ = lf.new_lights(
+        dataclasses.replace(SURVEY, lamps=tuple(dataclasses.replace(k, sigma_ln=0.15) for k in LAMPS))
+    )
+    result = follow(filter_, Room(dim), 60.0)[-1]
+    gains = {link.lamp_id: link.gain for link in result.links}
+    others = [gain for lamp_id, gain in gains.items() if lamp_id not in (6, None)]
+    if 6 in gains:
+        assert gains[6] - float(np.median(others)) == pytest.approx(math.log(1.2 / 1.5), abs=0.05)
+    assert off(result, circle(60.0))[0] < 0.05
+
+
+def test_a_covered_lamp_is_paused_and_comes_back() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    room = Room(cover=lambda lamp, t: 0.2 if 12.0 < t < 16.0 and lamp in (10, 11) else 1.0)
+    results = follow(filter_, room, 20.0)
+    during = {states(result).get(lamp) for result in results[125:155] for lamp in (10, 11)}
+    assert LinkState.OCCLUDED in during
+    assert LinkState.ACCEPTED not in during
+    assert off(results[155], circle(15.6))[0] < 0.06
+    assert {states(result).get(11) for result in results[185:]} <= {LinkState.ACCEPTED, LinkState.RIM, None}
+
+
+def test_with_every_link_gone_the_pose_is_held_and_its_covariance_grows() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    results = follow(filter_, Room(cover=lambda _lamp, t: 1.0 if t < 10.0 else 0.0), 20.0)
+    assert results[95].fix is Fix.GOOD
+    assert results[-1].fix is Fix.HELD
+    assert results[-1].covariance[0, 0] > results[95].covariance[0, 0]
+    assert off(results[-1], circle(20.0))[0] < 0.3
+
+
+def test_carried_elsewhere_it_says_lost_and_finds_itself_again() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 10.0)
+    results = follow(filter_, Room(), 30.0, 15.0)  # 5 s of driving that no wheel has seen
+    assert Fix.LOST in {result.fix for result in results}
+    assert results[-1].fix is Fix.GOOD
+    assert off(results[-1], circle(45.0))[0] < 0.08
+
+
+def test_information_gained_is_what_the_covariance_lost() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 10.0)
+    lf.predict(filter_, wheels(circle, 10.1, 0.1))
+    before = lf.result(filter_)
+    after = lf.update(filter_, Room().epoch(10.1, circle(10.1)))
+    want = np.linalg.inv(after.covariance) - np.linalg.inv(before.covariance)
+    np.testing.assert_allclose(after.gained, want, rtol=0.05, atol=0.02 * np.abs(want).max())
+    assert np.linalg.eigvalsh(after.gained).min() > -1e-6
+    np.testing.assert_allclose(after.gained_by, after.T_map_base - before.T_map_base, atol=1e-12)
+
+
+def test_a_late_epoch_is_compared_with_where_the_robot_was() -> None:
+    on_time, late = lf.new_lights(SURVEY), lf.new_lights(SURVEY)
+    held = []
+    for _, odometry, epoch in drive(Room(), circle, 20.0):
+        lf.predict(on_time, odometry)
+        lf.predict(late, odometry)
+        a = lf.update(on_time, epoch)
+        held.append(epoch)
+        b = lf.update(late, held.pop(0)) if len(held) > 3 else lf.result(late)  # 0.3 s: 12 cm of way
+    assert off(a, circle(20.0))[0] < 0.03
+    assert off(b, circle(20.0))[0] < 0.03
+    assert b.t_mono < b.t_pose
+
+
+def test_without_odometry_it_follows_by_constant_velocity() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    errors = []
+    for k in range(1, 401):
+        t = 0.1 * k
+        result = lf.update(filter_, Room(seed=k).epoch(t, circle(t)))
+        errors.append(off(result, circle(t)))
+    assert result.fix is Fix.GOOD
+    assert np.median([e for e, _ in errors[200:]]) < 0.08
+    assert np.median([h for _, h in errors[200:]]) < math.radians(8.0)
+
+
+def test_a_gyro_gives_the_turn_and_its_bias_is_found() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    bias = 0.01
+    for t, odometry, epoch in drive(Room(), circle, 60.0):
+        for j in range(10):
+            a, b = t - 0.1 + 0.01 * j, t - 0.09 + 0.01 * j
+            turn = se2.wrap(float(circle(b)[2] - circle(a)[2]))
+            lf.predict(filter_, Imu(a, b, turn + bias * 0.01))
+        wrong = dataclasses.replace(odometry, delta=odometry.delta * np.array((1.0, 1.0, 0.7)))
+        lf.predict(filter_, wrong)
+        result = lf.update(filter_, epoch)
+    assert off(result, circle(60.0))[0] < 0.05
+    assert off(result, circle(60.0))[1] < math.radians(2.0)
+    assert filter_.tracks[0].x[lf.ekf.GYRO] == pytest.approx(bias, abs=0.004)
+
+
+def test_place_sets_the_pose() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    lf.place(filter_, circle(0.0), np.diag((0.1**2, 0.1**2, 0.1**2)))
+    assert off(lf.result(filter_), circle(0.0)) == (0.0, 0.0)
+    results = follow(filter_, Room(), 2.0)
+    assert results[-1].fix is Fix.GOOD
+    assert off(results[-1], circle(2.0))[0] < 0.06
+
+
+def test_reset_forgets_everything() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 5.0)
+    lf.reset(filter_)
+    assert lf.result(filter_).fix is Fix.NONE
+    assert lf.result(filter_).accepted == frozenset()
+
+
+def test_a_block_that_cannot_be_used_brings_no_links() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 5.0)
+    none = Room().epoch(5.1, circle(5.1), least=1.0)
+    result = lf.update(filter_, dataclasses.replace(none, block=BlockFlag.SATURATED))
+    assert result.links == ()
+    assert result.block is BlockFlag.SATURATED
+    np.testing.assert_array_equal(result.gained, 0.0)
+
+
+def test_numbers_that_are_none_change_nothing() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 6.0)
+    lf.predict(filter_, lf.Odometry(6.0, 6.1, np.array((math.nan, 0.0, 0.0))))
+    lf.predict(filter_, lf.Odometry(6.0, math.nan, np.zeros(3)))
+    lf.predict(filter_, Imu(6.0, 6.1, math.nan))
+    epoch = Room().epoch(6.1, circle(6.1))
+    epoch.amplitude[0], epoch.amplitude[1], epoch.variance[2] = math.nan, -1.0, math.nan
+    result = lf.update(filter_, epoch)
+    assert np.isfinite(result.T_map_base).all()
+    assert np.isfinite(result.covariance).all()
+    assert off(result, circle(6.1))[0] < 0.15
+
+
+def test_a_survey_with_one_number_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="lamp 1 twice"):
+        lf.new_lights(Survey((LAMPS[0], LAMPS[0])))
