@@ -19,9 +19,9 @@ GARBLED_BLOCKS: Final = 3
 """Blocks in a row that the chip cannot have sent, until the bus is opened anew and the chip looked at again."""
 REFRESH_S: Final = 30.0
 """How often a converter that says one word only, for no known reason, is started afresh."""
-DARK: Final = 0.02
+DARK: Final = 0.005
 DAZZLED: Final = 0.95
-"""Of the DC channel's full scale."""
+"""Of the DC channel's range between rest and saturation: 9 uA, some 60 lx, with the amplifier of docs/receiver.md."""
 
 Level = Callable[[], float | None]
 """Mean light as a fraction of the amplifier's full scale; None where it is not known."""

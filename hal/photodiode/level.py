@@ -35,6 +35,7 @@ class LevelInput:
     Attributes:
         chip: ADS1015 or ADS1115. address: 0x48 to 0x4B. channel: 0 to 3.
         full_scale_v: output of the saturated amplifier, V: what counts as level 1.
+        rest_v: its output without any light, V: level 0 (docs/receiver.md biases it to 0.1 V).
 
     Raises:
         ValueError: a field that cannot be.
@@ -44,6 +45,7 @@ class LevelInput:
     address: int = 0x48
     channel: int = 0
     full_scale_v: float = 3.3
+    rest_v: float = 0.1
 
     def __post_init__(self) -> None:
         if self.chip.upper() not in ads1x15.RATES:
@@ -54,6 +56,8 @@ class LevelInput:
             raise ValueError(f"DC channel {self.channel}: expected 0 to 3")
         if not 0.0 < self.full_scale_v <= ads1x15.RANGES_V[0]:
             raise ValueError(f"DC channel of {self.full_scale_v:g} V: expected up to {ads1x15.RANGES_V[0]:g} V")
+        if not 0.0 <= self.rest_v < self.full_scale_v:
+            raise ValueError(f"DC channel at rest at {self.rest_v:g} V: expected 0 to {self.full_scale_v:g} V")
 
 
 async def ask(bus: AsyncBus, address: int, query: Query) -> bytes | None:
@@ -125,5 +129,6 @@ class LevelMeter:
         if answer is None:
             return "does not answer"
         volts = ads1x15.fraction(answer) * self._wanted.full_scale_v
-        self._level, self._t_read = volts / self._where.full_scale_v, self._clock.now()
+        where = self._where
+        self._level, self._t_read = (volts - where.rest_v) / (where.full_scale_v - where.rest_v), self._clock.now()
         return ""

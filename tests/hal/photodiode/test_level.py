@@ -11,7 +11,7 @@ from hal.photodiode.driver import Sampling
 from hal.photodiode.level import LevelInput
 from tests.hal.photodiode.bench import Bench, on_fake
 
-DC = Sampling(level=LevelInput(full_scale_v=3.0))
+DC = Sampling(level=LevelInput(full_scale_v=3.0, rest_v=0.0))
 
 
 def with_level(bench: Bench, volts: float = 1.2, chip: str = "ADS1115") -> None:
@@ -27,6 +27,35 @@ def test_level_is_read_once_a_second_between_blocks(chip: str) -> None:
             blocks = await bench.more(60, 10.0, driver)
         assert driver.status.extra["dc_level"] == "40.0 %"
         assert not any(block.blemish for block in blocks)
+
+    on_fake(body)
+
+
+def test_level_counts_from_rest() -> None:
+    """0.1 V is no light: the amplifier's bias."""
+
+    async def body(bench: Bench) -> None:
+        with_level(bench, 1.7)
+        driver = bench.driver(Sampling(level=LevelInput()))
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+        assert driver.status.extra["dc_level"] == "50.0 %"
+
+    on_fake(body)
+
+
+def test_light_without_lamps_is_neither_dark_nor_dead() -> None:
+    """Daylight only: nothing flickers, the converter's own noise goes on."""
+
+    async def body(bench: Bench) -> None:
+        noise = np.random.default_rng(4)
+        bench.device._source = lambda t: 0.5 + 1.1e-4 * noise.standard_normal(t.size)
+        with_level(bench)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(60, 10.0, driver)
+            assert "there is light, but no lamp in it" in str(driver.status.error)
+            assert driver.status.recoveries == 0
 
     on_fake(body)
 
@@ -143,6 +172,8 @@ def test_another_chip_in_its_place(wrong: str) -> None:
         ({"channel": 4}, "expected 0 to 3"),
         ({"full_scale_v": 0.0}, "expected up to"),
         ({"full_scale_v": 7.0}, "expected up to"),
+        ({"rest_v": 3.3}, "at rest at 3.3 V"),
+        ({"rest_v": -0.1}, "at rest"),
     ],
 )
 def test_an_input_that_cannot_be(fields: dict[str, object], says: str) -> None:
