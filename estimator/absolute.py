@@ -15,28 +15,34 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from estimator import se2
 from estimator.linear3 import invert3
 from estimator.mapframe import move_map, shift_map
-from estimator.records import Array
+from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
 from estimator.state import State
 
 FRESH_M, FRESH_S = 0.7, 60.0
 """Way and time after which the error of the light model (walls, floor, lamps) is another one."""
 
-DRIFT = np.array((1e-4, 1e-4, 1.2e-5))
-"""Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of."""
+DRIFT = np.array((5e-5, 5e-5, 2e-6))
+"""Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of: some
+7 mm and 0.08 deg by the root of the way."""
 
+YOUNG, YOUNG_M = 8.0, 4.0
+"""A position from light that has just begun is surer of itself than it may be: its variance counts so many times more
+at the start, and that fades with the way driven (its equations bend while gains and heading are being found)."""
 SURPRISE_S = 1.0
 """Light that disagrees for longer than this is believed: nothing else knows where in the building the robot is."""
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 """What stamps and lever arms make of a moving robot."""
 
+SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
+"""Covariance of a pose that a person gives."""
 SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
 BLIND_S = 0.5
@@ -55,6 +61,7 @@ class Absolute:
         placed: light has told where the map lies. P, X: see above, both 3x3, odom-aligned axes.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
+        way, way_young: driven so far, and when light last began to find the place.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
         since: ID of the first keyframe laid after light and pose agreed for the last time.
         t_match: instant of the latest match. poses: T_odom_base of the last second, each with its instant.
@@ -65,6 +72,8 @@ class Absolute:
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
     gap: float | None = None
     odd_since: float | None = None
+    way: float = 0.0
+    way_young: float = 0.0
     fresh: float = 0.0
     since: int = 0
     t_match: float = -math.inf
@@ -82,6 +91,7 @@ def on_motion(state: State, T_before: Array, P_before: Array, t_before: float) -
     way, dt = math.hypot(x, y), moving.t_mono - t_before
     tie.P = F @ tie.P @ F.T + Q + np.diag(DRIFT * way)
     tie.X = F @ tie.X @ F.T + Q
+    tie.way += way
     tie.fresh = min(1.0, tie.fresh + way / FRESH_M + (dt / FRESH_S if math.isfinite(dt) else 0.0))
     tie.poses.append((moving.t_mono, moving.T_odom_base))
     while moving.t_mono - tie.poses[0][0] > MEMORY_S:
@@ -113,8 +123,11 @@ def on_lights(state: State, lights: LightsResult) -> None:
     tie = state.absolute
     assert tie is not None
     tie.gap = None
+    if lights.fix in (Fix.NONE, Fix.STARTING, Fix.LOST, Fix.AMBIGUOUS):
+        tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
+    lights = replace(lights, covariance=lights.covariance * youth(tie), gained=lights.gained / youth(tie))
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     R = se2.rotation(state.T_map_odom[2])
     P = R @ tie.P @ R.T
@@ -126,6 +139,21 @@ def on_lights(state: State, lights: LightsResult) -> None:
     elif lights.fix is Fix.GOOD and tie.odd_since is None:
         tie.since = state.next_key
         gain(state, lights, T_odom_base, off)
+
+
+def on_order(state: State, command: Command) -> None:
+    """What a person orders holds for light too: it looks about the given pose, or begins anew."""
+    tie, T_map_base = state.absolute, command.T_map_base
+    if tie is None or state.light is None:
+        return
+    if command.order is Order.RESET:
+        state.light.reset()
+        tie.placed, tie.gap, tie.odd_since, tie.since = False, None, None, 0
+    if T_map_base is not None and np.isfinite(T_map_base).all():
+        state.light.place(T_map_base, SAID)
+        R = se2.rotation(state.T_map_odom[2])
+        tie.P, tie.X = R.T @ SAID @ R, np.zeros((3, 3))
+        tie.placed, tie.gap, tie.odd_since, tie.fresh = True, None, None, 0.0
 
 
 def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
@@ -161,6 +189,11 @@ def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     move_map(state, T_map_odom)
     tie.P, tie.X = R.T @ lights.covariance @ R, np.zeros((3, 3))
     tie.placed, tie.odd_since, tie.fresh, tie.since = True, None, 0.0, state.next_key
+
+
+def youth(tie: Absolute) -> float:
+    """Factor on the variance of a position from light that has not been driven with for long."""
+    return 1.0 + YOUNG * math.exp((tie.way_young - tie.way) / YOUNG_M)
 
 
 def blind(state: State) -> bool:

@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from estimator import cdma
-from estimator.cdma_epoch import UNUSABLE, LightEpoch, LinkFlag, SampleBlock
+from estimator import cdma, lights
+from estimator.cdma_epoch import LightEpoch, SampleBlock
 from estimator.cdma_profile import PROFILE_A, Profile
 from estimator.lamps import Survey
-from estimator.records import Record
-from estimator.result import Fix, LightsResult, Link, LinkState
-
-NOTHING = LightsResult(
-    t_mono=-math.inf,
-    fix=Fix.NONE,
-    T_map_base=np.zeros(3),
-    covariance=np.zeros((3, 3)),
-    links=(),
-    accepted=frozenset(),
-    gained=np.zeros((3, 3)),
-    gained_by=np.zeros(3),
-)
-"""Before the first epoch."""
+from estimator.records import Array, Imu, Odometry, Record
+from estimator.result import LightsResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,38 +31,36 @@ class Light:
     """What is known from light, without the laser.
 
     Attributes:
-        setup: as given. decoder: of the photodiode's blocks. result: after the latest epoch.
+        setup: as given. decoder: of the photodiode's blocks. filter: see estimator/lights.py. result: after the latest
+            epoch.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
-        """Nothing seen yet; raises ValueError for a stored sample clock outside the profile's range."""
+        """Nothing seen yet; raises ValueError for a stored clock out of range or an impossible survey."""
         self.setup = setup
         self.decoder = cdma.new_decoder(setup.profile, setup.clock_ppm)
-        self.result = NOTHING
+        self.filter = lights.new_lights(setup.survey)
+        self.result = lights.result(self.filter)
 
     def predict(self, record: Record) -> None:
         """Move the `lights` filter with the robot; it never hears of the laser."""
+        if isinstance(record, Odometry | Imu):
+            lights.predict(self.filter, record)
 
     def take(self, record: SampleBlock | LightEpoch) -> LightsResult:
         """Decode a block, if it is one, and take the epoch into the filter."""
         epoch = cdma.decode(self.decoder, record) if isinstance(record, SampleBlock) else record
-        rows = zip(epoch.ids.tolist(), epoch.amplitude.tolist(), epoch.flags.tolist(), strict=True)
-        links = [Link(code, None, _state(flag), amplitude) for code, amplitude, flag in rows]
-        self.result = replace(
-            NOTHING,
-            t_mono=self.result.t_mono if epoch.block & UNUSABLE else epoch.t_end,
-            links=tuple(sorted(links, key=lambda link: -link.amplitude)),
-            block=epoch.block,
-            clock_ppm=epoch.clock_ppm,
-        )
+        self.result = lights.update(self.filter, epoch)
         return self.result
 
     def look_on(self, codes: int) -> None:
         """Go on looking for lamps that are not followed yet, as far as this cycle can afford."""
         cdma.search(self.decoder, codes)
 
+    def place(self, T_map_base: Array, covariance: Array) -> None:
+        """Somebody says where the robot is."""
+        lights.place(self.filter, T_map_base, covariance)
 
-def _state(flag: int) -> LinkState:
-    if flag & LinkFlag.FAINT:
-        return LinkState.FAINT
-    return LinkState.TWIN if flag & LinkFlag.TWIN else LinkState.UNSURVEYED
+    def reset(self) -> None:
+        """Forget the place and what was learned of the lamps."""
+        lights.reset(self.filter)

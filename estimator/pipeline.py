@@ -66,6 +66,7 @@ def predict(state: State, record: Record) -> None:
             motion.carry_to(state.fused, record.t_end, noise)
         case Command():
             obey(state, record)
+            absolute.on_order(state, record)
     absolute.on_motion(state, *before)
 
 
