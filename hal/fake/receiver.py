@@ -31,6 +31,8 @@ from hal.i2c_server import BusServer, say, until_told
 
 BUS = "simulated"
 DC_ADDRESS = 0x48
+DC_REST = 0.1 / 3.3
+"""What the amplifier's output is at without any light, of the supply."""
 
 
 @dataclass(slots=True)
@@ -61,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--address", type=_number, default=0x4D, help="of the converter (default 0x4d)")
     add("--adapter", default="designware", choices=sorted(ADAPTERS), help="how the bus is driven (default %(default)s)")
     add("--light", type=Path, metavar="FILE", help=".npz with fraction and rate_hz (default: lamps without codes)")
-    add("--dc", type=float, metavar="LEVEL", help="add an ADS1115 at 0x48 that measures this level, 0 to 1")
+    add("--dc", type=float, metavar="LEVEL", help="add an ADS1115 at 0x48 that sees this much light, 0 (dark) to 1 (saturated)")
     add("--scl-percent", type=float, default=0.0, help="how far SCL is off its nominal rate")
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
     add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
@@ -86,7 +88,7 @@ def _device(options: _Options) -> FakeAdc:
     device.bus.scl_error = 0.01 * options.scl_percent
     level = options.dc
     if level is not None:
-        device.add_level(lambda t: np.full_like(t, level), DC_ADDRESS)
+        device.add_level(lambda t: np.full_like(t, DC_REST + level * (1.0 - DC_REST)), DC_ADDRESS)
     return device
 
 
