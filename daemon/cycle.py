@@ -19,13 +19,14 @@ from daemon.bridge import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
 from daemon.budget import Budget
 from daemon.evidence import EARLY, Observer
 from daemon.inbox import Inbox, Taken
+from daemon.lampwatch import LampWatch
 from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot
 from daemon.state import REASONS, SILENT_PERIODS, Memory, judge
 from daemon.worker import Worker
-from estimator.records import Command, Limits, Order, Record
+from estimator.records import Command, LightEpoch, Limits, Order, Record, SampleBlock
 from estimator.result import StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
@@ -113,6 +114,7 @@ class Cycle:
     Attributes:
         cycles, overruns: so far. cycle_us: duration of the latest. failing: numbers of the sinks that raise.
         verdict: what is said about the pose. result: of the latest step.
+        blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -129,7 +131,8 @@ class Cycle:
         self._painter = Painter(parts.map_id)
         self.cycle_us: int | None = None
         self.failing: set[int] = set()
-        self._blocks = 0
+        self.blocks = 0
+        self.lamps = LampWatch()
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
@@ -141,6 +144,7 @@ class Cycle:
         records = (*answers, *taken.commands, *self._bridge(taken))
         stages.lap("bridge")
         limits = self._step(records, stages)
+        self._watch_lamps(t_mono, records, limits)
         verdict = self._judge(t_mono, records, None if limits is None else self.result)
         snapshot = self._painter.paint(self.result, verdict, self._facts(self.parts.clock.now()))
         stages.lap("judge")
@@ -199,7 +203,7 @@ class Cycle:
         if bridge is None or watch is None:
             return []
         records: list[Record] = []
-        self._blocks += len(samples)
+        self.blocks += len(samples)
         for raw in samples:
             if (block := bridge.block(raw)) is not None:
                 watch.on_block(raw)
@@ -238,6 +242,11 @@ class Cycle:
             self._painter.map_id = (self._painter.map_id + 1) % 2**32
         return limits
 
+    def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
+        if limits is not None and self.result is not None:
+            fresh = any(isinstance(record, SampleBlock | LightEpoch) for record in records)
+            self.lamps.on_step(t_mono, self.result.lights, fresh)
+
     def _judge(self, t_mono: float, records: tuple[Record, ...], fresh: StepResult | None) -> Memory:
         """What may be said about the pose; a change goes to the log."""
         evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
@@ -261,7 +270,7 @@ class Cycle:
             cycle_us=self.cycle_us,
             lidar_ok=alive,
             adc_ok=None if parts.blocks is None else parts.blocks.ok(t_mono),
-            blocks=self._blocks,
+            blocks=self.blocks,
             blocks_lost=self.blocks_lost(),
             odometry_ok=self.observer.odometry_ok(t_mono),
             fault=parts.fault(),

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
+from hal.adc import BusStuck, ChipMissing, Clipping, Dark, Dazzled, NoSignal, WrongChip
+from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.lidar import Link
 
 
@@ -21,6 +22,26 @@ class Fault(IntEnum):
     LIDAR_SILENT = 104
     LIDAR_GARBLED = 105
     LIDAR_GAPS = 106
+    ADC_BUS_MISSING = 151
+    ADC_BUS_REFUSED = 152
+    ADC_MISSING = 153
+    ADC_WRONG = 154
+    ADC_BUS_STUCK = 155
+    ADC_BUS_FAULTY = 156
+    ADC_SILENT = 157
+    ADC_GARBLED = 158
+    NO_SIGNAL = 159
+    DARK = 160
+    DAZZLED = 161
+    CLIPPED = 162
+    ADC_RATE = 163
+    ADC_STALLS = 164
+    ADC_GAPS = 165
+    NO_LAMPS = 171
+    SURVEY_CONTRADICTED = 172
+    TWIN_LAMPS = 173
+    LAMP_MOVED = 174
+    LAMP_DEAD = 175
     ODOMETRY_SILENT = 201
     ODOMETRY_JUMPS = 202
     ODOMETRY_DISAGREES = 203
@@ -42,6 +63,68 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.LIDAR_SILENT: ("the lidar is connected and sends no valid scan", "power it off and on; check the cable"),
     Fault.LIDAR_GARBLED: ("more than 5 % of the lidar's frames are damaged", "check cable, shielding and USB hub"),
     Fault.LIDAR_GAPS: ("more than 2 % of the lidar's scans are missing", "check the computer's load and the line rate"),
+    Fault.ADC_BUS_MISSING: (
+        "the photodiode's I2C bus is not there",
+        "check `photodiode.bus`; is I2C enabled, is the adapter plugged in, does the bus server run?",
+    ),
+    Fault.ADC_BUS_REFUSED: (
+        "the photodiode's I2C bus may not be used, or cannot do what is needed",
+        "join the group i2c, unbind what else uses the converter, or use an I2C controller of the processor",
+    ),
+    Fault.ADC_MISSING: (
+        "no converter answers on the photodiode's bus",
+        "check its power and wiring, and `photodiode.converter`; run `lumiloop probe`",
+    ),
+    Fault.ADC_WRONG: ("another chip answers than `photodiode.converter` says", "run `lumiloop probe`, correct the key"),
+    Fault.ADC_BUS_STUCK: (
+        "the photodiode's bus hangs",
+        "switch the converter's power off and on; look for SDA or SCL held low",
+    ),
+    Fault.ADC_BUS_FAULTY: (
+        "reads of the photodiode's converter fail",
+        "check wiring, pull-ups and cable length; read the log",
+    ),
+    Fault.ADC_SILENT: ("the photodiode's converter is connected and delivers nothing", "read the log"),
+    Fault.ADC_GARBLED: (
+        "the converter's words are damaged, or another kind of chip sends them",
+        "check `photodiode.converter`, wiring and pull-ups",
+    ),
+    Fault.NO_SIGNAL: (
+        "the photodiode gives no signal: dark, dazzled, or a dead converter",
+        "look for a cover, for lamps off, for glaring light; a DC channel (`photodiode.level`) would tell which",
+    ),
+    Fault.DARK: ("no light reaches the photodiode", "look for a cover, a broken cable, lamps off"),
+    Fault.DAZZLED: ("the photodiode's amplifier is saturated", "shade the photodiode or lower the gain"),
+    Fault.CLIPPED: (
+        "more than a fifth of the samples are at the rails",
+        "too much modulated or flickering light: shade the photodiode or lower the gain",
+    ),
+    Fault.ADC_RATE: (
+        "the converter is not clocked as the air interface needs it",
+        "set SCL to 18 times the sample rate of `photodiode.profile`: 400 kHz for A",
+    ),
+    Fault.ADC_STALLS: (
+        "the bus stands still inside many blocks of samples",
+        "take load off the computer, or serve the bus from a process of its own: python -m hal.i2c_server",
+    ),
+    Fault.ADC_GAPS: ("more than 2 % of the blocks of samples are lost", "take load off the computer"),
+    Fault.NO_LAMPS: (
+        "there is light, and no lamp in it can be decoded",
+        "are coded lamps on and in view? `photodiode.profile` must be that of the lamps",
+    ),
+    Fault.SURVEY_CONTRADICTED: (
+        "what is received does not fit the survey",
+        "is `lights.survey` that of this building? calibrate anew: lumiloop calibrate",
+    ),
+    Fault.TWIN_LAMPS: (
+        "two lamps with one code are in view",
+        "give one of them another code; read the links: lumiloop status",
+    ),
+    Fault.LAMP_MOVED: (
+        "a lamp does not shine as surveyed",
+        "moved or exchanged? the log names it; survey it anew",
+    ),
+    Fault.LAMP_DEAD: ("a lamp is not received where it must be", "the log names it: replace it or switch it on"),
     Fault.ODOMETRY_SILENT: ("configured odometry does not arrive", "check its sender and `odometry.port`"),
     Fault.ODOMETRY_JUMPS: ("odometry has jumped", "its sender was restarted, or two senders use `odometry.port`"),
     Fault.ODOMETRY_DISAGREES: (
@@ -75,6 +158,9 @@ class Vitals:
         link, error: of the lidar driver. silent: no valid scan for three scan periods.
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the laser.
+        adc: whether blocks of samples arrive, None where there is no photodiode. adc_link, adc_error: of its driver.
+        blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked beyond the decoder's reach.
+        lamps: what is wrong with lamps and survey.
         cycles, overruns, jobs_failed: counters. lateness: worst lateness of the loop lately, seconds.
         failed: names of parts that are down at the moment.
     """
@@ -90,6 +176,15 @@ class Vitals:
     odometry: bool | None = None
     odometry_jumps: int = 0
     disagree: bool = False
+    adc: bool | None = None
+    adc_link: Link = Link.CLOSED
+    adc_error: HalError | None = None
+    blocks: int = 0
+    lost: int = 0
+    unfit: int = 0
+    stalled: int = 0
+    off_rate: bool = False
+    lamps: frozenset[Fault] = frozenset()
     cycles: int = 0
     overruns: int = 0
     jobs_failed: int = 0
@@ -100,6 +195,8 @@ class Vitals:
 def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
     """Faults that are present, gravest first; ``before`` are vitals of about :data:`WINDOW_S` ago."""
     found = [*_lidar(now, before), *_odometry(now, before), *_computer(now, before), *_outputs(now)]
+    if now.adc is not None:
+        found += [*_photodiode(now, before), *now.lamps]
     return tuple(sorted(found))
 
 
@@ -125,6 +222,39 @@ def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
 def _noun(error: HalError) -> Fault:
     nouns = {DeviceMissing: Fault.LIDAR_MISSING, DeviceRefused: Fault.LIDAR_REFUSED, DeviceFault: Fault.LIDAR_BROKEN}
     return next((fault for noun, fault in nouns.items() if isinstance(error, noun)), Fault.LIDAR_SILENT)
+
+
+ADC_NOUNS: Final[tuple[tuple[type[HalError], Fault], ...]] = (
+    (ChipMissing, Fault.ADC_MISSING),
+    (WrongChip, Fault.ADC_WRONG),
+    (BusStuck, Fault.ADC_BUS_STUCK),
+    (Dark, Fault.DARK),
+    (Dazzled, Fault.DAZZLED),
+    (NoSignal, Fault.NO_SIGNAL),
+    (Clipping, Fault.CLIPPED),
+    (DeviceMissing, Fault.ADC_BUS_MISSING),
+    (DeviceRefused, Fault.ADC_BUS_REFUSED),
+    (DataInvalid, Fault.ADC_GARBLED),
+    (HalError, Fault.ADC_BUS_FAULTY),
+)
+"""What a converter's driver says, by kind: the first that fits."""
+
+
+def _photodiode(now: Vitals, before: Vitals) -> Iterable[Fault]:
+    if now.adc_error is not None:
+        yield next(fault for noun, fault in ADC_NOUNS if isinstance(now.adc_error, noun))
+    elif not now.adc and now.adc_link is Link.STREAMING and now.unfit == before.unfit:
+        yield Fault.ADC_SILENT
+    blocks, lost = now.blocks - before.blocks, now.lost - before.lost
+    unfit, stalled = now.unfit - before.unfit, now.stalled - before.stalled
+    if unfit > FEW + 0.05 * blocks and not isinstance(now.adc_error, NoSignal | DataInvalid):
+        yield Fault.ADC_GARBLED
+    if now.off_rate:
+        yield Fault.ADC_RATE
+    if stalled > FEW + 0.1 * blocks:
+        yield Fault.ADC_STALLS
+    if now.adc and lost > FEW + 0.02 * (blocks + lost):
+        yield Fault.ADC_GAPS
 
 
 def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from daemon.health import WINDOW_S, Fault, Vitals, assess, describe
+from daemon.health import ADC_NOUNS, WINDOW_S, Fault, Vitals, assess, describe
 from daemon.notify import notify
 
 log = logging.getLogger(__name__)
@@ -17,8 +17,10 @@ log = logging.getLogger(__name__)
 BEAT_S: Final = 1.0
 STATISTICS_BEATS: Final = 300
 """Beats between two lines of statistics in the log."""
-SAID_BY_DRIVER: Final = frozenset([Fault.LIDAR_MISSING, Fault.LIDAR_REFUSED, Fault.LIDAR_BROKEN])
-"""The driver logs these itself, with the device's name."""
+SAID_BY_DRIVER: Final = frozenset(
+    [Fault.LIDAR_MISSING, Fault.LIDAR_REFUSED, Fault.LIDAR_BROKEN, *(fault for _, fault in ADC_NOUNS)]
+) - {Fault.ADC_GARBLED}
+"""The drivers log these themselves, with the device's name; of damaged words only where nearly all are."""
 
 
 class Heartbeat:

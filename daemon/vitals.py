@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 from daemon.cycle import Cycle
 from daemon.health import Vitals
@@ -26,6 +27,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         odometry=cycle.observer.odometry_ok(t_mono),
         odometry_jumps=cycle.odometry.jumps,
         disagree=cycle.verdict.reason is Reason.WITNESSES_DISAGREE,
+        **_photodiode(cycle, t_mono),
         cycles=cycle.cycles,
         overruns=cycle.overruns,
         jobs_failed=parts.worker.failed,
@@ -34,15 +36,42 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
     )
 
 
+def _photodiode(cycle: Cycle, t_mono: float) -> dict[str, Any]:
+    """The part of the vitals that is the photodiode's; nothing where there is none."""
+    blocks, samples, lamps = cycle.parts.blocks, cycle.parts.samples, cycle.lamps
+    if blocks is None or samples is None:
+        return {}
+    return {
+        "adc": blocks.ok(t_mono),
+        "adc_link": blocks.status.link,
+        "adc_error": blocks.status.error,
+        "blocks": cycle.blocks,
+        "lost": blocks.status.dropped + (cycle.inbox.blocks_dropped if cycle.cycles else 0),
+        "unfit": samples.unfit,
+        "stalled": lamps.spoiled,
+        "off_rate": samples.off_rate,
+        "lamps": lamps.faults if blocks.ok(t_mono) else frozenset(),
+    }
+
+
 def statistics(cycle: Cycle) -> str:
     """One line for the log."""
     status = cycle.parts.status
     return (
         f"state {cycle.verdict.state.name} cycles {cycle.cycles} overruns {cycle.overruns} scans {status.scans} "
         f"missed {status.missed} dropped {cycle.inbox.dropped} invalid {status.invalid} resyncs {status.resyncs} "
-        f"reconnects {status.reconnects} scan period {1e3 * cycle.period.seconds:.2f} ms "
+        f"reconnects {status.reconnects}{_light_statistics(cycle)} scan period {1e3 * cycle.period.seconds:.2f} ms "
         f"cycle {cycle.cycle_us or 0} us memory {resident_mb():.0f} MB"
     )
+
+
+def _light_statistics(cycle: Cycle) -> str:
+    blocks, result = cycle.parts.blocks, cycle.result
+    if blocks is None:
+        return ""
+    lights = None if result is None else result.lights
+    links = 0 if lights is None else len(lights.links)
+    return f" blocks {cycle.blocks} lost {cycle.blocks_lost()} recoveries {blocks.status.recoveries} links {links}"
 
 
 def resident_mb() -> float:

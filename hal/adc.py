@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from hal.errors import HalError
+from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.lidar import Link
 
 
@@ -50,6 +50,34 @@ class RawSamples:
     bits: int
     blemish: Blemish
     slack_s: float = 0.0
+
+
+class ChipMissing(DeviceMissing):
+    """The bus is there, and nothing acknowledges the converter's address."""
+
+
+class WrongChip(DeviceRefused):
+    """Something answers that is not such a converter."""
+
+
+class BusStuck(DeviceFault):
+    """Transactions time out, or do not return at all."""
+
+
+class NoSignal(DeviceFault):
+    """The words say nothing: no light, so much that the amplifier is saturated, or a dead converter."""
+
+
+class Dark(NoSignal):
+    """No light, as the DC channel says."""
+
+
+class Dazzled(NoSignal):
+    """Too much light, as the DC channel says."""
+
+
+class Clipping(DeviceFault):
+    """Much of the signal lies beyond the converter's range."""
 
 
 @dataclass(slots=True)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from hal.adc import AdcStatus, Blemish, RawSamples
+from hal.adc import AdcStatus, Blemish, RawSamples, WrongChip
 from hal.clock import Clock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.i2c import AsyncBus, BusOpener, read, write
@@ -139,7 +139,7 @@ class PhotodiodeAdc:
         chip, address = self._chip, self._address
         problem = chip.judge(tuple([await ask(bus, address, query) for query in chip.queries]))
         if problem:
-            raise DeviceRefused(
+            raise WrongChip(
                 self._bus, f"the chip at {address:#04x} is no {chip.name}: it {problem}", "check chip and address"
             )
         for message in chip.setup:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from hal.adc import RawSamples
+from hal.adc import Clipping, Dark, Dazzled, NoSignal, RawSamples
 from hal.errors import DataInvalid, DeviceFault, HalError
 from hal.photodiode.blocks import Census
 from hal.photodiode.chips import BlockChip
@@ -104,14 +104,14 @@ class Judge:
         )
 
     def _say_clipped(self) -> HalError:
-        return DeviceFault(
+        return Clipping(
             self._device,
             f"{self._where}: more than {100 * CLIPPED_SHARE:.0f} % of the samples are at the rails",
             "too much modulated or flickering light: shade the photodiode or lower the gain",
         )
 
     def _say_at_rail(self) -> HalError:
-        return DeviceFault(
+        return NoSignal(
             self._device,
             f"{self._where}: every word is at the same rail",
             "check the wire from amplifier to converter, its supply, and that it is this kind of chip",
@@ -119,13 +119,16 @@ class Judge:
 
     def _say_nothing(self, level: float | None, *, frozen: bool) -> HalError:
         """There is no signal: what that means depends on the mean light, and on whether the words move at all."""
+        noun: type[NoSignal] = NoSignal
         if level is None:
             problem = "no signal: no light at all, or so much that the amplifier is saturated"
             problem += ", or a dead converter" if frozen else ""
             remedy = "look at photodiode and lamps; a DC channel (ADS1115) would tell which"
         elif level >= DAZZLED:
+            noun = Dazzled
             problem, remedy = "dazzled: the amplifier is saturated", "shade the photodiode or lower the gain"
         elif level <= DARK:
+            noun = Dark
             problem, remedy = "dark: no light reaches the photodiode", "look for a cover, a broken cable, lamps off"
         elif frozen:
             problem = "constant words, though there is light: the converter or its input is dead"
@@ -133,4 +136,4 @@ class Judge:
         else:
             problem = "there is light, but no lamp in it: nothing flickers"
             remedy = "look whether coded lamps are on and in view; check the coupling capacitor"
-        return DeviceFault(self._device, f"{self._where}: {problem}", remedy)
+        return noun(self._device, f"{self._where}: {problem}", remedy)

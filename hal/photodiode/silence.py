@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Callable
 from typing import Final
 
+from hal.adc import BusStuck
 from hal.errors import DeviceFault, HalError
 from hal.i2c import NACKS, AsyncBus, Message, OnRead, Transferred
 
@@ -118,7 +119,7 @@ class WatchedBus:
         )
 
     def _say_hang(self) -> HalError:
-        return DeviceFault(
+        return BusStuck(
             self.name,
             f"a transaction has not returned for {HANG_S:g} s",
             "the adapter's driver hangs: unbind and bind it, or restart the computer",

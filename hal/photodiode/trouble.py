@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass
 from typing import Final
 
+from hal.adc import BusStuck, ChipMissing
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 
 Noun = type[HalError]
@@ -31,7 +32,7 @@ class Policy:
 
 
 _ABSENT: Final = Policy(
-    DeviceMissing,
+    ChipMissing,
     "no {chip} answers at address {address}",
     "check its power and wiring, and the address with: i2cdetect -y N",
     retries=3,
@@ -49,7 +50,7 @@ POLICIES: Final[dict[int, Policy]] = {
     errno.ENXIO: _ABSENT,
     errno.EREMOTEIO: _ABSENT,
     errno.ETIMEDOUT: Policy(
-        DeviceFault,
+        BusStuck,
         "the bus is stuck (a transaction timed out)",
         "switch the converter's power off and on; look for SDA or SCL held low",
         retries=2,

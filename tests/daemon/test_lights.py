@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from daemon.budget import FixedBudget
@@ -29,10 +30,10 @@ LIDAR = "/dev/ttyACM0"
 BLOCK_S = PROFILE_A.epoch_s
 
 
-def settings(lidar: bool, light: bool) -> Config:
+def settings(lidar: bool, light: bool, level: bool = False) -> Config:
     return Config(
         lidar=LidarConfig(device=LIDAR if lidar else NO_DEVICE),
-        photodiode=PhotodiodeConfig(bus=BUS if light else ""),
+        photodiode=PhotodiodeConfig(bus=BUS if light else "", level="ads1115@0x48/0" if level else ""),
         modbus=ModbusConfig(port=0),
     )
 
@@ -47,14 +48,18 @@ class Bench:
 
     lidar: bool = False
     light: bool = True
+    level: bool = False
+    codes: Sequence[int] = CODES
     lights: Lights = field(default_factory=lambda: Lights(SURVEY, PROFILE_A, 0.0))
     snapshots: list[Snapshot] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.loop = asyncio.get_running_loop()
         clock = LoopClock(self.loop, utc_at_zero=1.7e9)
-        self.source = Lit()
+        self.source = Lit(self.codes)
         self.buses, self.adc = plugged(clock, self.source)
+        if self.level:
+            self.adc.add_level(lambda t_mono: np.full_like(t_mono, 0.4))
         self.device = FakeHokuyo(URG_04LX_UG01, Room(URG_04LX_UG01))
         self.opener = FakeOpener(clock)
         self.opener.plug(LIDAR, self.device)
@@ -71,7 +76,7 @@ class Bench:
             buses=self.buses,
             lights=self.lights if self.light else None,
         )
-        self.daemon = Daemon(settings(self.lidar, self.light), world)
+        self.daemon = Daemon(settings(self.lidar, self.light, self.level), world)
 
     @property
     def last(self) -> Snapshot:
