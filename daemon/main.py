@@ -42,9 +42,10 @@ from estimator.records import Limits, Record
 from estimator.result import StepResult
 from hal.clock import Clock, SystemClock
 from hal.errors import HalError
-from hal.i2c import BusOpener, open_bus
+from hal.i2c import BusOpener
 from hal.lidar import Lidar, LidarGeometry, LidarStatus, RawScan
-from hal.port import PortOpener, open_port
+from hal.opening import open_bus, open_port
+from hal.port import PortOpener
 
 if TYPE_CHECKING:
     from daemon.record import Recorder

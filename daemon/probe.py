@@ -8,7 +8,7 @@ import json
 import sys
 
 from hal.hokuyo import discover
-from hal.port import open_port
+from hal.opening import open_port
 from hal.probe import Finding, identify_at
 
 NOTHING = (

@@ -15,8 +15,6 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from hal.errors import DeviceRefused
-
 MAX_MESSAGES: Final = 42
 """Messages of one transaction (I2C_RDWR_IOCTL_MAX_MSGS)."""
 MAX_LENGTH: Final = 8192
@@ -151,41 +149,3 @@ def check(messages: tuple[Message, ...]) -> None:
             raise OSError(errno.EINVAL, "a message either writes or reads")
         if not 1 <= length <= MAX_LENGTH:
             raise OSError(errno.EINVAL, f"{length} bytes: one message has 1 to {MAX_LENGTH}")
-
-
-def blocking_opener(name: str) -> Callable[[str], Bus]:
-    """What opens a bus of this kind of name, blocking; its module is imported only now.
-
-    Raises:
-        DeviceRefused: a name of no kind.
-    """
-    if name.startswith(("unix:", "tcp://")):
-        from hal.i2c_remote import open_remote
-
-        return open_remote
-    if name.startswith(("/", "adapter:")):
-        from hal.i2c_linux import open_linux
-
-        return open_linux
-    raise DeviceRefused(
-        name,
-        "not the name of an I2C bus",
-        "expected a path such as /dev/i2c-1, adapter:NAME, unix:/path, or tcp://host:port",
-    )
-
-
-async def open_bus(name: str) -> AsyncBus:
-    """Open a real or a remote bus, with a thread of its own: the :class:`BusOpener` of the daemon.
-
-    Args:
-        name: path of a device node (``/dev/i2c-1``, or a link to one), ``adapter:NAME`` for the only adapter whose
-            own name contains NAME (bus numbers of USB adapters change), ``unix:/path`` or ``tcp://host:port`` for a
-            bus served by :mod:`hal.i2c_server`.
-
-    Raises:
-        DeviceMissing: no such bus, unplugged, host unreachable.
-        DeviceRefused: permission, busy, not an I2C bus, or a name of no kind.
-    """
-    from hal.i2c_thread import open_threaded
-
-    return await open_threaded(name, blocking_opener(name))

@@ -29,9 +29,10 @@ from typing import Final
 from hal import i2c_frames as frames
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceRefused, HalError
-from hal.i2c import AsyncBus, BusOpener, Message, Transferred, check, open_bus
+from hal.i2c import AsyncBus, BusOpener, Message, Transferred, check
 from hal.i2c_remote import clock_name, parse_address
 from hal.inet import resolve
+from hal.opening import open_bus
 
 AHEAD: Final = 8
 """Transactions a client may have ordered and not been answered; further bytes of it are not read meanwhile."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from hal.clock import Clock
-from hal.errors import DeviceMissing, DeviceRefused, HalError
+from hal.errors import DeviceMissing, HalError
 
 OnData = Callable[[bytes, float], None]
 """Called with bytes and the ``t_mono`` taken before anything else was done with them."""
@@ -55,28 +55,6 @@ class PortOpener(Protocol):
             DeviceMissing: nothing there. DeviceRefused: permission, busy, not a tty.
         """
         ...
-
-
-async def open_port(device: str, baud: int) -> Port:
-    """Open a real device: the :class:`PortOpener` of the daemon.
-
-    Args:
-        device: path of a serial port (``/dev/ttyACM0``) or ``tcp://host:port`` (SCIP: port 10940, the default).
-        baud: line rate in bit/s; without meaning on USB CDC and TCP.
-
-    Raises:
-        DeviceMissing: no such path, unplugged, host unreachable.
-        DeviceRefused: permission, busy, not a serial port, or a name of neither kind.
-    """
-    if device.startswith("tcp://"):
-        from hal.tcp_port import open_tcp_port
-
-        return await open_tcp_port(device)
-    if device.startswith("/"):
-        from hal.serial_port import open_serial_port
-
-        return await open_serial_port(device, baud)
-    raise DeviceRefused(device, "not a device name", "expected a path such as /dev/ttyACM0, or tcp://host:port")
 
 
 class MemoryPort:

@@ -52,7 +52,7 @@ async def probe(opener: PortOpener, devices: Sequence[str] = ()) -> list[Finding
     """Identify what is at each device; a sensor that streams is stopped, and left idle.
 
     Args:
-        opener: opens ports (:func:`hal.port.open_port`).
+        opener: opens ports (:func:`hal.opening.open_port`).
         devices: paths and ``tcp://`` names; none: every port at which a HOKUYO may be.
     """
     return [await identify_at(opener, device) for device in devices or discover.candidates()]

@@ -76,3 +76,16 @@ def test_commands_without_numbers_do_not_load_numba(words: list[str]) -> None:
     command = [sys.executable, "-W", "error", "-c", code]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def circle_in(room: str) -> list[str]:
+    """Modules of a room that import each other in a circle, also where the import waits inside a function."""
+    modules = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in sources(room)}
+    graph = {name: (imports_of(path) & set(modules)) - {name} for name, path in modules.items()}
+    while leaves := [name for name, needed in graph.items() if not needed]:
+        graph = {name: needed - set(leaves) for name, needed in graph.items() if name not in leaves}
+    return sorted(graph)
+
+
+def test_no_circles_among_devices() -> None:
+    assert circle_in("hal") == []

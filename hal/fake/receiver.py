@@ -63,7 +63,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--address", type=_number, default=0x4D, help="of the converter (default 0x4d)")
     add("--adapter", default="designware", choices=sorted(ADAPTERS), help="how the bus is driven (default %(default)s)")
     add("--light", type=Path, metavar="FILE", help=".npz with fraction and rate_hz (default: lamps without codes)")
-    add("--dc", type=float, metavar="LEVEL", help="add an ADS1115 at 0x48 that sees this much light, 0 (dark) to 1 (saturated)")
+    add(
+        "--dc",
+        type=float,
+        metavar="LEVEL",
+        help="add an ADS1115 at 0x48: 0 is dark, 1 saturated",
+    )
     add("--scl-percent", type=float, default=0.0, help="how far SCL is off its nominal rate")
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
     add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")

@@ -45,7 +45,7 @@ class HokuyoDriver:
     Args:
         device: path, ``tcp://host:port``, or ``auto``: the first port at which a HOKUYO answers.
         clock: gives the times of arrival; the same as the ports'.
-        opener: opens ports (:func:`hal.port.open_port`).
+        opener: opens ports (:func:`hal.opening.open_port`).
         serial: the sensor's own number (``VV SERI``); with ``auto`` it is found wherever it is plugged in.
         baud: RS-232 rate to use; 0: the lowest that carries every revolution. No meaning on USB and Ethernet.
         intensity: ask for intensities where model and firmware can give them.

@@ -17,7 +17,7 @@ from hal.fake.pty_server import PtyServer
 from hal.fake.schedule import FaultSchedule
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import VALID, Link, RawScan
-from hal.port import open_port
+from hal.opening import open_port
 from tests.faults.bench import World
 
 PATIENCE = 4.0

@@ -19,9 +19,10 @@ from hal import i2c_frames as frames
 from hal.adc import Blemish
 from hal.clock import SystemClock
 from hal.errors import HalError
-from hal.i2c import MAX_LENGTH, MAX_MESSAGES, AsyncBus, Message, OnRead, Transferred, open_bus, read, write
+from hal.i2c import MAX_LENGTH, MAX_MESSAGES, AsyncBus, Message, OnRead, Transferred, read, write
 from hal.i2c_remote import RemoteBus, clock_name
 from hal.i2c_server import BusServer
+from hal.opening import open_bus
 from hal.photodiode.capability import Capability
 from hal.photodiode.judge import Judge
 from hal.photodiode.mcp3221 import CHIP

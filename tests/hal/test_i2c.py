@@ -12,7 +12,8 @@ from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceMissing, DeviceRefused
 from hal.fake.adc import FakeAdc, FakeBuses
 from hal.fake.schedule import FaultSchedule
-from hal.i2c import AsyncBus, Message, Transferred, blocking_opener, check, open_bus, read, write
+from hal.i2c import AsyncBus, Message, Transferred, check, read, write
+from hal.opening import blocking_opener, open_bus
 
 
 @pytest.mark.parametrize("name", ["", "1", "i2c-1", "serial:/dev/ttyACM0", "http://x", "udp://127.0.0.1:1"])

@@ -23,9 +23,10 @@ from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc import FakeAdc, FakeBuses
 from hal.fake.schedule import FaultSchedule
-from hal.i2c import open_bus, read, write
+from hal.i2c import read, write
 from hal.i2c_remote import RemoteClock, clock_name, open_remote, parse_address
 from hal.i2c_server import BusServer
+from hal.opening import open_bus
 from hal.photodiode.driver import PhotodiodeAdc
 from tests.hal.photodiode.bench import Bench, Light, falsehoods
 

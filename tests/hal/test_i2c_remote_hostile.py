@@ -18,9 +18,10 @@ from hal import i2c_frames as frames
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc import FakeBuses
-from hal.i2c import open_bus, read, write
+from hal.i2c import read, write
 from hal.i2c_remote import RemoteClock, open_remote
 from hal.i2c_server import CLIENTS, BusServer
+from hal.opening import open_bus
 from hal.photodiode.driver import PhotodiodeAdc
 from tests.hal.test_i2c_remote import Server, greet, served
 

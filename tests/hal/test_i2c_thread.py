@@ -223,7 +223,7 @@ def test_a_loop_that_has_ended_ends_the_thread() -> None:
 
 
 def test_opening_a_bus_that_is_not_there() -> None:
-    from hal.i2c import open_bus
+    from hal.opening import open_bus
 
     with pytest.raises(DeviceMissing, match="no such bus"):
         asyncio.run(open_bus("/dev/i2c-250"))

@@ -8,7 +8,8 @@ import pytest
 
 from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceMissing, DeviceRefused, HalError
-from hal.port import MemoryPort, memory_pair, open_port
+from hal.opening import open_port
+from hal.port import MemoryPort, memory_pair
 
 
 class Ear:

@@ -16,7 +16,7 @@ import pytest
 import serial
 
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
-from hal.port import open_port
+from hal.opening import open_port
 from hal.serial_port import SerialPort, explain_open_error
 
 

@@ -9,7 +9,7 @@ import socket
 import pytest
 
 from hal.errors import DeviceMissing, DeviceRefused, HalError
-from hal.port import open_port
+from hal.opening import open_port
 from hal.tcp_port import TcpPort, parse_tcp_name
 
 

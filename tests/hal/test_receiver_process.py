@@ -17,8 +17,8 @@ import pytest
 from hal.adc import Blemish, RawSamples
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceMissing, HalError
-from hal.i2c import open_bus
 from hal.lidar import Link
+from hal.opening import open_bus
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
 from hal.photodiode.level import LevelInput
 from hal.photodiode.probe import probe_buses

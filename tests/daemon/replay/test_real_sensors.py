@@ -30,7 +30,8 @@ from hal.fake.scan import FakeScan
 from hal.fake.transport import FakeOpener
 from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
-from hal.port import PortOpener, open_port
+from hal.opening import open_port
+from hal.port import PortOpener
 from tools import convert
 
 Array = npt.NDArray[np.float64]

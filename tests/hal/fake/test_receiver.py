@@ -14,7 +14,7 @@ from hal.adc import RawSamples
 from hal.clock import SystemClock
 from hal.errors import DataInvalid
 from hal.fake.adc_light import OrdinaryLamps, RecordedLight
-from hal.i2c import open_bus
+from hal.opening import open_bus
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
 from hal.photodiode.level import LevelInput
 

@@ -17,7 +17,8 @@ from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import RawScan
-from hal.port import PortOpener, open_port
+from hal.opening import open_port
+from hal.port import PortOpener
 
 PORT = "/dev/ttyACM7"  # a name that stands for USB; nothing is opened under it
 

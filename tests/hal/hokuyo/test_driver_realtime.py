@@ -21,7 +21,7 @@ from hal.fake.tcp_server import TcpServer
 from hal.hokuyo.passive import PassiveHokuyo
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import FrameSplitter, parse_reply
-from hal.port import open_port
+from hal.opening import open_port
 from tests.hal.hokuyo import encoder
 from tests.hal.hokuyo.bench import Bench, Scene, error_of
 

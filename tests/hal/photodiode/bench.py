@@ -15,7 +15,8 @@ from hal.errors import HalError
 from hal.fake.adc import FakeAdc, FakeBuses
 from hal.fake.i2c_adapters import BCM2835, Adapter
 from hal.fake.schedule import FaultSchedule
-from hal.i2c import BusOpener, open_bus
+from hal.i2c import BusOpener
+from hal.opening import open_bus
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
 
 BUS = "/dev/i2c-7"  # a name only; nothing is opened under it

@@ -14,7 +14,7 @@ from hal.adc import Blemish
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceRefused
 from hal.fake.adc import FakeAdc
-from hal.i2c import open_bus
+from hal.opening import open_bus
 from tests.hal.i2c_kernel import Kernel
 from tests.hal.photodiode.bench import Bench, Light, error_of, falsehoods
 

@@ -16,7 +16,7 @@ from hal.fake.adc import FakeAdc, FakeBuses
 from hal.fake.adc_chips import Adc121c021, Eeprom24c02, Lm75, Mcp3221
 from hal.fake.i2c_adapters import BCM2835, DESIGNWARE, FT260, Adapter
 from hal.fake.schedule import FaultSchedule
-from hal.i2c import open_bus
+from hal.opening import open_bus
 from hal.photodiode.probe import ADDRESSES, BusFinding, probe_buses
 from tests.hal.i2c_kernel import kernel
 from tests.hal.photodiode.bench import Light
