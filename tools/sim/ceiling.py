@@ -47,6 +47,7 @@ class Ceiling:
     Attributes:
         fixtures: lamps as planned. world: what stands between. height_m: of the ceiling. depth: of modulation.
         lean, movers: how the robot sways, and who walks about; None: it does not, nobody.
+        lit_since: when the lamps were switched on, s; -inf: at time 0.
         placed: (lamps, 3) where they truly are. power_w: (lamps,) what they truly radiate at time 0 when warm.
     """
 
@@ -59,6 +60,7 @@ class Ceiling:
     seed: int = 0
     lean: Lean | None = None
     movers: Movers | None = None
+    lit_since: float = -np.inf
 
     def __post_init__(self) -> None:
         fx, n = self.effects, len(self.fixtures)
@@ -154,11 +156,12 @@ class Ceiling:
     def powers(self, t: Array) -> Array:
         """(n, lamps) mean radiant power in W."""
         fx = self.effects
+        t = t - self.lit_since if np.isfinite(self.lit_since) else t
         change = 1.0 + self._ageing * np.clip(t[:, None] / fx.ageing_s, 0.0, 1.0)
         change = change * (1.0 + fx.warm_up * self._warm * np.exp(-np.maximum(t[:, None], 0.0) / fx.warm_up_s))
         change = change * (1.0 + fx.drift * np.sin(2.0 * np.pi * t[:, None] / 1800.0 + self._swing))
         for k, (begin, end) in self._off.items():
-            change[:, k] = np.where((t >= begin) & (t < end), 0.0, change[:, k])
+            change[(t >= begin) & (t < end), k] = 0.0
         return np.asarray(change * self.power_w)
 
     def by_the_walls(self, at: Array) -> Array:

@@ -43,6 +43,8 @@ class Reception:
         efficiency: variance of an amplitude is noise^2 / (samples efficiency), with 16 lamps solved at once.
         reported: the same as the decoder reports it, which errs on the safe side.
         shape: relative error by template and timing.
+        cross: error by lamps that shine but are not followed, whose codes are not quite orthogonal to the others: part
+            of their amplitude (root of the sum of squares). cross_reported: what of it the decoder counts as noise.
     """
 
     ambient_a: float = 79e-6
@@ -52,6 +54,8 @@ class Reception:
     efficiency: float = 0.72
     reported: float = 0.64
     shape: float = 1.5e-4
+    cross: float = 0.045
+    cross_reported: float = 0.031
 
     def sample_noise(self, lamps_a: float) -> float:
         """A per sample, under lamps of that mean photocurrent."""
@@ -105,11 +109,14 @@ class Links:
             amplitudes: (lamps,) A, true on average over the block.
         """
         noise = self._reception.sample_noise(float(amplitudes.sum()) / self._depth)
-        samples = (t_end - t_begin) * self._reception.rate_hz
-        sigma = noise / np.sqrt(samples * self._reception.efficiency)
-        measured = amplitudes * (1.0 + self._reception.shape * self._rng.standard_normal(len(amplitudes)))
+        rx = self._reception
+        samples = (t_end - t_begin) * rx.rate_hz
+        dim = ~self._known & (amplitudes < DIM * float(np.max(amplitudes, initial=0.0)))
+        hidden = float(np.sum(amplitudes[dim] ** 2))
+        sigma = np.sqrt(noise**2 / (samples * rx.efficiency) + rx.cross**2 * hidden)
+        measured = amplitudes * (1.0 + rx.shape * self._rng.standard_normal(len(amplitudes)))
         measured = measured + sigma * self._rng.standard_normal(len(amplitudes))
-        variance = noise**2 / (samples * self._reception.reported)
+        variance = noise**2 / (samples * rx.reported) + rx.cross_reported**2 * hidden
         faint = self._live_and_die(measured, float(np.sqrt(variance)))
         lamp = np.flatnonzero(self._known)
         codes, counts = np.unique(self._codes[lamp], return_counts=True)

@@ -1,7 +1,8 @@
 """A whole daemon and a whole simulated world in one process and in virtual time, as fast as the machine can.
 
 The lidar is a fake HOKUYO on a memory port that carries the very bytes a tty carries; odometry arrives as the very
-datagrams a socket carries. Nothing reads a real clock, so one seed gives one result. For tests and experiments.
+datagrams a socket carries; light as words of a fake converter on a memory bus, or at link level as decoded epochs.
+Nothing reads a real clock, so one seed gives one result. For tests and experiments.
 """
 
 from __future__ import annotations
@@ -15,18 +16,21 @@ import numpy as np
 import numpy.typing as npt
 
 from daemon.budget import FixedBudget
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig
+from daemon.config import NO_DEVICE, Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.cycle import Cycle, Sink
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot, State
 from daemon.worker import CycleWorker
 from hal.clock import LoopClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import Unit
-from hal.fake.schedule import FaultSchedule
+from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.transport import FakeOpener
 from hal.inputs import InputPort
 from tools.sim.feed import feed_odometry
+from tools.sim.harness_light import BUS, LEVEL, LinkBridge, light_up, lights_of
 from tools.sim.scene import Scenario, Scene, SimulatedScene
+from tools.sim.scene_light import LINK
 from tools.sim.world import Array
 
 DEVICE: Final = "/dev/simulated"
@@ -39,7 +43,9 @@ class Run:
 
     Attributes:
         t_mono: instant each pose is true for. pose: T_map_base (n, 3). odom: T_odom_base (n, 3).
-        truth: true poses in the map frame, which is where the robot stood at the first pose.
+        truth: true poses in the map frame: where the robot stood at the first pose, until light has told where the map
+            lies; then the building's own.
+        site: true poses in the building's own frame, which is the lights survey's. placed: light has told.
         sigma: (n, 3) one-sigma of x, y, yaw. known: (n, 3) axes said to be observed. state, reason: as published.
         snapshots: all of them, as published. scans_sent: by the fake sensor.
     """
@@ -48,6 +54,8 @@ class Run:
     pose: Array
     odom: Array
     truth: Array
+    site: Array
+    placed: npt.NDArray[np.bool_]
     sigma: Array
     known: npt.NDArray[np.bool_]
     state: npt.NDArray[np.int64]
@@ -76,6 +84,7 @@ def run(
     scene: Scene | None = None,
     faults: str = "",
     odometry: bool = True,
+    lidar: bool = True,
 ) -> Run:
     """Run daemon and world together for some virtual seconds.
 
@@ -83,8 +92,9 @@ def run(
         seconds: from the first scan asked for.
         scenario: the simulated scene; default the paper's robot in the paper's room.
         scene: another scene, instead of a scenario.
-        faults: TOML schedule of lidar faults.
+        faults: TOML schedule of faults of the lidar and, with lights, of the converter (``adc``).
         odometry: whether wheel odometry is fed.
+        lidar: whether there is a lidar; without one, lights must be in the scenario.
 
     Raises:
         RuntimeError: the daemon ended by itself, or never published a pose.
@@ -93,14 +103,20 @@ def run(
         scene = SimulatedScene(scenario or Scenario())
     x, y, yaw = scene.mount
     seed = scene.scenario.seed if isinstance(scene, SimulatedScene) else 0
+    light = lights_of(scene)
+    if light is None and not lidar:
+        raise ValueError("without a lidar, lights must be in the scenario: Scenario(lights=Lights())")
     settings = Config(
-        lidar=LidarConfig(device=DEVICE, mount=Mount(x, y, math.degrees(yaw))),
+        lidar=LidarConfig(device=DEVICE if lidar else NO_DEVICE, mount=Mount(x, y, math.degrees(yaw))),
         odometry=OdometryConfig(port=_ANY_PORT if odometry else 0),
         modbus=ModbusConfig(port=0),
+        photodiode=PhotodiodeConfig(
+            bus="" if light is None else BUS, level=LEVEL if light and light.lights.level else ""
+        ),
     )
-    snapshots: list[Snapshot] = []
-    sent = run_virtual(_main(settings, scene, snapshots, _Order(seconds, faults, seed)))
-    return _collect(snapshots, scene, sent)
+    log = _Log()
+    sent = run_virtual(_main(settings, scene, log, _Order(seconds, faults, seed)))
+    return _collect(log, scene, sent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,16 +126,38 @@ class _Order:
     seed: int
 
 
-async def _main(settings: Config, scene: Scene, snapshots: list[Snapshot], order: _Order) -> int:
+class _Log:
+    """A sink of the daemon's that keeps every snapshot, and whether light had told by then where the map lies."""
+
+    def __init__(self) -> None:
+        self.snapshots: list[Snapshot] = []
+        self.placed: list[bool] = []
+        self.cycle: Cycle | None = None
+
+    def __call__(self, snapshot: Snapshot) -> None:
+        result = None if self.cycle is None else self.cycle.result
+        self.snapshots.append(snapshot)
+        self.placed.append(result is not None and result.placed)
+
+
+async def _main(settings: Config, scene: Scene, log: _Log, order: _Order) -> int:
     loop = asyncio.get_running_loop()
     clock = LoopClock(loop)
     device = FakeHokuyo(scene.model, scene.scan, unit=Unit(seed=order.seed), rotor=scene.rotor())
     opener = FakeOpener(clock)
     opener.plug(DEVICE, device)
-    schedule = FaultSchedule({"lidar": device})
+    targets: dict[str, Target] = {"lidar": device}
+    around = world(clock, opener, log)
+    light = lights_of(scene)
+    if light is not None:
+        targets |= light_up(around, light, clock)
+    schedule = FaultSchedule(targets)
     if order.faults:
         schedule.load(order.faults)
-    daemon = Daemon(settings, world(clock, opener, snapshots))
+    daemon = Daemon(settings, around)
+    log.cycle = daemon.cycle
+    if light is not None and light.lights.fidelity == LINK:
+        daemon.cycle.parts.samples = LinkBridge(light)
     stop = asyncio.Event()
     loop.call_later(order.seconds, stop.set)
     wheels = _connect_wheels(daemon, scene, clock) if settings.odometry.port else None
@@ -133,7 +171,7 @@ async def _main(settings: Config, scene: Scene, snapshots: list[Snapshot], order
     return device.scans_sent
 
 
-def world(clock: LoopClock, opener: FakeOpener, snapshots: list[Snapshot]) -> World:
+def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
     """What the daemon meets in virtual time: no thread, no stopwatch, no chance."""
 
     async def warm() -> None:
@@ -148,7 +186,7 @@ def world(clock: LoopClock, opener: FakeOpener, snapshots: list[Snapshot]) -> Wo
         make_budget=FixedBudget,
         stopwatch=None,
         warm_up=warm,
-        sinks=(snapshots.append,),
+        sinks=(sink,),
         draw_map_id=lambda: 1,
     )
 
@@ -162,7 +200,8 @@ def _connect_wheels(daemon: Daemon, scene: Scene, clock: LoopClock) -> asyncio.T
     return asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
 
 
-def _collect(snapshots: list[Snapshot], scene: Scene, scans_sent: int) -> Run:
+def _collect(log: _Log, scene: Scene, scans_sent: int) -> Run:
+    snapshots = log.snapshots
     posed = [snapshot for snapshot in snapshots if snapshot.pose is not None]
     if not posed:
         last = snapshots[-1].state.name if snapshots else "no snapshot at all"
@@ -171,12 +210,15 @@ def _collect(snapshots: list[Snapshot], scene: Scene, scans_sent: int) -> Run:
     covariance = np.array([snapshot.covariance or [np.nan] * 6 for snapshot in snapshots])
     pose = _poses(snapshots, "pose")
     first = snapshots.index(posed[0])
-    truth = in_frame_of(scene.truth(t), scene.truth(t[first : first + 1])[0], pose[first])
+    placed, site = np.array(log.placed), scene.truth(t)
+    truth = np.where(placed[:, None], site, in_frame_of(site, site[first], pose[first]))
     return Run(
         t_mono=t,
         pose=pose,
         odom=_poses(snapshots, "odom"),
         truth=truth,
+        site=site,
+        placed=placed,
         sigma=np.sqrt(covariance[:, [0, 2, 5]]),
         known=np.array([snapshot.known for snapshot in snapshots]),
         state=np.array([int(snapshot.state) for snapshot in snapshots]),

@@ -42,10 +42,15 @@ class Crowd:
             rows[2 * number : 2 * number + 2] = self._person(number, t, robot)
         return rows
 
-    def bodies(self, t: float, robot: Array) -> Array:
-        """(n, 2) where the people stand at ``t``: midway between their feet."""
-        legs = self.legs(t, robot)
-        return np.asarray(0.5 * (legs[0::2, 1:3] + legs[1::2, 1:3]))
+    def bodies(self, t: Array, robot: Array) -> Array:
+        """(n, people, 2) where people stand, midway between their feet, at (n,) times; ``robot`` is (n, 3)."""
+        places = np.zeros((len(t), len(self._walkers), 2))
+        for number, (walker, path, length) in enumerate(zip(self._walkers, self._paths, self._lengths, strict=True)):
+            walked = walker.offset_m + walker.speed * t
+            folded = np.abs((walked + length[-1]) % (2 * length[-1]) - length[-1])
+            x, y = np.interp(folded, length, path[:, 0]), np.interp(folded, length, path[:, 1])
+            places[:, number] = np.column_stack(_step_aside(x, y, robot.T))
+        return places
 
     def _person(self, number: int, t: float, robot: Array) -> Array:
         walker, path, length = self._walkers[number], self._paths[number], self._lengths[number]

@@ -131,6 +131,16 @@ class Drive:
         return float(pitch), float(roll)
 
 
+def leans(drive: Drive, t: Array) -> Array:
+    """(n, 2) pitch and roll of the body at (n,) times: :meth:`Drive.tilt` less the tilt of the lidar's mount."""
+    body, (before, now, after) = drive.body, (drive.twist(t + step)[:, 0] for step in (-0.05, 0.0, 0.05))
+    moving = 0.5 * body.sway * np.minimum(now / 0.2, 1.0)
+    pitch = -body.dive * (after - before) / 0.1
+    pitch = pitch + moving * (np.sin(2 * np.pi * 1.7 * t) + np.sin(2 * np.pi * 4.3 * t + 1.0))
+    roll = moving * (np.sin(2 * np.pi * 1.3 * t + 2.0) + np.sin(2 * np.pi * 5.1 * t))
+    return np.column_stack([pitch, roll])
+
+
 def _headings(points: Array, step: Array) -> tuple[Array, Array]:
     """Heading (unwrapped) and curvature at every route point; the tour is closed, so both are periodic."""
     ring = np.vstack([points[-2], points, points[1]])

@@ -20,6 +20,7 @@ from tools.sim.buildings import Building, building
 from tools.sim.odometry import Odometer, Wheels
 from tools.sim.people import Crowd
 from tools.sim.robot import Body, Drive
+from tools.sim.scene_light import Lights, SceneLight
 from tools.sim.world import Array
 
 OPTICS: Final[dict[str, Optics]] = {
@@ -67,7 +68,7 @@ class Scenario:
         building: name, see :data:`tools.sim.buildings.BUILDINGS`. lidar: name in :data:`hal.fake.models.MODELS`.
         seed: of noise, people and slip. people: False empties the building.
         dwell_s: standing still before each lap. laps: how many.
-        optics: None takes the lidar's own.
+        optics: None takes the lidar's own. lights: coded lamps overhead; None: there are none.
     """
 
     building: str = "paper_room"
@@ -79,6 +80,7 @@ class Scenario:
     body: Body = field(default_factory=Body)
     wheels: Wheels = field(default_factory=Wheels)
     optics: Optics | None = None
+    lights: Lights | None = None
 
 
 PAPER: Final = Scenario(laps=1)
@@ -86,10 +88,13 @@ PAPER: Final = Scenario(laps=1)
 
 
 class SimulatedScene:
-    """A robot on its tour through a building. People start to walk with the first scan that is asked for.
+    """A robot on its tour through a building. People start to walk with the first scan, or block of light, asked for.
 
-    So does the robot, unless it is held: then it drives off with the first scan after :meth:`release`. Until it does it
+    So does the robot, unless it is held: then it drives off with the first one after :meth:`release`. Until it does it
     stands at the start, so that a daemon that is slow to start misses nothing.
+
+    Attributes:
+        light: the lamps overhead, None if there are none.
     """
 
     def __init__(self, scenario: Scenario, place: Building | None = None, held: bool = False) -> None:
@@ -104,6 +109,9 @@ class SimulatedScene:
         self._crowd = Crowd(self.building.people if scenario.people else ())
         self._scanner = Scanner(self.building.world, _sweep(self.model), self.optics, scenario.seed)
         self._odometer = Odometer(self.drive, self.building.world, scenario.wheels, scenario.seed)
+        self.light: SceneLight | None = None
+        if scenario.lights is not None:
+            self.light = SceneLight(self, self.building, self._crowd, scenario.lights, scenario.seed)
 
     @property
     def mount(self) -> tuple[float, float, float]:
@@ -116,12 +124,9 @@ class SimulatedScene:
 
     def scan(self, t_mono: float) -> FakeScan:
         """See :class:`Scene`."""
-        if self._t_first is None:
-            self._t_first = t_mono
-        if self.t_go is None and not self.held:
-            self.t_go = t_mono
-        t = t_mono - self._t_first
-        since = self._t_first - t_mono if self.t_go is None else self._t_first - self.t_go  # <= 0: not driving yet
+        first = self.begin(t_mono)
+        t = t_mono - first
+        since = first - t_mono if self.t_go is None else first - self.t_go  # <= 0: not driving yet
         pitch, roll = self.drive.tilt(t + since)
         robot = self.drive.pose(np.array([t + since]))[0]
         legs = self._crowd.legs(t + self._scanner.sweep.first_s, robot)
@@ -129,9 +134,31 @@ class SimulatedScene:
         seen = self._scanner.measure(t, lambda at: compose(self.drive.pose(at + since), self.mount), legs, posture)
         return to_device(self.model, seen)
 
+    def begin(self, t_mono: float) -> float:
+        """A sensor is read: people walk, and the robot drives off unless it is held. Returns when that first was."""
+        if self._t_first is None:
+            self._t_first = t_mono
+            self._surprise()
+        if self.t_go is None and not self.held:
+            self.t_go = t_mono
+            self._surprise()
+        return self._t_first
+
+    def _surprise(self) -> None:
+        if self.light is not None:
+            self.light.stream.track.forget()
+
     def release(self) -> None:
         """Let a held robot drive off."""
         self.held = False
+
+    def driven(self, t_mono: Array) -> Array:
+        """(n,) s since the robot drove off, 0 before."""
+        return np.zeros(len(t_mono)) if self.t_go is None else np.maximum(t_mono - self.t_go, 0.0)
+
+    def walked(self, t_mono: Array) -> Array:
+        """(n,) s since people began to walk, 0 before."""
+        return np.zeros(len(t_mono)) if self._t_first is None else np.maximum(t_mono - self._t_first, 0.0)
 
     def odometry_after(self, t_mono: float) -> tuple[float, Array] | None:
         """See :class:`Scene`; readings start with the clock, before that the wheels stand still."""

@@ -100,7 +100,7 @@ def test_shelves_are_solid_between_their_heights_only() -> None:
 
 def test_people_cast_soft_shadows_from_the_head_down() -> None:
     ceiling = hall(empty(), people=True)
-    ceiling.movers = lambda t, poses: np.repeat(rows_of(np.array([[1.0, 0.0]]))[None], len(t), axis=0)
+    ceiling.movers = lambda t, poses: rows_of(np.tile([1.0, 0.0], (len(t), 1, 1)))
     free = hall(empty())
     x = np.linspace(0.4, 4.3, 400)
     poses = np.column_stack([x + 0.1, np.zeros(400), np.zeros(400)])
