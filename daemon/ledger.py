@@ -25,6 +25,8 @@ _ONLINE, _ODOM, _ON_ANCHOR = slice(2, 5), slice(5, 8), slice(8, 11)
 class Ledger:
     """One row a scan, in the order of the log, and counts. A row is 88 bytes: a day at 40 Hz fits into memory.
 
+    Where scans are missing, there is a row for each cycle in which light alone held the pose.
+
     Attributes:
         cycles, keyframes, matched: counts. outcomes: how often each reason of a match came. states: of the snapshot.
         loops: each with the stamp of its scan. corrected_m, corrected_rad: largest correction by a match.
@@ -41,15 +43,16 @@ class Ledger:
     corrected_rad: float = 0.0
     jumps: int = 0
     dropped: int = 0
+    _samples: int = 0
     _rows: array[float] = field(default_factory=lambda: array("d"))
     _settled: list[Array] = field(default_factory=list)
 
     def __len__(self) -> int:
-        """Scans that gave a pose."""
+        """Rows: what gave a pose."""
         return len(self._rows) // _FIELDS
 
     def take(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
-        """Take in one cycle; ``stamp`` is the log's for the latest scan, which was measured at ``t_mono``."""
+        """Take in one cycle; ``stamp`` is the log's for the latest scan or block, which was true at ``t_mono``."""
         self.cycles += 1
         self.dropped += len(record.dropped)
         self.states[record.snapshot.state.name] += 1
@@ -59,7 +62,9 @@ class Ledger:
         self.jumps = result.jumps
         if record.limits is not None:
             self._count(result, stamp)
-        if record.scan is not None and pose is not None:
+        lit = record.samples > self._samples and result.lights is not None and result.placed
+        self._samples = record.samples
+        if (record.scan is not None or lit) and pose is not None:
             at = stamp + (result.t_mono - t_mono)
             odom, on_anchor = result.T_odom_base.tolist(), result.T_anchor_base.tolist()
             self._rows.extend((at, result.anchor, *pose, *odom, *on_anchor))

@@ -175,7 +175,8 @@ def _verdict(outcome: Outcome) -> int:
     for sentence in source.report.sentences():
         sys.stderr.write(f"replay: {source.path}: {sentence}\n")
     if not len(rerun.ledger):
-        return cli.fail(f"{source.path}: {source.kind} without a scan that gave a pose")
+        sources = "a scan or light" if rerun.blocks else "a scan"
+        return cli.fail(f"{source.path}: {source.kind} without {sources} that gave a pose")
     if rerun.comparison.differ:
         first = rerun.comparison.first
         sys.stderr.write(f"replay: {rerun.comparison.differ} cycles differ from the recorded run; {first}\n")

@@ -99,7 +99,7 @@ class Rerun:
         self._state = new_state(lights, pipeline.Settings(history=True))
         self._caps = ReplayBudget()
         self._answers: dict[int, tuple[int, ...]] = {}
-        self._scan: tuple[float, float] = (0.0, 0.0)
+        self._latest: tuple[float, float] = (0.0, 0.0)
         self._odometry: RawOdometry | None = None
         self._kept: list[CycleRecord] = []
         self.cycle: Final = Cycle(self._parts(config, lights))
@@ -134,9 +134,10 @@ class Rerun:
         self._arrive(event.t1 if isinstance(event, RawSamples) else event.t_rx)
         if isinstance(event, RawSamples):
             self.blocks += 1
+            self._latest = (self._source.utc(event.t1), event.t1)
             self.cycle.inbox.put_samples(event)
         elif isinstance(event, RawScan):
-            self._scan = (self._source.stamp(event), event.t_mono)
+            self._latest = (self._source.stamp(event), event.t_mono)
             self.cycle.inbox.put_scan(event)
             if not self._source.recorded:
                 self._run()
@@ -219,4 +220,4 @@ class Rerun:
 
     def _keep(self, record: CycleRecord) -> None:
         self._kept.append(record)
-        self.ledger.take(record, *self._scan)
+        self.ledger.take(record, *self._latest)

@@ -83,6 +83,10 @@ class Source(ABC):
     def events(self) -> Iterator[Event]:
         """Everything in order."""
 
+    def utc(self, t_mono: float) -> float:
+        """The log's own stamp for an instant of the virtual clock, where it has one that goes on without scans."""
+        return t_mono
+
     @abstractmethod
     def stamp(self, scan: RawScan) -> float:
         """The log's own stamp, seconds, of a scan it has delivered."""
@@ -217,7 +221,11 @@ class RecordingSource(Source):
 
     def stamp(self, scan: RawScan) -> float:
         """UTC as the recording computer knew it when the recording began, carried on by its monotonic clock."""
-        return self._utc + scan.t_mono
+        return self.utc(scan.t_mono)
+
+    def utc(self, t_mono: float) -> float:
+        """UTC of an instant; see :meth:`stamp`."""
+        return self._utc + t_mono
 
     def events(self) -> Iterator[Event]:
         """Inputs and cycles in the order in which they happened."""

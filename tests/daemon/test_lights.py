@@ -64,7 +64,7 @@ class Bench:
         self.opener = FakeOpener(clock)
         self.opener.plug(LIDAR, self.device)
         self.faults = FaultSchedule({"adc": self.adc})
-        world = World(
+        self.world = World(
             clock,
             opener=self.opener,
             make_worker=CycleWorker,
@@ -76,7 +76,10 @@ class Bench:
             buses=self.buses,
             lights=self.lights if self.light else None,
         )
-        self.daemon = Daemon(settings(self.lidar, self.light, self.level), world)
+        self.daemon = self.make()
+
+    def make(self) -> Daemon:
+        return Daemon(settings(self.lidar, self.light, self.level), self.world)
 
     @property
     def last(self) -> Snapshot:

@@ -1,0 +1,168 @@
+"""A recorded run with lights, replayed: blocks, survey and sample clock come back, poses the same to the last bit."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import re
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from daemon import cli
+from daemon.budget import FixedBudget
+from daemon.lights import Lights, from_header
+from daemon.main import Daemon
+from daemon.record import Recorder, decode_cycle
+from estimator.cdma_profile import PROFILE_A
+from estimator.records import Limits
+from hal.clock import run_virtual
+from hal.odometry import RawOdometry
+from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
+from hal.replay.report import LogReport
+from tests.daemon.lightroom import BUS, SURVEY
+from tests.daemon.test_lights import LIDAR, Bench, decoded, settings
+
+
+class UnevenBudget(FixedBudget):
+    """Caps that change from cycle to cycle, as measured ones do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._caps = itertools.cycle(
+            [Limits(50, 100_000, True, 129), Limits(3, 120, False, 4), Limits(7, 333, True, 40)]
+        )
+
+    def limits(self, budget_us: float) -> Limits:
+        return next(self._caps)
+
+
+class Recorded(Bench):
+    """The bench with a recorder, and wheels that turn."""
+
+    def __init__(self, folder: Path, lidar: bool, lights: Lights) -> None:
+        self.folder = folder
+        super().__init__(lidar=lidar, lights=lights)
+
+    def make(self) -> Daemon:
+        config = settings(self.lidar, True)
+        self.recorder = Recorder(self.folder, config, self.world.clock, self.lights)
+        self.world.make_budget = UnevenBudget
+        return Daemon(config, self.world, self.recorder)
+
+    async def drive(self, seconds: float) -> None:
+        """Odometry at 33 Hz, in step with nothing."""
+        put = self.recorder.on_odometry(self.daemon.cycle.inbox.put_odometry)
+        for _ in range(round(seconds / 0.03)):
+            await asyncio.sleep(0.03)
+            t = self.loop.time()
+            put(RawOdometry(t, t - 0.004, 0.02 * (t - 100.0), 0.0, 0.01 * (t - 100.0)))
+
+
+def record(
+    folder: Path, scenario: Callable[[Recorded], Awaitable[None]], lidar: bool, lights: Lights | None = None
+) -> Recorded:
+    async def go() -> Recorded:
+        bench = Recorded(folder, lidar, lights or Lights(SURVEY, PROFILE_A, 12.5))
+        stop = asyncio.Event()
+        running = asyncio.create_task(bench.daemon.run(stop))
+        try:
+            await scenario(bench)
+        finally:
+            stop.set()
+            await asyncio.wait_for(running, 10.0)
+        return bench
+
+    return run_virtual(go(), start=100.0)
+
+
+def replay(folder: Path, out: Path, *options: str) -> dict[str, dict[str, object]]:
+    assert cli.main(["replay", str(folder), "--out", str(out), *options]) == cli.OK
+    summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
+    return summary
+
+
+async def calm(bench: Recorded) -> None:
+    await bench.until(decoded, 6.0)
+    await bench.drive(3.0)
+
+
+async def eventful(bench: Recorded) -> None:
+    """Stalls, damaged words, the adapter unplugged, the lidar unplugged, other lamps."""
+    await calm(bench)
+    bench.order("what = 'stall'; us = 300; every = 3; for = 1.0")
+    bench.order("what = 'shift'; every = 7; for = 1.0")
+    await bench.drive(1.5)
+    bench.order("what = 'gone'; for = 1.0")
+    await bench.drive(2.5)
+    bench.opener.unplug(LIDAR)
+    await bench.drive(1.0)
+    bench.opener.plug(LIDAR, bench.device)
+    bench.source.under((5, 17, 60))
+    await bench.drive(3.0)
+
+
+@pytest.mark.parametrize(("scenario", "lidar"), [(calm, False), (eventful, True)])
+def test_the_replay_gives_the_same_poses_to_the_last_bit(
+    tmp_path: Path, scenario: Callable[[Recorded], Awaitable[None]], lidar: bool
+) -> None:
+    bench = record(tmp_path / "rec", scenario, lidar)
+    summary = replay(tmp_path / "rec", tmp_path / "out")
+    assert summary["recorded_run"] == {
+        "cycles": bench.daemon.cycle.cycles,
+        "differ": 0,
+        "first_difference": "",
+    }
+    assert summary["counts"]["blocks"] == bench.daemon.adc.status.blocks > 50
+
+
+def test_the_head_keeps_what_the_estimator_was_told(tmp_path: Path) -> None:
+    bench = record(tmp_path, calm, lidar=False)
+    recording = open_recording(tmp_path)
+    assert from_header(recording.header) == bench.lights
+    frames = list(recording.frames(LogReport()))
+    blocks = [frame for frame in frames if frame.kind == Kind.SAMPLES]
+    assert len(blocks) == bench.daemon.adc.status.blocks
+    cycles = [decode_cycle(frame.payload) for frame in frames if frame.kind == Kind.CYCLE]
+    assert {cycle.codes for cycle in cycles} == {129, 4, 40, None}
+    assert cycles[-1].samples == bench.daemon.cycle.blocks
+
+
+def test_a_block_that_is_missing_is_noticed(tmp_path: Path) -> None:
+    record(tmp_path / "rec", calm, lidar=True)
+    (segment,) = (tmp_path / "rec").rglob("*.lumirec")
+    recording = open_recording(tmp_path / "rec")
+    frames = list(recording.frames(LogReport()))
+    lost = [index for index, frame in enumerate(frames) if frame.kind == Kind.SAMPLES][40]
+    kept = frames[:lost] + frames[lost + 1 :]
+    packed = b"".join(pack_frame(frame.kind, frame.channel, frame.t_mono, frame.payload) for frame in kept)
+    segment.write_bytes(pack_head(recording.header) + packed)
+    summary = replay(tmp_path / "rec", tmp_path / "out")
+    assert re.search(r"took block 4[01], recorded is 4[12]", str(summary["recorded_run"]["first_difference"]))
+
+
+def test_another_survey_may_be_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(tmp_path / "rec", calm, lidar=True)
+    missing = tmp_path / "nowhere.toml"
+    arguments = ["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out"), "--set", f"lights.survey={missing}"]
+    assert cli.main(arguments) == cli.FAILED
+    assert "no such survey" in capsys.readouterr().err
+    without = replay(tmp_path / "rec", tmp_path / "out", "--set", "photodiode.bus=")
+    assert without["counts"]["poses"]
+
+
+def test_lights_of_another_version_are_refused_by_name() -> None:
+    header = Lights(SURVEY, PROFILE_A, 3.0).header()
+    assert from_header(msgspec.json.decode(msgspec.json.encode(header))) == Lights(SURVEY, PROFILE_A, 3.0)
+    assert from_header({}) is None
+    for broken in ({"survey": {"lamps": 3}}, {**header["lights"], "profile": "Q"}, 7):
+        with pytest.raises(ValueError, match="not of this version"):
+            from_header({"lights": broken})
+
+
+def test_the_bus_is_named_in_the_configuration_that_is_kept(tmp_path: Path) -> None:
+    record(tmp_path, calm, lidar=False)
+    assert open_recording(tmp_path).header["config"]["photodiode"]["bus"] == BUS
