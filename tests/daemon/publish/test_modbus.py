@@ -1,10 +1,8 @@
-"""The server over real loopback sockets: nobody is lost, nobody is disturbed, nothing is torn."""
+"""The server over real loopback sockets: everybody is answered, exactly once, in turn."""
 
 from __future__ import annotations
 
 import asyncio
-import errno
-import os
 import socket
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -15,25 +13,22 @@ from pymodbus.client import AsyncModbusTcpClient, AsyncModbusUdpClient
 from daemon.publish import modbus, registers
 from daemon.publish.holding import Outcome, Request
 from daemon.publish.modbus import ModbusPublisher
-from hal import inet
-from hal.clock import SystemClock, run_virtual
-from hal.errors import DeviceMissing, DeviceRefused
+from hal.clock import SystemClock
 from hal.odometry import RawOdometry
 from tests.daemon.publish.network import (
     BLOCK,
     closed,
-    plugged,
     publishing,
     read_answer,
     request,
-    taken_port,
     tcp_client,
     udp_client,
     until,
 )
-from tests.daemon.publish.test_registers import snapshot
 
 Client = AsyncModbusTcpClient | AsyncModbusUdpClient
+
+
 CLIENTS = [AsyncModbusTcpClient, AsyncModbusUdpClient]
 
 
@@ -56,9 +51,6 @@ def with_client(
 
 def as_bytes(words: list[int]) -> bytes:
     return b"".join(word.to_bytes(2, "big") for word in words)
-
-
-# --- with pymodbus's clients -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", CLIENTS)
@@ -109,9 +101,6 @@ def test_pymodbus_commands_and_writes_odometry(kind: type[Client]) -> None:
         assert all(r.t_rx - r.t_mono == pytest.approx(0.01) for r in readings)
 
     with_client(kind, body, write=True, on_command=commands.append, on_odometry=readings.append)
-
-
-# --- everybody is answered exactly once ------------------------------------------------------------------------------
 
 
 def test_eight_udp_clients_back_to_back() -> None:
@@ -218,9 +207,6 @@ def test_one_client_with_thousands_of_requests_delays_nobody() -> None:
     asyncio.run(run())
 
 
-# --- no turn of the loop serves more than 64 -------------------------------------------------------------------------
-
-
 def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every client that may be there sends as much as it can; requests served between two turns are counted."""
     per_turn: list[int] = []
@@ -252,312 +238,3 @@ def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> N
 
     asyncio.run(run())
     assert 0 < max(per_turn) <= 64
-
-
-# --- nobody disturbs anybody -----------------------------------------------------------------------------------------
-
-READ_ONE = bytes.fromhex("010400000001")
-MALFORMED = [
-    *(b"", b"\x00", b"\x00\x01\x00", bytes(7), bytes(2000), b"\xff" * 8, b"\xff" * 300),
-    b"\x00\x01\x00\x07\x00\x06" + READ_ONE,  # another protocol
-    *(b"\x00\x01\x00\x00" + length.to_bytes(2, "big") + READ_ONE for length in (0, 5, 7, 254, 0xFFFF)),
-]
-
-
-def test_a_malformed_datagram_disturbs_nobody() -> None:
-    async def run() -> None:
-        async with publishing() as publisher, udp_client(publisher.port) as (good, datagrams):
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bad:
-                for number, rubbish in enumerate(MALFORMED * 5):
-                    bad.sendto(rubbish, ("127.0.0.1", publisher.port))
-                    good.sendto(request(number, *BLOCK))
-                    await datagrams.wait_for(number + 1)
-                with pytest.raises(BlockingIOError):
-                    bad.recv(512, socket.MSG_DONTWAIT)
-            assert [a[:2] for a in datagrams.answers] == [n.to_bytes(2, "big") for n in range(len(MALFORMED) * 5)]
-            assert publisher.counts.malformed == len(MALFORMED) * 5
-
-    asyncio.run(run())
-
-
-@pytest.mark.parametrize("rubbish", [b"\x00\x01\x00\x07\x00\x06\x01\x04", b"GET / HTTP/1.1\r\n\r\n", bytes(300)])
-def test_a_tcp_client_that_does_not_speak_modbus_is_closed(rubbish: bytes) -> None:
-    async def run() -> None:
-        async with publishing() as publisher, tcp_client(publisher.port) as (other, writer):
-            async with tcp_client(publisher.port) as (reader, bad):
-                bad.write(request(1, *BLOCK) + rubbish + request(2, *BLOCK))
-                assert len(await closed(reader)) == 137, "what came before the rubbish is answered"
-            writer.write(request(3, *BLOCK))
-            assert (await read_answer(other))[:2] == b"\x00\x03"
-            assert publisher.counts.malformed == 1
-
-    asyncio.run(run())
-
-
-def test_clients_that_vanish_leave_nothing_behind() -> None:
-    async def run() -> None:
-        async with publishing() as publisher:
-            for number in range(50):
-                _, writer = await asyncio.open_connection("127.0.0.1", publisher.port)
-                writer.write(request(1, *BLOCK) + request(2, *BLOCK)[: number % 12])
-                await writer.drain()
-                writer.transport.abort()
-            await until(lambda: not publisher.counts.connections)
-            async with tcp_client(publisher.port) as (reader, writer):
-                writer.write(request(3, *BLOCK))
-                await read_answer(reader)
-
-    asyncio.run(run())
-
-
-def test_an_answer_that_the_kernel_does_not_take_is_dropped() -> None:
-    class Full(socket.socket):
-        def sendto(self, *_: Any) -> int:
-            raise BlockingIOError(errno.EAGAIN, "no buffer space")
-
-    async def run() -> None:
-        publisher = ModbusPublisher(SystemClock())
-        sock = Full(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.setblocking(False)
-        sock.bind(("127.0.0.1", 0))
-        endpoint = modbus.UdpEndpoint(sock, publisher._responder, publisher.counts)
-        async with udp_client(sock.getsockname()[1]) as (transport, datagrams):
-            transport.sendto(request(1, *BLOCK))
-            transport.sendto(request(2, *BLOCK))
-            await until(lambda: publisher.counts.unsent == 2)
-            assert datagrams.answers == []
-        endpoint.close()
-
-    asyncio.run(run())
-
-
-def test_closing_drops_clients_and_frees_the_port() -> None:
-    async def run() -> None:
-        async with publishing() as publisher:
-            port = publisher.port
-            async with tcp_client(port) as (reader, _):
-                await asyncio.sleep(0.02)
-                await publisher.close()
-                await publisher.close()
-                assert await closed(reader) == b""
-            await publisher.start("127.0.0.1", 0)
-            assert publisher.port != port, "a new start asks for what it is told, not for the old port"
-            again = ModbusPublisher(SystemClock())
-            await again.start("127.0.0.1", port)
-            await again.close()
-
-    asyncio.run(run())
-
-
-# --- torn reads ------------------------------------------------------------------------------------------------------
-
-
-def test_a_read_is_never_torn() -> None:
-    """Every point is set from the snapshot's number; a block that mixes two snapshots could not be consistent."""
-
-    async def run() -> None:
-        async with publishing() as publisher:
-            done = asyncio.Event()
-
-            async def update() -> None:
-                number = 0
-                while not done.is_set():
-                    number += 1
-                    pose = (number / 1e4, -number / 1e4, 0.0)
-                    publisher.publish(snapshot(seq=number, pose=pose, odom=pose, missed=number, loop_new=number))
-                    await asyncio.sleep(0)
-
-            async def check(port: int) -> set[int]:
-                seen = set()
-                async with udp_client(port) as (transport, datagrams):
-                    for index in range(400):
-                        transport.sendto(request(index, *BLOCK))
-                        await datagrams.wait_for(index + 1)
-                        values = registers.decode_block(datagrams.answers[index][9:])
-                        seq = int(values["seq"] or 0)
-                        assert values["map_x"] == seq / 1e4
-                        assert values["odom_y"] == -seq / 1e4
-                        assert values["missed"] == values["loop_new"] == seq
-                        seen.add(seq)
-                return seen
-
-            publisher.publish(snapshot(seq=0, pose=(0.0, 0.0, 0.0), odom=(0.0, 0.0, 0.0), missed=0, loop_new=0))
-            updating = asyncio.create_task(update())
-            seen = await asyncio.gather(*(check(publisher.port) for _ in range(3)))
-            done.set()
-            await updating
-            assert all(len(numbers) > 50 for numbers in seen), "the snapshot must have changed while it was read"
-
-    asyncio.run(run())
-
-
-# --- limits of a connection, in virtual time --------------------------------------------------------------------------
-
-
-def in_virtual_time(body: Callable[[modbus.TcpEndpoint], Coroutine[Any, Any, None]]) -> None:
-    async def run() -> None:
-        publisher = ModbusPublisher(SystemClock())
-        endpoint = modbus.TcpEndpoint(publisher._responder, publisher.counts)
-        await body(endpoint)
-        await endpoint.close()
-
-    run_virtual(run())
-
-
-def test_idle_and_half_open_connections_are_dropped() -> None:
-    async def body(endpoint: modbus.TcpEndpoint) -> None:
-        idle, busy, partial = plugged(endpoint), plugged(endpoint), plugged(endpoint)
-        await asyncio.sleep(30.0)
-        partial[0].data_received(request(1, *BLOCK)[:7])
-        assert not partial[1].gone
-        await asyncio.sleep(modbus.PARTIAL_S - 1.0)
-        assert not partial[1].gone
-        for _ in range(10):
-            busy[0].data_received(request(1, *BLOCK))
-            await asyncio.sleep(7.0)
-        assert idle[1].gone
-        assert partial[1].gone
-        assert not busy[1].gone
-        assert endpoint.counts.dropped == 2
-
-    in_virtual_time(body)
-
-
-def test_a_client_that_trickles_bytes_is_dropped_too() -> None:
-    async def body(endpoint: modbus.TcpEndpoint) -> None:
-        connection, wire = plugged(endpoint)
-        for byte in request(1, *BLOCK)[:11] * 3:
-            if wire.gone:
-                break
-            connection.data_received(bytes([byte]))
-            await asyncio.sleep(modbus.PARTIAL_S - 1.0)
-        assert wire.gone
-
-    in_virtual_time(body)
-
-
-def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> None:
-    async def body(endpoint: modbus.TcpEndpoint) -> None:
-        connection, wire = plugged(endpoint)
-        connection.data_received(request(1, *BLOCK))
-        connection.pause_writing()
-        for _ in range(200):
-            if wire.reading:
-                connection.data_received(request(2, *BLOCK) * 50)
-        assert len(wire.sent) == 137, "nothing more is served"
-        assert not wire.reading, "nothing more is taken in"
-        await asyncio.sleep(modbus.STUCK_S - 2.0)
-        connection.resume_writing()
-        await asyncio.sleep(0.5)
-        assert len(wire.sent) > 137 * 1000
-        assert wire.reading
-        connection.pause_writing()
-        await asyncio.sleep(modbus.STUCK_S + 2.0)
-        assert wire.gone
-
-    in_virtual_time(body)
-
-
-def test_a_full_house_drops_the_longest_idle_or_refuses() -> None:
-    async def body(endpoint: modbus.TcpEndpoint) -> None:
-        house = [plugged(endpoint) for _ in range(modbus.MAX_CONNECTIONS)]
-        _, refused = plugged(endpoint)
-        assert refused.gone
-        assert endpoint.counts.refused == 1
-        await asyncio.sleep(modbus.EVICT_S + 1.0)
-        for connection, _ in house[:5] + house[6:]:
-            connection.data_received(request(1, *BLOCK))
-        _, admitted = plugged(endpoint)
-        assert not admitted.gone
-        assert [number for number, (_, wire) in enumerate(house) if wire.gone] == [5]
-        assert endpoint.counts.connections == modbus.MAX_CONNECTIONS
-
-    in_virtual_time(body)
-
-
-# --- what can go wrong at the start ----------------------------------------------------------------------------------
-
-
-def test_a_port_in_use_is_refused_with_a_remedy() -> None:
-    async def run() -> None:
-        with taken_port() as taken:
-            port = taken.getsockname()[1]
-            with pytest.raises(DeviceRefused, match=rf"Modbus on 127.0.0.1:{port}: the port is in use .*modbus\.port"):
-                await ModbusPublisher(SystemClock()).start("127.0.0.1", port)
-
-    asyncio.run(run())
-
-
-def test_a_udp_port_in_use_leaves_no_tcp_listener_behind() -> None:
-    async def run() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-            taken.bind(("127.0.0.1", 0))
-            port = taken.getsockname()[1]
-            with pytest.raises(DeviceRefused, match="in use"):
-                await ModbusPublisher(SystemClock()).start("127.0.0.1", port)
-        publisher = ModbusPublisher(SystemClock())
-        await publisher.start("127.0.0.1", port)
-        await publisher.close()
-
-    asyncio.run(run())
-
-
-def test_an_address_of_another_computer_is_missing() -> None:
-    async def run() -> None:
-        with pytest.raises(DeviceMissing, match=r"does not have that address .*bind"):
-            await ModbusPublisher(SystemClock()).start("203.0.113.7", 1502)
-
-    asyncio.run(run())
-
-
-def test_a_name_that_is_not_known_is_missing() -> None:
-    async def run() -> None:
-        with pytest.raises(DeviceMissing, match="host name not known"):
-            await ModbusPublisher(SystemClock()).start("no-such-host.invalid", 1502)
-
-    asyncio.run(run())
-
-
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
-def test_a_privileged_port_names_the_capability(number: int) -> None:
-    error = inet.refusal("Modbus on 0.0.0.0:502", "modbus.port", 502, OSError(number, os.strerror(number)))
-    assert isinstance(error, DeviceRefused)
-    assert "CAP_NET_BIND_SERVICE" in error.remedy
-    assert "1502" in error.remedy
-
-
-def test_another_error_keeps_the_systems_words() -> None:
-    error = inet.refusal("Modbus on ::1:1502", "modbus.port", 1502, OSError(errno.ENOBUFS, "No buffer space"))
-    assert "No buffer space" in str(error)
-
-
-@pytest.mark.skipif(not socket.has_ipv6, reason="this computer has no IPv6")
-def test_ipv6_and_all_addresses() -> None:
-    async def run() -> None:
-        for bind in ("::1", ""):
-            publisher = ModbusPublisher(SystemClock())
-            try:
-                await publisher.start(bind, 0)
-            except DeviceMissing:
-                pytest.skip("this computer has no IPv6 loopback address")
-            client = AsyncModbusUdpClient("::1", port=publisher.port)
-            assert await client.connect()
-            assert (await client.read_input_registers(0, count=1)).registers == [0x4C4C]
-            client.close()
-            await publisher.close()
-
-    asyncio.run(run())
-
-
-def test_before_the_first_snapshot_the_state_is_starting() -> None:
-    async def run() -> None:
-        publisher = ModbusPublisher(SystemClock())
-        await publisher.start("127.0.0.1", 0)
-        async with udp_client(publisher.port) as (transport, datagrams):
-            transport.sendto(request(1, *BLOCK))
-            await datagrams.wait_for(1)
-        values = registers.decode_block(datagrams.answers[0][9:])
-        assert (values["seq"], values["state"], values["map_x"]) == (0, 0, None)
-        await publisher.close()
-
-    asyncio.run(run())

@@ -1,0 +1,176 @@
+"""What the driver delivers: intensities, no returns, the same scans from the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from hal.fake.models import ECHOES, PLAIN, UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.hokuyo.driver import HokuyoDriver
+from hal.hokuyo.passive import PassiveHokuyo
+from hal.port import OnData, OnLost, Port
+from tests.hal.hokuyo.bench import PORT, Bench, on_fake
+
+
+class TestIntensity:
+    def run(self, model: LidarModel, check: Callable[[Bench, HokuyoDriver], None], fault: str = "") -> None:
+        async def body(bench: Bench) -> None:
+            if fault:
+                bench.order(fault)
+            driver = bench.driver(intensity=True)
+            await bench.deliver(driver, 30, within=20.0)
+            check(bench, driver)
+
+        on_fake(body, model)
+
+    def test_proved_and_used(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "on"
+            assert driver.status.dialect == "SCIP 2.2 ME"
+            for scan in bench.scans:
+                assert scan.intensity is not None
+                assert (scan.intensity[3:9] == scan.ranges[3:9] // 2).all()
+
+        self.run(UST_10LX, check)
+
+    def test_a_usb_utm_is_not_asked_for_more_than_it_can_bear(self) -> None:
+        """95 degrees times the cluster: all 270 degrees at three steps together."""
+
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.dialect == "SCIP 2.0 ME, 3 steps together"
+            assert {len(scan.ranges) for scan in bench.scans} <= {360, 361}
+            assert bench.scans[0].stride == 3
+
+        self.run(UTM_30LX, check)
+
+    def test_refused(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "off: ME answers 0E"
+            assert driver.status.dialect == "SCIP 2.2 MD"
+            assert bench.scans[0].intensity is None
+
+        self.run(replace(UST_10LX, measures=PLAIN), check)
+
+    def test_all_dark(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "off: every intensity is 0"
+            assert driver.status.dialect == "SCIP 2.2 MD"
+
+        self.run(UST_10LX, check, '[[fault]]\nwhat = "dark"\nfor = 2.0')
+
+    def test_never_arrives(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"] == "off: no scan within 6 s"
+
+        self.run(UST_10LX, check, '[[fault]]\nwhat = "intermittent"\nshare = 1.0\ncount = 1')
+
+    def test_damaged(self) -> None:
+        def check(bench: Bench, driver: HokuyoDriver) -> None:
+            assert driver.status.extra["intensity"].startswith("off: checksum")
+
+        self.run(UST_10LX, check, '[[fault]]\nwhat = "bit_flip"\nbit = 0\ncount = 1')
+
+    def test_a_stream_that_dies_of_it_is_given_up(self) -> None:
+        """One scan with intensities came, the stream brings the sensor down every time: distances alone will do."""
+
+        async def body(bench: Bench) -> None:
+            assert bench.fake is not None
+            assert bench.faults is not None
+            receive, faults = bench.fake.receive, bench.faults
+
+            def weak(data: bytes) -> None:
+                faults.clear()
+                if data.strip().startswith(b"ME") and data.strip().endswith(b"00"):
+                    bench.order('[[fault]]\nwhat = "intermittent"\nshare = 1.0')
+                receive(data)
+
+            bench.fake.receive = weak  # type: ignore[method-assign]  # a weak sensor
+            driver = bench.driver(intensity=True)
+            await bench.deliver(driver, 30, within=40.0)
+            assert driver.status.extra["intensity"] == "off: given up after failures"
+            assert driver.status.dialect == "SCIP 2.2 MD"
+
+        on_fake(body, UST_10LX)
+
+    def test_lost_port_while_proving(self) -> None:
+        async def body(bench: Bench) -> None:
+            driver = bench.driver(intensity=True)
+            bench.order('[[fault]]\nwhat = "hangup"\nwhen = 0.05\nfor = 1.0')
+            await bench.deliver(driver, 30, within=20.0)
+            assert driver.status.extra["intensity"] == "on"
+
+        on_fake(body, replace(UST_10LX, measures=ECHOES), Unit(spin_up_s=2.0))
+
+
+def test_no_return_of_a_ust_is_no_range_even_where_dmax_allows_it() -> None:
+    async def body(bench: Bench) -> None:
+        bench.order('[[fault]]\nwhat = "dmax"\n[[fault]]\nwhat = "codes"\nvalue = 65533\nbeams = 1.0')
+        scans = await bench.deliver(bench.driver(), 10, within=8.0)
+        assert scans[0].geometry.dmax == 262143
+        assert (scans[0].code == 65533).all()
+        assert not scans[0].ranges.any()
+
+    on_fake(body, UST_10LX)
+
+
+@pytest.mark.parametrize("intensity", [False, True])
+def test_what_was_received_gives_the_same_scans_again(intensity: bool) -> None:
+    """A recording of the bytes and their times, heard by the passive listener: the same scans to the last bit."""
+
+    async def body(bench: Bench) -> None:
+        log: list[tuple[bytes, float] | None] = []
+        real = bench.opener
+
+        async def opener(device: str, baud: int) -> Port:
+            port = await real(device, baud)
+            start = port.start
+
+            def tapped(on_data: OnData, on_lost: OnLost) -> None:
+                log.append(None)
+                start(lambda data, t: (log.append((data, t)), on_data(data, t))[0], on_lost)
+
+            port.start = tapped  # type: ignore[method-assign]  # a tap
+            return port
+
+        bench.opener = opener
+        driver = bench.driver(intensity=intensity)
+        async with bench.running(driver):
+            await bench.more(300, 20.0, driver)
+            bench.order('[[fault]]\nwhat = "bit_flip"\ncount = 5')
+            await bench.more(100, 5.0, driver)
+            bench.order('[[fault]]\nwhat = "set_clock"\nms = 77')
+            await bench.more(100, 5.0, driver)
+            bench.order('[[fault]]\nwhat = "hangup"\nfor = 0.5')
+            await bench.more(100, 10.0, driver)
+        listener = PassiveHokuyo(device=PORT)
+        heard = []
+        for entry in log:
+            if entry is None:
+                listener.restart()
+            else:
+                heard += listener.feed(*entry)
+        by_arrival = {scan.t_rx: scan for scan in heard}
+        assert len(bench.scans) >= 600
+        for scan in bench.scans:
+            twin = by_arrival[scan.t_rx]
+            assert (twin.t_mono, twin.t_sigma, twin.t_tick) == (scan.t_mono, scan.t_sigma, scan.t_tick)
+            assert (twin.ranges == scan.ranges).all()
+            assert (twin.code == scan.code).all()
+            assert twin.geometry == scan.geometry
+        if not intensity:
+            assert len(heard) - len(bench.scans) <= 1  # the frame under way when the driver left
+
+    on_fake(body, UST_10LX)
+
+
+def test_sensors_text_is_kept_for_people() -> None:
+    async def body(bench: Bench) -> None:
+        bench.order('[[fault]]\nwhat = "trouble"')
+        driver = bench.driver()
+        await bench.deliver(driver, 10, within=8.0)
+        assert driver.status.extra["state"] == "Trouble!! Error No. =[00->33]"
+        assert driver.status.extra["serial"] == "H0706400"
+
+    on_fake(body)
