@@ -1,6 +1,6 @@
 """Eq. 5-7: the state of the `lights` filter and its prediction, compiled.
 
-State, one float64 vector with its covariance; only the first ``14 + 2 * slots`` elements are in use:
+State, one float64 vector with its covariance; only the first ``15 + 4 * slots`` elements are in use:
 
 =====  ==========================================================================================================
 0-2    x, y, yaw of the base in the map (m, rad)
@@ -9,12 +9,14 @@ State, one float64 vector with its covariance; only the first ``14 + 2 * slots``
 10     common ln gain: dirt on the receiver, supply voltage, its own gain
 11     ln of the diffuse share
 12-13  the receiver's lean beyond what was calibrated (slopes in base_link)
-14..   two per lamp: its ln gain, and its present model error
+14     the receiver's Lambert order beyond what was calibrated: takes up that lamps and receiver are no cosines
+15..   four per lamp: its ln gain, its lean beyond the survey (two slopes), its present model error
 =====  ==========================================================================================================
 
-A model error (walls, a luminaire that is not Lambertian, a floor that is darker here) stays the same while the robot
-stands and changes as it drives on. It is a state of unit variance that fades with the way, scaled per link by how much
-may be wrong there. Twenty epochs a second of the same error therefore do not count as twenty witnesses.
+A lamp's lean also takes up that it shines more to one side. A model error (walls, a luminaire that is not Lambertian,
+a floor that is darker here) stays the same while the robot stands and changes as it drives on. It is a state of unit
+variance that fades with the way, scaled per link by how much may be wrong there. Twenty epochs a second of the same
+error therefore do not count as twenty witnesses.
 """
 
 from __future__ import annotations
@@ -27,12 +29,15 @@ from estimator.kernel import kernel
 from estimator.records import Array
 
 X, Y, YAW, SPEED, SIDE, TURN = range(6)
-SCALE, TURN_SCALE, CURVE, GYRO, COMMON, FLOOR, LEAN_X, LEAN_Y, FIRST = range(6, 15)
-"""Places in the state; lamp k has its gain at ``FIRST + 2 k`` and its model error behind that."""
+SCALE, TURN_SCALE, CURVE, GYRO, COMMON, FLOOR, LEAN_X, LEAN_Y, ORDER, FIRST = range(6, 16)
+"""Places in the state."""
+OWN: Final = 4
+GAIN, TILT_X, TILT_Y, ERROR = range(OWN)
+"""Of the lamp in slot k, from ``FIRST + OWN * k`` on."""
 
 SLOTS: Final = 24
 """Lamps that have states at once; more than a receiver with 120 deg of view uses in a 2.5 m grid."""
-SIZE: Final = FIRST + 2 * SLOTS
+SIZE: Final = FIRST + OWN * SLOTS
 
 
 @kernel("void(f8[::1], f8[:, ::1], i8, f8[:, ::1], f8[:, ::1])")

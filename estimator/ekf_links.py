@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from estimator.ekf import COMMON, FIRST, FLOOR, LEAN_X, LEAN_Y, YAW, X, Y
+from estimator.ekf import COMMON, ERROR, FIRST, FLOOR, LEAN_X, LEAN_Y, ORDER, OWN, TILT_X, TILT_Y, YAW, X, Y
 from estimator.kernel import kernel
-from estimator.optics import COLUMNS, RECEIVER_COLUMNS, expect
+from estimator.optics import COLUMNS, LAMP_COLUMNS, RECEIVER_COLUMNS, expect
 from estimator.records import Array
 
-WIDTH: Final = 9
-"""Elements of the state that one link depends on: pose, common gain, floor, lean, own gain, own model error."""
+WIDTH: Final = 12
+"""Elements of the state that one link depends on: pose; common gain, floor, lean, order; the four of its lamp."""
 
 SLOT, LN, NOISE, SHIFT, SIGMA, LINK_COLUMNS = range(6)
 """Columns of a link: slot, ln of the amplitude, variance of that, ln correction by a residual map, sigma of the model
@@ -30,8 +30,8 @@ OUT_COLUMNS: Final = SLOPES + WIDTH
 BACK: Final = RECEIVER_COLUMNS
 """In a view: from here (x, y, yaw) of the pose at the epoch, seen from the state's pose."""
 MODEL: Final = RECEIVER_COLUMNS + 3
-"""In a view: from here the sigmas of the model: ln, anywhere; share of the diffuse part; lean of a lamp, rad; ln, anew
-at every epoch."""
+"""In a view: from here the sigmas of the model: ln, anywhere; share of the diffuse part; ln, anew at every epoch; ln at
+the edge of view."""
 VIEW_COLUMNS: Final = MODEL + 4
 
 LOG_2PI: Final = 1.8378770664093453
@@ -45,9 +45,9 @@ def element(slot: float, w: int) -> int:
     """Where in the state the ``w``-th of the WIDTH elements of a link in a slot stands."""
     if w < 3:
         return w
-    if w < 7:
+    if w < 8:
         return COMMON + w - 3
-    return FIRST + 2 * int(slot) + w - 7
+    return FIRST + OWN * int(slot) + w - 8
 
 
 @kernel("void(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])")
@@ -63,33 +63,40 @@ def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: 
         out: (L, OUT_COLUMNS), filled.
     """
     rx, pose, J, said = view[:RECEIVER_COLUMNS].copy(), np.empty(3), np.empty(COLUMNS), np.empty(3)
+    lamp = np.empty(LAMP_COLUMNS)
     rx[7] += x[LEAN_X]
     rx[8] += x[LEAN_Y]
+    rx[5] = max(rx[5] + x[ORDER], 0.0)
     c, s = np.cos(x[YAW]), np.sin(x[YAW])
     bx, by = c * view[BACK] - s * view[BACK + 1], s * view[BACK] + c * view[BACK + 1]
     pose[0], pose[1], pose[2] = x[X] + bx, x[Y] + by, x[YAW] + view[BACK + 2]
     floor = np.exp(x[FLOOR])
+    fov2 = max(1.0 / max(rx[6] * rx[6], 1e-2) - 1.0, 1e-2)
     for i in range(links.shape[0]):
         slot = int(links[i, SLOT])
-        expect(lamps[slot], rx, pose, floor, said, J)
+        own = FIRST + OWN * slot
+        lamp[:] = lamps[slot]
+        lamp[5] += x[own + TILT_X]
+        lamp[6] += x[own + TILT_Y]
+        expect(lamp, rx, pose, floor, said, J)
         total = max(said[0], 1e-30)
         direct = said[1] / total
-        own = FIRST + 2 * slot
         model = view[MODEL] if links[i, SIGMA] < 0.0 else links[i, SIGMA]
         tan2 = max(1.0 / max(said[2] * said[2], 1e-2) - 1.0, 0.0)
-        scale = np.sqrt(
-            model * model + ((1.0 - direct) * view[MODEL + 1]) ** 2 + (view[MODEL + 2] * lamps[slot, 4]) ** 2 * tan2
-        )
-        out[i, RESIDUAL] = links[i, LN] - np.log(total) - links[i, SHIFT] - x[COMMON] - x[own] - scale * x[own + 1]
-        out[i, WHITE] = links[i, NOISE] + view[MODEL + 3] ** 2
+        edge = view[MODEL + 3] * (tan2 / fov2) ** 2
+        scale = np.sqrt(model * model + ((1.0 - direct) * view[MODEL + 1]) ** 2 + edge * edge)
+        gain = links[i, SHIFT] + x[COMMON] + x[own]
+        out[i, RESIDUAL] = links[i, LN] - np.log(total) - gain - scale * x[own + ERROR]
+        out[i, WHITE] = links[i, NOISE] + view[MODEL + 2] ** 2
         out[i, DIRECT], out[i, COS_BETA] = direct, said[2]
-        out[i, TOTAL] = total * np.exp(x[COMMON] + x[own] + links[i, SHIFT])
+        out[i, TOTAL] = total * np.exp(gain)
         h = out[i, SLOPES:]
         h[0], h[1] = J[0] / total, J[1] / total
         h[2] = (J[2] - by * J[0] + bx * J[1]) / total
         h[3], h[4] = 1.0, J[4] * floor / total
         h[5], h[6] = J[10] / total, J[11] / total
-        h[7], h[8] = 1.0, scale
+        h[7], h[8], h[11] = J[9] / total, 1.0, scale
+        h[9], h[10] = J[6] / total, J[7] / total
         spread = 0.0
         for v in range(WIDTH):
             for w in range(WIDTH):
@@ -113,7 +120,7 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
         ln of the likelihood of these links together, each one's surprise capped.
     """
     likelihood = 0.0
-    h, a, b, K = np.empty(WIDTH), np.empty(n), np.empty(n), np.empty(n)
+    h, a, b, c, K = np.empty(WIDTH), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     at = np.empty(WIDTH, np.int64)
     lin = around.copy()
     for i in range(links.shape[0]):
@@ -121,17 +128,19 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
         if not noise < np.inf:
             continue
         nu = out[i, RESIDUAL]
+        a[:] = 0.0
         for w in range(WIDTH):
-            at[w], h[w] = element(links[i, SLOT], w), out[i, SLOPES + w]
-            step = x[at[w]] - lin[at[w]]
+            k = at[w] = element(links[i, SLOT], w)
+            h[w] = out[i, SLOPES + w]
+            step = x[k] - lin[k]
             if w == YAW:
                 step = (step + np.pi) % (2.0 * np.pi) - np.pi
             nu -= h[w] * step
+            for j in range(k):  # only the upper triangle is kept up while links are taken in
+                a[j] += P[j, k] * h[w]
+            for j in range(k, n):
+                a[j] += P[k, j] * h[w]
         spread = 0.0
-        for j in range(n):
-            a[j] = 0.0
-            for w in range(WIDTH):
-                a[j] += P[at[w], j] * h[w]
         for w in range(WIDTH):
             spread += h[w] * a[at[w]]
         S = max(spread, 0.0) + noise
@@ -139,10 +148,13 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
         for j in range(n):
             K[j] = a[j] / S
             b[j] = a[j] - K[j] * spread
+            c[j] = noise * K[j] - a[j]
             x[j] += K[j] * nu
         for j in range(n):
             for k in range(j, n):
-                P[j, k] += noise * K[j] * K[k] - K[j] * a[k] - b[j] * K[k]
-                P[k, j] = P[j, k]
+                P[j, k] += K[j] * c[k] - b[j] * K[k]
+    for j in range(n):
+        for k in range(j):
+            P[j, k] = P[k, j]
     x[YAW] = (x[YAW] + np.pi) % (2.0 * np.pi) - np.pi
     return likelihood

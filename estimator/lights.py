@@ -121,7 +121,8 @@ def update(lights: Lights, epoch: LightEpoch, level: float | None = None) -> Lig
     if not lights.tracks:
         seen = sights(lights, epoch, 0.0, 0.0) if usable else []
     lights.t_epoch = max(lights.t_epoch, epoch.t_end)
-    lights.result = describe(lights, [sight.link for sight in seen], epoch)
+    best = lights.tracks[0] if lights.tracks else None
+    lights.result = describe(lights, [sight.link(best) for sight in seen], epoch)
     lights.result = replace(lights.result, gained=gained, gained_by=gained_by)
     return lights.result
 
@@ -167,9 +168,11 @@ def keep_gains(lights: Lights) -> None:
     if len(lights.tracks) != 1 or not settled(lights.tracks[0]):
         return
     track = lights.tracks[0]
+    doubt = np.array((0.03, 0.01, 0.01)) ** 2
     for lamp_id, slot in track.slots.items():
-        at, sigma = ekf.FIRST + 2 * slot, lights.catalogue.by_id[lamp_id].sigma_ln
-        lights.gains[lamp_id] = (float(track.x[at]), min(float(track.P[at, at]) + 0.03**2, sigma**2))
+        at = ekf.FIRST + ekf.OWN * slot
+        fresh = np.array((lights.catalogue.by_id[lamp_id].sigma_ln, *[lights.settings.model.lean] * 2)) ** 2
+        lights.gains[lamp_id] = track.x[at : at + 3].copy(), np.minimum(np.diag(track.P)[at : at + 3] + doubt, fresh)
 
 
 def take_in(lights: Lights, epoch: LightEpoch, middle: float, drop: bool) -> list[Sight]:
@@ -195,8 +198,9 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
     dt = min(max(dt, 0.0), 1e6) if math.isfinite(dt) else 0.0
     keep, grow = np.ones(n), np.zeros(n)
     fade = math.exp(-way / model.fade_m - dt / model.fade_s)
-    keep[ekf.FIRST + 1 : n : 2], grow[ekf.FIRST + 1 : n : 2] = fade, 1.0 - fade * fade
-    grow[ekf.FIRST : n : 2] = model.gain_m**2 * way
+    errors = slice(ekf.FIRST + ekf.ERROR, n, ekf.OWN)
+    keep[errors], grow[errors] = fade, 1.0 - fade * fade
+    grow[ekf.FIRST : n : ekf.OWN] = model.gain_m**2 * way
     grow[ekf.COMMON], grow[ekf.FLOOR] = model.common_m**2 * way, model.floor_m**2 * way
     grow[ekf.GYRO] = 1e-8 * min(dt, 10.0)
     ekf.fade(track.x, track.P, n, keep, grow)
@@ -239,7 +243,7 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
     """Note what was used; when most links contradict for long, look for another place that explains them better."""
     if len(lights.tracks) != 1:
         return
-    states = [sight.link.state for sight in seen]
+    states = [sight.state for sight in seen]
     used, against = (states.count(s) for s in (LinkState.ACCEPTED, LinkState.REJECTED))
     against += states.count(LinkState.OCCLUDED)
     now = lights.course.t_mono

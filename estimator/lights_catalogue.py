@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from estimator.cdma_frame import LampFrame
-from estimator.lamps import Lamp, Survey
+from estimator.lamps import Lamp, Receiver, Survey
 from estimator.optics import pack_lamps
 from estimator.records import Array
 
@@ -37,19 +36,29 @@ def contradicts(frame: LampFrame, code: int, lamp: Lamp) -> bool:
     return code != lamp.code or away > CONTRADICTION_M or power > CONTRADICTION_LN + 3.0 * lamp.sigma_ln
 
 
+def rim_amplitude(lamp: Lamp, rx: Receiver, depth: float) -> float:
+    """What a lamp gives at the very edge of view of a level receiver, A."""
+    h = max(lamp.z - rx.z, 0.1)
+    nadir = (lamp.order + 1.0) * rx.area_m2 / (2.0 * math.pi * h * h) * rx.responsivity
+    return depth * lamp.power_w * nadir * math.pow(math.cos(min(rx.half_fov_rad, 1.5)), lamp.order + rx.order + 2.0)
+
+
 @dataclass(slots=True, eq=False)
 class Catalogue:
     """Lamps by number and by code.
 
     Attributes:
         by_id, by_code: the lamps. surveyed: numbers of those that the survey names. rows: by number, for the kernels.
+        rims: by number, what each gives at the very edge of view of a level receiver, A.
     """
 
     depth: float
+    receiver: Receiver
     by_id: dict[int, Lamp] = field(default_factory=dict)
     by_code: dict[int, list[Lamp]] = field(default_factory=dict)
     surveyed: set[int] = field(default_factory=set)
     rows: dict[int, Array] = field(default_factory=dict)
+    rims: dict[int, float] = field(default_factory=dict)
 
     def add(self, lamp: Lamp) -> None:
         """Take a lamp in; one of the same number is replaced."""
@@ -59,6 +68,7 @@ class Catalogue:
         self.by_id[lamp.lamp_id] = lamp
         self.by_code.setdefault(lamp.code, []).append(lamp)
         self.rows[lamp.lamp_id] = np.ascontiguousarray(pack_lamps([lamp], self.depth)[0])
+        self.rims[lamp.lamp_id] = rim_amplitude(lamp, self.receiver, self.depth)
 
     def learn(self, frame: LampFrame, code: int) -> tuple[Lamp, bool]:
         """The lamp that says this of itself, and whether the survey (which wins) knows it otherwise."""
@@ -79,15 +89,10 @@ def catalogue_of(survey: Survey) -> Catalogue:
     Raises:
         ValueError: two lamps have one number.
     """
-    catalogue = Catalogue(survey.depth)
+    catalogue = Catalogue(survey.depth, survey.receiver)
     for lamp in survey.lamps:
         if lamp.lamp_id in catalogue.by_id:
             raise ValueError(f"the survey has lamp {lamp.lamp_id} twice; lamp numbers must be unique in the building")
         catalogue.add(lamp)
         catalogue.surveyed.add(lamp.lamp_id)
     return catalogue
-
-
-def near(lamps: Iterable[Lamp], x: float, y: float) -> list[Lamp]:
-    """Lamps by their horizontal distance from a point, nearest first."""
-    return sorted(lamps, key=lambda lamp: math.hypot(lamp.x - x, lamp.y - y))

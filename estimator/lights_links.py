@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +14,17 @@ from estimator.lights_state import Lights, Pause, Track, Watch
 from estimator.optics import pack_receiver
 from estimator.records import Array
 from estimator.result import Link, LinkState
+
+ACCEPTED, OCCLUDED, REJECTED, RIM, FAINT, TWIN, UNSURVEYED = (
+    LinkState.ACCEPTED,
+    LinkState.OCCLUDED,
+    LinkState.REJECTED,
+    LinkState.RIM,
+    LinkState.FAINT,
+    LinkState.TWIN,
+    LinkState.UNSURVEYED,
+)
+FAINT_FLAG, TWIN_FLAG = int(LinkFlag.FAINT), int(LinkFlag.TWIN)  # an enum's lookups would be half of an update
 
 TWIN_SHARE = 0.1
 """A second lamp of the same code adds to a link when it would be received at this share of the first or more."""
@@ -29,39 +40,62 @@ STRIKES = 2
 
 @dataclass(slots=True, eq=False)
 class Sight:
-    """One link of an epoch as a hypothesis sees it."""
+    """One link of an epoch as a hypothesis sees it; the fields are those of `result.Link`."""
 
-    link: Link
+    code: int
+    amplitude: float
+    variance: float
+    state: LinkState = UNSURVEYED
     lamp: Lamp | None = None
-    variance: float = 0.0
+    contradicted: bool = False
+    slot: int = -1
+    residual: float | None = None
+    sigma: float | None = None
+
+    def link(self, track: Track | None) -> Link:
+        """As others are told."""
+        known = self.lamp is not None and self.state is not TWIN
+        link_id = self.lamp.lamp_id if self.lamp is not None and known else None
+        gain, spread = 0.0, 0.0
+        if track is not None and self.slot >= 0:
+            at = ekf.FIRST + ekf.OWN * self.slot
+            gain = float(track.x[at] + track.x[ekf.COMMON])
+            spread = float(track.P[at, at] + track.P[ekf.COMMON, ekf.COMMON] + 2.0 * track.P[at, ekf.COMMON])
+        sigma = math.sqrt(max(spread, 0.0))
+        residual, of_it = self.residual, self.sigma
+        return Link(self.code, link_id, self.state, self.amplitude, residual, of_it, gain, sigma, self.contradicted)
 
 
 def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
     """The links of an epoch with the lamps they come from if the receiver is near a place, strongest first."""
+    rows = zip(
+        epoch.ids.tolist(),
+        epoch.amplitude.tolist(),
+        epoch.variance.tolist(),
+        epoch.flags.tolist(),
+        epoch.lamps,
+        strict=True,
+    )
     found = []
-    for i in np.argsort(-epoch.amplitude):
-        code, amplitude, variance = int(epoch.ids[i]), float(epoch.amplitude[i]), float(epoch.variance[i])
-        sight = Sight(Link(code, None, LinkState.UNSURVEYED, amplitude), variance=variance)
-        found.append(sight)
+    for code, amplitude, variance, flags, frame in rows:
         if not (math.isfinite(amplitude) and variance >= 0.0):
-            sight.link = replace(sight.link, state=LinkState.FAINT, amplitude=0.0)
+            found.append(Sight(code, 0.0, math.inf, FAINT))
             continue
-        frame = epoch.lamps[i]
-        twin = bool(epoch.flags[i] & LinkFlag.TWIN)
+        sight = Sight(code, amplitude, variance)
+        found.append(sight)
         if frame is not None:
-            sight.lamp, contradicted = lights.catalogue.learn(frame, code)
-            sight.link = replace(sight.link, contradicted=contradicted)
+            sight.lamp, sight.contradicted = lights.catalogue.learn(frame, code)
+            alone = True
         else:
             sight.lamp, alone = nearest(lights, code, x, y)
-            twin = twin or not alone
+            alone = alone and not flags & TWIN_FLAG
         if sight.lamp is None:
             continue
-        state = LinkState.ACCEPTED
-        if bool(epoch.flags[i] & LinkFlag.FAINT) or amplitude < lights.settings.faint * math.sqrt(variance):
-            state = LinkState.FAINT
-        elif twin and frame is None:
-            state = LinkState.TWIN
-        sight.link = replace(sight.link, lamp_id=None if state is LinkState.TWIN else sight.lamp.lamp_id, state=state)
+        if flags & FAINT_FLAG or amplitude <= lights.settings.faint * math.sqrt(variance):
+            sight.state = FAINT
+        else:
+            sight.state = ACCEPTED if alone else TWIN
+    found.sort(key=lambda sight: -sight.amplitude)
     return found
 
 
@@ -82,14 +116,6 @@ def below(lights: Lights, lamp: Lamp, x: float, y: float) -> float:
     d2 = h2 + (lamp.x - x) ** 2 + (lamp.y - y) ** 2
     fall = math.pow(h2 / d2, 0.5 * (lamp.order + receiver.order))
     return lamp.power_w * fall / d2
-
-
-def rim_amplitude(lights: Lights, lamp: Lamp) -> float:
-    """What a lamp gives at the very edge of view of a level receiver, A."""
-    rx, h = lights.survey.receiver, max(lamp.z - lights.survey.receiver.z, 0.1)
-    nadir = (lamp.order + 1.0) * rx.area_m2 / (2.0 * math.pi * h * h) * rx.responsivity
-    fall = math.pow(math.cos(min(rx.half_fov_rad, 1.5)), lamp.order + rx.order + 2.0)
-    return lights.survey.depth * lamp.power_w * nadir * fall
 
 
 def slot_of(lights: Lights, track: Track, lamp: Lamp, busy: set[int]) -> int | None:
@@ -114,19 +140,26 @@ def slot_of(lights: Lights, track: Track, lamp: Lamp, busy: set[int]) -> int | N
 def vacate(lights: Lights, track: Track, slot: int) -> None:
     """Remember what is known of the lamp in a slot and take it out."""
     lamp_id = next(key for key, value in track.slots.items() if value == slot)
-    at = ekf.FIRST + 2 * slot
-    lights.gains[lamp_id] = (float(track.x[at]), float(track.P[at, at]))
+    at = ekf.FIRST + ekf.OWN * slot
+    lights.gains[lamp_id] = track.x[at : at + 3].copy(), np.diag(track.P)[at : at + 3].copy()
     del track.slots[lamp_id]
+
+
+def remembered(lights: Lights, lamp: Lamp) -> tuple[Array, Array]:
+    """Means and variances of a lamp's (ln gain, lean x, lean y) as known from before, else as surveyed."""
+    lean = lights.settings.model.lean
+    new = np.zeros(3), np.array((lamp.sigma_ln**2, lean**2, lean**2))
+    return lights.gains.get(lamp.lamp_id, new)
 
 
 def occupy(lights: Lights, track: Track, lamp: Lamp, slot: int) -> None:
     """Give a lamp a slot, with what is known of its gain from before."""
-    at = ekf.FIRST + 2 * slot
-    for j in (at, at + 1):
-        ekf.cut(track.P, track.n, j)
-    gain, variance = lights.gains.get(lamp.lamp_id, (0.0, lamp.sigma_ln**2))
-    track.x[at], track.P[at, at] = gain, variance
-    track.x[at + 1], track.P[at + 1, at + 1] = 0.0, 1.0
+    at = ekf.FIRST + ekf.OWN * slot
+    mean, variance = remembered(lights, lamp)
+    for j in range(ekf.OWN):
+        ekf.cut(track.P, track.n, at + j)
+        track.x[at + j] = 0.0 if j == ekf.ERROR else mean[j]
+        track.P[at + j, at + j] = 1.0 if j == ekf.ERROR else variance[j]
     track.slots[lamp.lamp_id] = slot
 
 
@@ -134,14 +167,14 @@ def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight],
     """The sights that can be compared with a hypothesis, and their rows for the kernels."""
     rows, kept, busy = [], [], set[int]()
     for sight in seen:
-        if sight.lamp is None or sight.link.state is not LinkState.ACCEPTED or sight.lamp.lamp_id in busy:
+        if sight.lamp is None or sight.state is not ACCEPTED:
             continue
-        slot = slot_of(lights, track, sight.lamp, {track.slots[k] for k in busy})
-        if slot is None:
+        slot = slot_of(lights, track, sight.lamp, busy)
+        if slot is None or slot in busy:
             continue
-        busy.add(sight.lamp.lamp_id)
-        amplitude = sight.link.amplitude
-        rows.append((slot, math.log(amplitude), sight.variance / amplitude**2, 0.0, -1.0))
+        busy.add(slot)
+        sight.slot = slot
+        rows.append((slot, math.log(sight.amplitude), sight.variance / sight.amplitude**2, 0.0, -1.0))
         kept.append(sight)
     links = np.array(rows, dtype=np.float64).reshape(len(rows), ekf_links.LINK_COLUMNS)
     if lights.corrections is not None and kept:
@@ -155,7 +188,7 @@ def view_of(lights: Lights, back: Array) -> Array:
     """What the kernels need besides state and links."""
     model = lights.settings.model
     return np.concatenate(
-        [pack_receiver(lights.survey.receiver), back, (model.ln, model.floor, model.lean, model.white)]
+        [pack_receiver(lights.survey.receiver), back, (model.ln, model.floor, model.white, model.edge)]
     )
 
 
@@ -165,33 +198,30 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, level_dro
     Gating waits until the place is known well; before, a deviation is held against the link only softly, because it
     may as well be the place or a gain that is wrong.
     """
-    cos_rim = math.cos(max(lights.survey.receiver.half_fov_rad - lights.settings.rim_rad, 0.1))
+    half, rim = lights.survey.receiver.half_fov_rad, lights.settings.rim_rad
+    cos_rim, cos_out = math.cos(max(half - rim, 0.1)), math.cos(half + rim)
     gating = settled(track)
-    for i, sight in enumerate(kept):
-        r = float(out[i, ekf_links.RESIDUAL])
-        S = float(out[i, ekf_links.SPREAD] + out[i, ekf_links.WHITE])
-        state = LinkState.ACCEPTED
-        if out[i, ekf_links.COS_BETA] < cos_rim or out[i, ekf_links.DIRECT] < 0.5:
-            strong = sight.link.amplitude > 2.0 * rim_of(lights, track, sight)
-            state = LinkState.REJECTED if strong and gating else LinkState.RIM
+    for i, (sight, row) in enumerate(zip(kept, out[:, : ekf_links.SLOPES].tolist(), strict=True)):
+        r, S = row[ekf_links.RESIDUAL], row[ekf_links.SPREAD] + row[ekf_links.WHITE]
+        sight.residual, sight.sigma = r, math.sqrt(max(S, 0.0))
+        if row[ekf_links.COS_BETA] < cos_rim or row[ekf_links.DIRECT] < 0.5:
+            outside = gating and row[ekf_links.COS_BETA] < cos_out
+            sight.state = REJECTED if outside and sight.amplitude > rim_of(lights, track, sight) else RIM
         elif gating:
-            state = gate(lights, track, sight, (r, S), level_drop)
+            sight.state = gate(lights, track, sight, level_drop)
         elif r * r > 4.0 * S:
             out[i, ekf_links.WHITE] += 0.25 * r * r - S
-        if state is not LinkState.ACCEPTED:
+        if sight.state is not ACCEPTED:
             out[i, ekf_links.WHITE] = math.inf
-        at = ekf.FIRST + 2 * int(track.slots[sight.link.lamp_id]) if sight.link.lamp_id is not None else ekf.FIRST
-        spread = track.P[at, at] + track.P[ekf.COMMON, ekf.COMMON] + 2.0 * track.P[at, ekf.COMMON]
-        gain, sigma_gain = float(track.x[at] + track.x[ekf.COMMON]), math.sqrt(max(float(spread), 0.0))
-        sight.link = replace(sight.link, state=state, residual=r, sigma=math.sqrt(S), gain=gain, sigma_gain=sigma_gain)
     shorten(lights, kept, out)
 
 
 def rim_of(lights: Lights, track: Track, sight: Sight) -> float:
     """What this link's lamp would give at the edge of view, with its gain as learned, A."""
-    assert sight.lamp is not None
-    at = ekf.FIRST + 2 * track.slots[sight.lamp.lamp_id]
-    return rim_amplitude(lights, sight.lamp) * math.exp(float(track.x[ekf.COMMON] + track.x[at]))
+    if sight.lamp is None:
+        return math.inf
+    gain = float(track.x[ekf.COMMON] + track.x[ekf.FIRST + ekf.OWN * sight.slot])
+    return lights.catalogue.rims[sight.lamp.lamp_id] * math.exp(gain)
 
 
 def settled(track: Track) -> bool:
@@ -200,14 +230,15 @@ def settled(track: Track) -> bool:
     return bool(P[0, 0] + P[1, 1] < 0.2**2 and P[2, 2] < 0.15**2)
 
 
-def gate(lights: Lights, track: Track, sight: Sight, off: tuple[float, float], level_drop: bool) -> LinkState:
+def gate(lights: Lights, track: Track, sight: Sight, level_drop: bool) -> LinkState:
     """One link's NIS gate, narrower downwards: things in the way only ever take light away."""
-    r, S = off
     settings, t, way = lights.settings, lights.course.t_mono, lights.course.way
-    assert sight.lamp is not None
+    if sight.lamp is None or sight.residual is None or sight.sigma is None:
+        return RIM
+    r, sigma = sight.residual, sight.sigma
     watch = track.watches.setdefault(sight.lamp.lamp_id, Watch())
-    weak = settings.weak * (0.67 if level_drop else 1.0)
-    low, high = r < -weak * math.sqrt(S), r > settings.strong * math.sqrt(S)
+    low = r < -settings.weak * (0.67 if level_drop else 1.0) * sigma
+    high = r > settings.strong * sigma
     if low or high:
         watch.t_bad, watch.way_bad = t, way
         if math.isinf(watch.t_run):
@@ -215,11 +246,11 @@ def gate(lights: Lights, track: Track, sight: Sight, off: tuple[float, float], l
         watch.count += 1
         watch.total += r
         watch.square += r * r
-        return LinkState.REJECTED if high else LinkState.OCCLUDED
+        return REJECTED if high else OCCLUDED
     if t - watch.t_bad < settings.wait_s or way - watch.way_bad < settings.wait_m:
-        return LinkState.OCCLUDED
+        return OCCLUDED
     watch.t_run = math.inf
-    return LinkState.ACCEPTED
+    return ACCEPTED
 
 
 def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
@@ -227,7 +258,7 @@ def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
     n = lights.settings.link_n
     if n <= 0:
         return
-    clear = [i for i, sight in enumerate(kept) if sight.link.state is LinkState.ACCEPTED]
+    clear = [i for i, sight in enumerate(kept) if sight.state is ACCEPTED]
     drop = clear if lights.settings.pause is Pause.PAPER and len(clear) < n else clear[n:]
     out[drop, ekf_links.WHITE] = math.inf
 
@@ -240,7 +271,7 @@ def relearn(lights: Lights, track: Track) -> None:
             continue
         mean = watch.total / watch.count
         if watch.square / watch.count - mean * mean < STEADY**2:
-            at = ekf.FIRST + 2 * track.slots[lamp_id]
+            at = ekf.FIRST + ekf.OWN * track.slots[lamp_id]
             ekf.cut(track.P, track.n, at)
             track.x[at] += mean
             track.P[at, at] = 0.3**2

@@ -10,11 +10,10 @@ import numpy as np
 from estimator import ekf, ekf_start, se2
 from estimator.cdma_epoch import LightEpoch
 from estimator.lamps import Lamp
-from estimator.lights_links import DIFFUSE, Sight, rim_amplitude, sights
+from estimator.lights_links import ACCEPTED, DIFFUSE, Sight, remembered, sights
 from estimator.lights_state import Lights, Track
 from estimator.optics import pack_lamps, pack_receiver
 from estimator.records import Array
-from estimator.result import LinkState
 
 LEAST = 3
 """Links without which there is no start: two leave two places, and their gains are not known."""
@@ -83,10 +82,10 @@ def direct(lights: Lights, epoch: LightEpoch, seed: Lamp) -> list[Sight]:
     """The links that have come straight, each from the lamp it comes from if the receiver is near ``seed``."""
     used = []
     for sight in sights(lights, epoch, seed.x, seed.y):
-        if sight.lamp is None or sight.link.state is not LinkState.ACCEPTED:
+        if sight.lamp is None or sight.state is not ACCEPTED:
             continue
-        gain = lights.gains.get(sight.lamp.lamp_id, (0.0, 0.0))[0]
-        if sight.link.amplitude > DIFFUSE * math.exp(gain) * rim_amplitude(lights, sight.lamp):
+        gain = float(remembered(lights, sight.lamp)[0][0])
+        if sight.amplitude > DIFFUSE * math.exp(gain) * lights.catalogue.rims[sight.lamp.lamp_id]:
             used.append(sight)
     return used
 
@@ -98,9 +97,9 @@ def minima(lights: Lights, used: list[Sight]) -> list[Place]:
     receiver = replace(lights.survey.receiver, x=0.0, y=0.0, slope_x=0.0, slope_y=0.0)
     links = np.zeros((len(used), 2))
     for i, (sight, lamp) in enumerate(zip(used, lamps, strict=True)):
-        gain, variance = lights.gains.get(lamp.lamp_id, (0.0, lamp.sigma_ln**2))
+        gain, variance = (float(of[0]) for of in remembered(lights, lamp))
         lean = math.hypot(lights.survey.receiver.slope_x, lights.survey.receiver.slope_y)
-        links[i] = math.log(sight.link.amplitude) - gain, variance + 0.06**2 + (1.5 * lean) ** 2
+        links[i] = math.log(sight.amplitude) - gain, variance + 0.06**2 + (1.5 * lean) ** 2
     reach = (lamps[0].z - receiver.z) * math.tan(min(receiver.half_fov_rad, 1.3)) + STEP_M
     poses = grid(lamps[0].x, lamps[0].y, max(reach, 1.0))
     out = np.zeros((len(poses), 3))
@@ -154,6 +153,7 @@ def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track |
         ekf.FLOOR: model.floor_ln,
         ekf.LEAN_X: model.tilt,
         ekf.LEAN_Y: model.tilt,
+        ekf.ORDER: model.order,
     }
     track.x[ekf.FLOOR] = math.log(max(lights.survey.floor, 1e-4))
     for j, sigma in variance.items():

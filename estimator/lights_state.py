@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from estimator import se2
-from estimator.ekf import FIRST, SIZE, SLOTS
+from estimator.ekf import FIRST, OWN, SIZE, SLOTS
 from estimator.lamps import Survey
 from estimator.lights_catalogue import Catalogue
 from estimator.optics import LAMP_COLUMNS
@@ -46,10 +46,10 @@ class MotionErrors:
         speed: what a robot without odometry may go at, m/s.
     """
 
-    slip: float = 0.012
-    side: float = 0.006
-    turn: float = 0.02
-    wander: float = 0.008
+    slip: float = 0.009
+    side: float = 0.004
+    turn: float = 0.015
+    wander: float = 0.006
     idle_m: float = 0.0005
     idle_rad: float = 0.0005
     scale: float = 0.02
@@ -69,21 +69,24 @@ class ModelErrors:
 
     Attributes:
         ln: of any link (walls, shape of the luminaire). floor: share of the diffuse part that differs from place to
-            place. lean: of a lamp, rad. white: ln, anew at every epoch (stamps, decoder).
+            place. lean: of a lamp beyond the survey, slope. white: ln, anew at every epoch (stamps, decoder).
+        edge: ln at the edge of view, falling off inward with the fourth power. order: of the receiver's Lambert order.
         fade_m, fade_s: way and time after which they are others.
         common: ln gain common to all lamps, at the start. floor_ln: ln of the diffuse share. tilt: receiver, slope.
         gain_m, common_m, floor_m: how the lamps' gains, the common one and the floor wander, ln per root metre.
     """
 
-    ln: float = 0.025
+    ln: float = 0.02
     floor: float = 0.5
-    lean: float = 0.02
+    lean: float = 0.05
     white: float = 0.005
-    fade_m: float = 0.7
+    edge: float = 0.06
+    order: float = 0.1
+    fade_m: float = 2.0
     fade_s: float = 600.0
     common: float = 0.25
     floor_ln: float = 0.5
-    tilt: float = 0.01
+    tilt: float = 0.005
     gain_m: float = 0.003
     common_m: float = 0.003
     floor_m: float = 0.02
@@ -109,7 +112,7 @@ class LightsSettings:
     strong: float = 3.5
     wait_s: float = 0.5
     wait_m: float = 0.15
-    rim_rad: float = 0.07
+    rim_rad: float = 0.14
     faint: float = 5.0
     headings: int = 8
     decided: float = 0.99
@@ -157,7 +160,7 @@ class Track:
     @property
     def n(self) -> int:
         """Elements of the state in use."""
-        return FIRST + 2 * self.used
+        return FIRST + OWN * self.used
 
 
 @dataclass(slots=True, eq=False)
@@ -193,7 +196,7 @@ class Lights:
 
     Attributes:
         tracks: hypotheses, likeliest first; one when the place is known, none before a start.
-        gains: by lamp ID, (ln gain, its variance) of lamps that have left the slots.
+        gains: by lamp ID, means and variances of (ln gain, lean x, lean y) of lamps that have left the slots.
         t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: where the start began.
         t_lost: since when most links contradict, inf if they do not. absent: by lamp ID, (instant, way) since which it
             should be received but is not.
@@ -206,7 +209,7 @@ class Lights:
     catalogue: Catalogue
     course: Course = field(default_factory=Course)
     tracks: list[Track] = field(default_factory=list)
-    gains: dict[int, tuple[float, float]] = field(default_factory=dict)
+    gains: dict[int, tuple[Array, Array]] = field(default_factory=dict)
     t_epoch: float = -math.inf
     way_epoch: float = 0.0
     t_used: float = -math.inf

@@ -1,5 +1,7 @@
 """The compiled filter against textbook matrices, and its covariance against time."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,9 +11,9 @@ from estimator.optics import expected, pack_lamps, pack_receiver
 from estimator.records import Array
 from tests.estimator.light_room import LAMPS, RECEIVER
 
-N = ekf.FIRST + 2 * len(LAMPS)
+N = ekf.FIRST + ekf.OWN * len(LAMPS)
 BACK = np.array((0.03, -0.01, 0.04))
-MODEL = (0.03, 0.5, 0.02, 0.005)
+MODEL = (0.03, 0.5, 0.005, 0.08)
 
 
 def state(seed: int) -> tuple[Array, Array]:
@@ -48,24 +50,33 @@ def slow_row(x: Array, link: Array) -> tuple[float, Array, float]:
 
     def predicted(z: Array) -> float:
         receiver = RECEIVER.__class__(
-            x=RECEIVER.x, y=RECEIVER.y, z=RECEIVER.z, slope_x=float(z[ekf.LEAN_X]), slope_y=float(z[ekf.LEAN_Y])
+            x=RECEIVER.x,
+            y=RECEIVER.y,
+            z=RECEIVER.z,
+            order=RECEIVER.order + float(z[ekf.ORDER]),
+            slope_x=float(z[ekf.LEAN_X]),
+            slope_y=float(z[ekf.LEAN_Y]),
         )
         pose = se2.compose(z[:3], BACK)
         k = int(link[ekf_links.SLOT])
-        seen = expected([LAMPS[k]], Survey(LAMPS, receiver), pose, float(np.exp(z[ekf.FLOOR])))
+        own = ekf.FIRST + ekf.OWN * k
+        gain, lean_x, lean_y, error = z[own : own + 4].tolist()
+        lamp = dataclasses.replace(LAMPS[k], slope_x=lean_x, slope_y=lean_y)
+        seen = expected([lamp], Survey(LAMPS, receiver), pose, float(np.exp(z[ekf.FLOOR])))
         direct = seen.direct[0] / seen.amplitude[0]
         scale = np.sqrt(
-            MODEL[0] ** 2 + ((1 - direct) * MODEL[1]) ** 2 + (MODEL[2] * LAMPS[k].order * np.tan(seen.beta_rad[0])) ** 2
+            MODEL[0] ** 2
+            + ((1 - direct) * MODEL[1]) ** 2
+            + (MODEL[3] * (np.tan(seen.beta_rad[0]) / np.tan(RECEIVER.half_fov_rad)) ** 4) ** 2
         )
-        own = ekf.FIRST + 2 * k
-        return float(np.log(seen.amplitude[0]) + link[ekf_links.SHIFT] + z[ekf.COMMON] + z[own] + scale * z[own + 1])
+        return float(np.log(seen.amplitude[0]) + link[ekf_links.SHIFT] + z[ekf.COMMON] + gain + scale * error)
 
     H = np.zeros(N)
     for j in range(N):
         step = np.zeros(ekf.SIZE)
         step[j] = 1e-5
         H[j] = (predicted(x + step) - predicted(x - step)) / 2e-5
-    return float(link[ekf_links.LN] - predicted(x)), H, float(link[ekf_links.NOISE] + MODEL[3] ** 2)
+    return float(link[ekf_links.LN] - predicted(x)), H, float(link[ekf_links.NOISE] + MODEL[2] ** 2)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -97,7 +108,7 @@ def test_slopes_of_a_link_are_its_derivatives() -> None:
     x, P = state(7)
     links = links_of(x, [5, 6, 9], 7)
     out = np.zeros((3, ekf_links.OUT_COLUMNS))
-    x[ekf.FIRST + 1 : N : 2] = 0.0  # at model errors of zero the scale's own derivative does not matter
+    x[ekf.FIRST + ekf.ERROR : N : ekf.OWN] = 0.0  # at model errors of zero the scale's own derivative does not matter
     ekf_links.linearise(x, P, links, lamp_table(), view(), out)
     for i, link in enumerate(links):
         H = slow_row(x, link)[1]
@@ -152,7 +163,7 @@ def test_a_motion_is_propagated_as_by_the_textbook(seed: int) -> None:
 def test_fading_and_cutting() -> None:
     x, P = state(2)
     keep, grow = np.ones(N), np.zeros(N)
-    keep[ekf.FIRST + 1], grow[ekf.FIRST + 1], grow[ekf.COMMON] = 0.5, 0.75, 1e-3
+    keep[ekf.FIRST + 3], grow[ekf.FIRST + 3], grow[ekf.COMMON] = 0.5, 0.75, 1e-3
     D = np.diag(keep)
     got_x, got_P = x.copy(), P.copy()
     ekf.fade(got_x, got_P, N, keep, grow)
@@ -169,7 +180,7 @@ def test_covariance_stays_symmetric_and_positive_over_ten_thousand_epochs() -> N
     rng = np.random.default_rng(5)
     x, P = state(5)
     keep, grow = np.ones(N), np.zeros(N)
-    keep[ekf.FIRST + 1 : N : 2], grow[ekf.FIRST + 1 : N : 2] = 0.99, 1 - 0.99**2
+    keep[ekf.FIRST + ekf.ERROR : N : ekf.OWN], grow[ekf.FIRST + ekf.ERROR : N : ekf.OWN] = 0.99, 1 - 0.99**2
     out = np.zeros((8, ekf_links.OUT_COLUMNS))
     for _ in range(10_000):
         ekf.move(x, P, N, np.array((0.01, 0.0, 0.02)), np.array((0, 0, 0, 0.02, 0.01, 0, 1.0)), np.full(3, 1e-8))
