@@ -46,16 +46,17 @@ def fail(message: str, code: int = FAILED) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="lumiloop",
-        description="Indoor robot localisation from a 2D lidar: a pose over Modbus and UDP. Not a safety function.",
+        description="Indoor robot localisation from a 2D lidar and coded ceiling lights: a pose over Modbus and UDP. "
+        "Not a safety function.",
     )
     _print_option(parser, "--version", _version, "the version")
     _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
     _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
     _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    _run(commands.add_parser("run", help="read the lidar, publish the pose, until stopped"))
-    _check(commands.add_parser("check", help="say whether a configuration file is good"))
-    _probe(commands.add_parser("probe", help="find lidars and say what they are"))
+    _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
+    _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
+    _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
     _status(commands.add_parser("status", help="show what a running daemon publishes"))
     _map(commands.add_parser("map", help="work with maps"))
@@ -88,7 +89,7 @@ def _run(parser: argparse.ArgumentParser) -> None:
 def _check(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
     _config_arguments(parser, file=False)
-    parser.set_defaults(body=_configured(_good))
+    parser.set_defaults(body=_later("daemon.check", "main"))
 
 
 def _probe(parser: argparse.ArgumentParser) -> None:
@@ -161,11 +162,6 @@ def _configured(body: Body) -> Body:
         return body(args)
 
     return resolve_and_run
-
-
-def _good(args: argparse.Namespace) -> int:
-    sys.stdout.write(f"{args.config}: good\n")
-    return OK
 
 
 def _version() -> str:

@@ -145,8 +145,8 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
             raise ValueError(
                 f"Expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port in `bus`, got `{self.bus}`"
             )
-        name, address, channel = parse_chip(self.converter)
         try:
+            name, address, channel = parse_chip(self.converter)
             chip = chip_named(name)
         except ValueError as error:
             raise ValueError(f"{error} in `converter`") from None
@@ -161,10 +161,10 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     def _check_level(self, converter: int) -> None:
         from hal.photodiode.level import LevelInput
 
-        chip, address, channel = parse_chip(self.level)
-        if channel is None or address == converter:
-            raise ValueError(f"Expected chip@address/channel beside the converter in `level`, got `{self.level}`")
         try:
+            chip, address, channel = parse_chip(self.level)
+            if channel is None or address == converter:
+                raise ValueError(f"Expected chip@address/channel beside the converter, got `{self.level}`")
             LevelInput(chip, address, channel)
         except ValueError as error:
             raise ValueError(f"{error} in `level`") from None

@@ -1,42 +1,57 @@
-"""``lumiloop probe``: find lidars and say what they are, or why one could not be opened and what to do."""
+"""``lumiloop probe``: find lidars and photodiode converters, say what they are, or what is wrong and what to do."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import json
+import re
 import sys
 
+from hal import i2c_linux
 from hal.hokuyo import discover
-from hal.opening import open_port
+from hal.opening import open_bus, open_port
+from hal.photodiode.probe import BusFinding, Chip, probe_bus
 from hal.probe import Finding, identify_at
 
 NOTHING = (
-    "nothing to look at: no serial device that may be a HOKUYO is plugged in\n"
+    "nothing to look at: no serial device that may be a HOKUYO is plugged in, and there is no I2C bus\n"
     "  plug the sensor in and give it power; an Ethernet model is not searched for, name it:\n"
     "  lumiloop probe tcp://192.168.0.10:10940\n"
+    "  a photodiode's bus may have to be enabled first; one that is served elsewhere is named like\n"
+    "  lumiloop probe unix:/run/lumiloop/i2c\n"
 )
+
+Found = Finding | BusFinding
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``probe``; 0 when at least one lidar was found and every device named is one."""
-    devices = list(args.devices) or discover.candidates()
+    """The command ``probe``; 0 when a lidar or a converter was found, and one at every device named."""
+    devices = list(args.devices) or [*discover.candidates(), *i2c_linux.buses()]
     if not devices and not args.json:
         sys.stderr.write(NOTHING)
         return 1
     findings = asyncio.run(_look(devices, quiet=args.json))
     if args.json:
         sys.stdout.write(json.dumps([as_dict(finding) for finding in findings], indent=2) + "\n")
-    lidars = sum(finding.error is None for finding in findings)
-    return 0 if lidars and (not args.devices or lidars == len(findings)) else 1
+    good = sum(map(_usable, findings))
+    return 0 if good and (not args.devices or good == len(findings)) else 1
 
 
-async def _look(devices: list[str], quiet: bool) -> list[Finding]:
-    findings = []
+def is_bus(device: str) -> bool:
+    """Whether this is the name of an I2C bus; ``tcp://`` names a lidar here, so such a bus is named ``i2c+tcp://``."""
+    return re.match(r"/dev/i2c-|adapter:|unix:|i2c\+tcp://", device) is not None
+
+
+async def _look(devices: list[str], quiet: bool) -> list[Found]:
+    findings: list[Found] = []
     for device in devices:
         if not quiet:
             sys.stderr.write(f"looking at {device} ...\n")
-        finding = await identify_at(open_port, device)
+        bus = is_bus(device)
+        finding: Found = (
+            await probe_bus(open_bus, device.removeprefix("i2c+")) if bus else await identify_at(open_port, device)
+        )
         findings.append(finding)
         if not quiet:
             sys.stdout.write(describe(finding))
@@ -44,15 +59,35 @@ async def _look(devices: list[str], quiet: bool) -> list[Finding]:
     return findings
 
 
-def describe(finding: Finding) -> str:
+def _usable(finding: Found) -> bool:
+    if isinstance(finding, BusFinding):
+        return any(chip.usable for chip in finding.chips)
+    return finding.error is None
+
+
+def describe(finding: Found) -> str:
     """What a person wants to read: the line and how to use it."""
+    if isinstance(finding, BusFinding):
+        use = (_how_to_use(finding.bus, chip) for chip in finding.chips)
+        return "\n".join((str(finding), *(f"  use it: {text}" for text in use if text))) + "\n"
     if finding.error is not None:
         return f"no lidar: {finding}\n"
     return f"{finding}\n  use it: lumiloop run --lidar {finding.device}\n"
 
 
-def as_dict(finding: Finding) -> dict[str, object]:
+def _how_to_use(bus: str, chip: Chip) -> str:
+    """Keys of the configuration for a chip; empty for what is none of ours."""
+    name = chip.name.lower().rpartition(" ")[2]  # one of two that look alike will do
+    where = f"{name}@{chip.address:#04x}"
+    if chip.usable:
+        return f'photodiode.bus = "{bus}", photodiode.converter = "{where}"'
+    return f'photodiode.level = "{where}/0"' if name else ""
+
+
+def as_dict(finding: Found) -> dict[str, object]:
     """The same for programs. Angles in degrees, ranges in m, times in s; keys are absent where nothing is known."""
+    if isinstance(finding, BusFinding):
+        return _bus_as_dict(finding)
     if finding.error is not None:
         error = finding.error
         return {"device": finding.device, "problem": error.problem, "remedy": error.remedy}
@@ -70,4 +105,17 @@ def as_dict(finding: Finding) -> dict[str, object]:
             "period_s": g.period_s,
             "range_m": [round(g.dmin * g.range_unit_m, 6), round(g.dmax * g.range_unit_m, 6)],
         }
+    return known
+
+
+def _bus_as_dict(finding: BusFinding) -> dict[str, object]:
+    chips = [
+        {"address": chip.address, "usable": chip.usable}
+        | ({"name": chip.name} if chip.name else {})
+        | ({"problem": chip.problem} if chip.problem else {})
+        for chip in finding.chips
+    ]
+    known: dict[str, object] = {"bus": finding.bus, "adapter": finding.adapter, "chips": chips}
+    if finding.error is not None:
+        known |= {"problem": finding.error.problem, "remedy": finding.error.remedy}
     return known

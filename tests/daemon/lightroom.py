@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from estimator.cdma_profile import PROFILE_A
 from estimator.lamps import Lamp, Survey
+from hal.adc import Blemish, RawSamples
 from hal.clock import Clock
 from hal.fake.adc import FakeAdc, FakeBuses
 from tools.sim import light_transmitter
@@ -57,3 +59,10 @@ def plugged(clock: Clock, source: Lit, chip: str = "MCP3221", address: int = 0x4
     buses = FakeBuses(clock)
     buses.plug(BUS, device)
     return buses, device
+
+
+def raw_block(seq: int, blemish: Blemish = Blemish.NONE, rate_hz: float = PROFILE_A.sample_rate) -> RawSamples:
+    """A block as the driver delivers it, 50 ms of a sawtooth."""
+    t0 = 10.0 + 0.051 * seq
+    words = (1000 + np.arange(1111) % 700).astype(np.uint16)
+    return RawSamples(seq, t0, t0 + 0.0505, t0 + 2e-5, rate_hz, words, 12, blemish, 1e-4)

@@ -10,13 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.bridge import ImuBridge, OdometryBridge, ScanBridge, in_sector, range_facts
+from daemon.bridge import ImuBridge, OdometryBridge, SampleBridge, ScanBridge, in_sector, range_facts
 from daemon.config import LidarConfig, Mask, Mount
 from estimator import se2
+from estimator.cdma_profile import PROFILE_A
 from estimator.records import Beam
+from hal.adc import Blemish
 from hal.imu import RawImu
 from hal.lidar import VALID, LidarGeometry, RawScan
 from hal.odometry import RawOdometry
+from tests.daemon.lightroom import raw_block
 from tests.daemon.room import URG
 
 
@@ -206,3 +209,41 @@ def test_yaw_rates_become_turns() -> None:
     assert (turn.t_begin, turn.t_end, turn.dyaw) == (0.0, 0.1, pytest.approx(0.05))
     assert imu.turn(RawImu(9.0, 9.0, 1.0)) is None, "a gap is no turn"
     assert imu.turn(RawImu(9.0, 9.0, 1.0)) is None, "no time has passed"
+
+
+def test_a_block_of_samples_keeps_its_own_time_base() -> None:
+    raw = raw_block(3, rate_hz=22_100.0)
+    block = SampleBridge(PROFILE_A).block(raw)
+    assert block is not None
+    assert block.t_begin == raw.t_first
+    assert block.t_end == pytest.approx(raw.t_first + 1111 / 22_100.0 + raw.slack_s)
+    assert block.rate == PROFILE_A.sample_rate, "the decoder looks for the clock about the nominal rate"
+    assert block.words.dtype == np.float64
+    assert block.words.tolist() == raw.words.tolist()
+
+
+@pytest.mark.parametrize("blemish", [Blemish.SHORT, Blemish.MISALIGNED, Blemish.STUCK, Blemish.GAP | Blemish.SHORT])
+def test_words_that_the_light_never_was_are_dropped_and_counted(blemish: Blemish) -> None:
+    bridge = SampleBridge(PROFILE_A)
+    assert bridge.block(raw_block(0, blemish)) is None
+    assert bridge.block(replace(raw_block(1), words=np.empty(0, np.uint16))) is None
+    assert (bridge.unfit, bridge.stretched) == (2, 0)
+
+
+@pytest.mark.parametrize("blemish", [Blemish.NONE, Blemish.CLIPPED, Blemish.GAP, Blemish.STRETCHED])
+def test_the_decoder_judges_all_others(blemish: Blemish) -> None:
+    bridge = SampleBridge(PROFILE_A)
+    assert bridge.block(raw_block(0, blemish)) is not None
+    assert (bridge.unfit, bridge.stretched) == (0, blemish is Blemish.STRETCHED)
+
+
+@pytest.mark.parametrize(
+    ("off", "reachable"), [(0.0, True), (0.0099, True), (-0.0115, True), (0.013, False), (-0.2, False)]
+)
+def test_a_clock_beyond_the_decoders_reach_is_said(off: float, reachable: bool) -> None:
+    bridge = SampleBridge(PROFILE_A)
+    assert not bridge.off_rate, "nothing is known yet"
+    block = bridge.block(raw_block(0, rate_hz=PROFILE_A.sample_rate * (1.0 + off)))
+    assert block is not None
+    assert bridge.off_rate is not reachable
+    assert (block.rate == PROFILE_A.sample_rate) is reachable

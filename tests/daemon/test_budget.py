@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from daemon.budget import (
+    FEWEST_CODES,
     FEWEST_ITERATIONS,
     FEWEST_POINTS,
     LONGEST_MAP_WAIT,
+    SEARCH_SHARE,
+    SEARCH_US,
     FixedBudget,
     MeasuredBudget,
     RecordedBudget,
@@ -125,3 +128,18 @@ def test_fixed_caps_never_change() -> None:
     budget = FixedBudget(Limits(5, 6, False))
     budget.learn(1e9, UNLIMITED, step())
     assert budget.limits(1.0) == Limits(5, 6, False)
+
+
+def test_the_search_for_lamps_gets_a_millisecond_and_no_more_than_its_share() -> None:
+    budget = MeasuredBudget()
+    assert budget.limits(12_500.0).codes == UNLIMITED.codes, "nothing is known of its cost"
+    budget.learn_code(20.0)
+    assert budget.limits(12_500.0).codes == SEARCH_US / 20.0
+    assert budget.limits(5_000.0).codes == SEARCH_SHARE * 5_000.0 / 20.0
+    assert budget.limits(100.0).codes == FEWEST_CODES, "however slow, it comes to an end"
+    budget.learn_code(5.0)
+    assert budget.limits(12_500.0).codes == UNLIMITED.codes
+    for _ in range(20):
+        budget.learn(8 * 500.0, UNLIMITED, step())
+    budget.learn_code(20.0)
+    assert budget.limits(12_500.0).codes == SEARCH_US / 20.0

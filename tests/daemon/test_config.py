@@ -12,8 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon import configfile
-from daemon.config import Config, LidarConfig, Mask, ModbusConfig, Mount, PoseConfig, parse_endpoint
+from daemon.config import (
+    PROFILES,
+    Config,
+    LidarConfig,
+    Mask,
+    ModbusConfig,
+    Mount,
+    PoseConfig,
+    parse_chip,
+    parse_endpoint,
+)
 from daemon.configfile import ConfigError, load
+from estimator import cdma_profile
 
 ROOT = Path(__file__).parents[2]
 
@@ -62,12 +73,57 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ("[pose]\nreceivers = ['plc']", "robot.toml:2: Expected `host:port` or `[ipv6]:port`, got `plc`"),
         ("[pose]\nreceivers = ['a:1', 'plc:0']", "got `plc:0` in `receivers[1]` - at `$.pose`"),
         ("[odometry]\nport = 1502", "robot.toml:2: Expected a port other than Modbus's in `odometry.port`, got 1502"),
+        (
+            "[photodiode]\nbus = 'i2c-1'",
+            "robot.toml:2: Expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port",
+        ),
+        (
+            "[photodiode]\nconverter = 'mcp3221'",
+            "robot.toml:2: Expected chip@address, as in mcp3221@0x4d, got `mcp3221`",
+        ),
+        ("[photodiode]\nconverter = 'mcp3221@0x20'", "Expected mcp3221@ADDRESS in `converter`, one of 0x48, 0x49"),
+        ("[photodiode]\nconverter = 'ads1115@0x48'", "robot.toml:2: chip ads1115: samples by a clock of its own"),
+        ("[photodiode]\nconverter = 'mcp3221@0x4d/0'", "Expected mcp3221@ADDRESS in `converter`"),
+        (
+            "[photodiode]\nlevel = 'ads1115@0x48'",
+            "Expected chip@address/channel beside the converter, got `ads1115@0x48`",
+        ),
+        ("[photodiode]\nlevel = 'ads1115@0x20/1'", "robot.toml:2: DC channel at 0x20: an ads1115 answers at 0x48"),
+        (
+            "[photodiode]\nconverter='mcp3221@0x48'\nlevel='ads1115@0x48/1'",
+            "robot.toml:3: Expected chip@address/channel beside the converter",
+        ),
+        ("[photodiode]\nprofile = 'C'", "robot.toml:2: Expected one of A, B, D in `profile`, got `C`"),
+        ("[lidar]\ndevice = 'none'", "Expected a lidar or a photodiode: `lidar.device` is none"),
         ("name = ''", "robot.toml:1: Expected `str` matching regex"),
         ("x y", "robot.toml: not valid TOML: Expected '=' after a key"),
     ],
 )
 def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, text: str, expected: str) -> None:
     assert expected in refused(tmp_path, text)
+
+
+def test_lights_alone_are_a_configuration(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        "lidar.device = 'none'\n[photodiode]\nbus = '/dev/i2c-1'\nconverter = 'adc121c021@0x54'\n"
+        "level = 'ADS1015@73/3'\nprofile = 'D'\n"
+    )
+    config = load(file)
+    assert (config.lidar.fitted, config.photodiode.fitted) == (False, True)
+    assert parse_chip(config.photodiode.level) == ("ADS1015", 73, 3)
+    assert tuple(PROFILES) == tuple(cdma_profile.PROFILES)
+
+
+def test_a_survey_is_looked_for_beside_the_file_that_names_it(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("[lights]\nsurvey = 'maps/hall.toml'\n")
+    assert load(file).lights.survey == str(tmp_path.resolve() / "maps" / "hall.toml")
+    file.write_text("[lights]\nsurvey = '/etc/hall.toml'\n")
+    assert load(file).lights.survey == "/etc/hall.toml"
+    assert load(None, ["lights.survey=hall.toml"]).lights.survey == "hall.toml"
+    file.write_text("")
+    assert load(file).lights.survey == ""
 
 
 def test_a_refusal_says_what_the_key_is_for(tmp_path: Path) -> None:

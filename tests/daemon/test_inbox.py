@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.inbox import DEEPEST, Inbox
+from daemon.inbox import BLOCKS, DEEPEST, Inbox
 from daemon.network import OneSender
 from daemon.pace import IDLE_PERIOD_S, ScanPeriod
 from estimator.records import Command, Order
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
+from tests.daemon.lightroom import raw_block
 from tests.daemon.room import URG, raw_scan
 
 SCAN = raw_scan(0, 0.0)
@@ -51,6 +52,18 @@ def test_the_first_and_the_last_odometry_survive_any_flood(count: int) -> None:
         assert taken.odometry[0].x == 0
         assert taken.odometry[-1].x == count - 1
         assert [r.x for r in taken.odometry] == sorted({r.x for r in taken.odometry})
+
+
+def test_the_latest_few_blocks_wait_in_order_and_the_others_are_counted() -> None:
+    inbox = Inbox()
+    for seq in range(BLOCKS + 3):
+        inbox.put_samples(raw_block(seq))
+    taken = inbox.take()
+    assert [block.seq for block in taken.samples] == list(range(3, BLOCKS + 3))
+    assert (taken.samples_total, inbox.blocks_dropped) == (BLOCKS + 3, 3)
+    assert inbox.take().samples == ()
+    inbox.begin()
+    assert inbox.blocks_dropped == 0, "before there was a cycle nothing was lost"
 
 
 def test_scans_from_before_the_first_cycle_are_no_loss() -> None:
@@ -91,3 +104,12 @@ def test_one_sender_of_odometry_at_a_time(caplog: pytest.LogCaptureFixture) -> N
     gate.take("Modbus", RawOdometry(2.5, 2.5, 2.0, 0, 0))
     assert passed[-1] == 2.0
     assert len([r for r in caplog.records if "is ignored" in r.message]) == 1
+
+
+def test_without_scans_blocks_set_the_pace_until_there_is_one() -> None:
+    period = ScanPeriod()
+    period.learn_block(0.05)
+    assert period.seconds == 0.05
+    period.learn(at(0, 0.0))
+    period.learn_block(0.05)
+    assert period.seconds == URG.period_s

@@ -1,0 +1,65 @@
+"""`lumiloop check`: a good file, a bad survey, and a bus that is not here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daemon import cli
+
+SURVEY = """
+lamp = [
+  { lamp_id = 1, code = 5, x = 0.0, y = 0.0, z = 2.6 },
+  { lamp_id = 2, code = 17, x = 2.5, y = 0.0, z = 2.6 },
+]
+"""
+
+
+def write(folder: Path, survey: str = SURVEY, bus: str = "/dev/i2c-99") -> Path:
+    (folder / "lights.toml").write_text(survey)
+    file = folder / "robot.toml"
+    file.write_text(f'[photodiode]\nbus = "{bus}"\n[lights]\nsurvey = "lights.toml"\n')
+    return file
+
+
+def test_all_good_but_the_bus_is_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write(tmp_path)
+    assert cli.main(["check", str(file)]) == cli.OK
+    good, survey, bus = capsys.readouterr().out.splitlines()
+    assert good == f"{file}: good"
+    assert survey == f"{tmp_path.resolve() / 'lights.toml'}: good, 2 lamps"
+    assert bus.startswith("as seen from here, /dev/i2c-99: ")
+
+
+@pytest.mark.parametrize(
+    ("survey", "words"),
+    [
+        ("lamp = [ { lamp_id = 1, cod = 5, x = 0.0, y = 0.0, z = 2.6 } ]", "did you mean `code`?"),
+        (SURVEY.replace("lamp_id = 2", "lamp_id = 1"), "lights.toml:4: lamp 1: that `lamp_id` is taken already"),
+        ("lamp", "not valid TOML"),
+    ],
+)
+def test_a_bad_survey_is_refused_with_its_place(
+    tmp_path: Path, survey: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write(tmp_path, survey)
+    for command in (["check", str(file)], ["run", "--config", str(file), "--set", "modbus.port=0"]):
+        assert cli.main(command) == cli.USAGE
+        said = capsys.readouterr()
+        if command[0] == "check":
+            assert words in said.err
+            assert "Traceback" not in said.err
+
+
+def test_a_survey_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write(tmp_path)
+    (tmp_path / "lights.toml").unlink()
+    assert cli.main(["check", str(file)]) == cli.USAGE
+    assert "lights.toml: no such survey" in capsys.readouterr().err
+
+
+def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write(tmp_path, bus="")
+    assert cli.main(["check", str(file)]) == cli.OK
+    assert "the survey is not used: `photodiode.bus` is empty" in capsys.readouterr().out
