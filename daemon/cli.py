@@ -22,13 +22,13 @@ Body = Callable[[argparse.Namespace], int]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Wrong usage raises SystemExit(2) after explaining itself."""
-    parser = _parser()
-    args = parser.parse_args(argv)
-    body: Body | None = getattr(args, "body", None)
-    if body is None:
-        parser.print_help(sys.stderr)
-        return USAGE
     try:
+        parser = _parser()
+        args = parser.parse_args(argv)
+        body: Body | None = getattr(args, "body", None)
+        if body is None:
+            parser.print_help(sys.stderr)
+            return USAGE
         return body(args)
     except KeyboardInterrupt:
         return INTERRUPTED

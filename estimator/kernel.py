@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -43,6 +44,10 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 FASTMATH: Final = {"contract", "reassoc", "arcp", "nsz"}
+KEPT: Final = 4
+"""Directories of other sources that are kept beside our own, the latest used ones."""
+KEPT_S: Final = 7 * 86400.0
+"""And all that were used more recently than this: their programs may be running."""
 
 
 def source_key() -> str:
@@ -78,11 +83,31 @@ def _cache_roots() -> list[Path]:
     return roots
 
 
+def _last_used(directory: Path) -> float:
+    try:
+        return directory.stat().st_mtime
+    except OSError:  # another process has removed it just now
+        return 0.0
+
+
+def _prune(root: Path, ours: Path) -> None:
+    """Remove what earlier versions left behind; whatever cannot be removed stays."""
+    now = _last_used(ours)
+    others = sorted((path for path in root.glob("kernels-*") if path != ours), key=_last_used, reverse=True)
+    for path in others[KEPT:]:
+        if now - _last_used(path) > KEPT_S:
+            shutil.rmtree(path, ignore_errors=True)
+
+
 def _choose_cache() -> Path:
     key = source_key()
     for root in _cache_roots():
         directory = root / f"kernels-{key}"
+        is_new = not directory.exists()
         if _writable(directory):
+            os.utime(directory)  # when it was last used
+            if is_new:
+                _prune(root, directory)
             return directory
     raise RuntimeError("no writable directory for compiled kernels; set NUMBA_CACHE_DIR to one")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -94,3 +95,31 @@ def test_a_command_gets_the_settings_and_its_code_is_ours(monkeypatch: pytest.Mo
 def test_an_interrupt_is_not_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     _command(monkeypatch, KeyboardInterrupt())
     assert cli.main(["replay", "x.log", "--out", "o"]) == cli.INTERRUPTED
+
+
+INTERRUPTED_WHILE_LOADING = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "daemon.cli":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+from daemon.__main__ import main
+sys.exit(main())
+"""
+
+
+def test_an_early_interrupt_ends_without_a_traceback() -> None:
+    command = [sys.executable, "-c", INTERRUPTED_WHILE_LOADING, "run"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_an_interrupt_that_is_ignored_stays_ignored() -> None:
+    code = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)" + INTERRUPTED_WHILE_LOADING
+    command = [sys.executable, "-c", code, "--print-config"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0
+    assert "[modbus]" in done.stdout

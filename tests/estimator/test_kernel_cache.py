@@ -1,0 +1,59 @@
+"""Compiled kernels of earlier versions are removed, those of versions that may be running are not."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from estimator import kernel
+
+DAY = 86400.0
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+def left_behind(root: Path, name: str, days: float) -> Path:
+    folder = root / f"kernels-{name}"
+    (folder / "estimator_1").mkdir(parents=True)
+    (folder / "estimator_1" / "a.nbc").touch()
+    os.utime(folder, (time.time() - days * DAY,) * 2)
+    return folder
+
+
+def test_the_latest_used_are_kept(root: Path) -> None:
+    old = [left_behind(root, f"{k:02}", 10.0 + k) for k in range(10)]
+    alien = root / "maps"
+    alien.mkdir()
+    ours = kernel._choose_cache()
+    assert ours == root / f"kernels-{kernel.source_key()}"
+    assert sorted(root.iterdir()) == sorted([alien, ours, *old[: kernel.KEPT]])
+
+
+def test_what_was_used_this_week_is_kept(root: Path) -> None:
+    fresh = [left_behind(root, f"{k:02}", 0.5 * k) for k in range(10)]
+    kernel._choose_cache()
+    assert all(folder.exists() for folder in fresh)
+
+
+def test_nothing_is_looked_at_when_ours_is_there_already(root: Path) -> None:
+    ours = kernel._choose_cache()
+    os.utime(ours, (0.0, 0.0))
+    old = [left_behind(root, f"{k:02}", 100.0) for k in range(10)]
+    assert kernel._choose_cache() == ours
+    assert all(folder.exists() for folder in old)
+    assert time.time() - ours.stat().st_mtime < DAY  # it counts as used
+
+
+def test_what_cannot_be_removed_stays(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = [left_behind(root, f"{k:02}", 100.0) for k in range(kernel.KEPT + 1)]
+    old[-1].rename(root / "elsewhere")
+    (root / old[-1].name).symlink_to(root / "elsewhere")  # rmtree refuses a link
+    kernel._choose_cache()
+    assert (root / "elsewhere").exists()
