@@ -9,6 +9,7 @@ import numpy as np
 
 from daemon.state import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
 from daemon.witness import Witnesses
+from estimator import result as light
 from estimator.records import Array, Command, LightEpoch, Odometry, Record, SampleBlock
 from estimator.result import SURPRISE, Fix, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
@@ -109,16 +110,17 @@ class Observer:
         if result is None or result.lights is None:
             return Light(alive, placed=self._placed, known=self._known)
         lights, gap = result.lights, result.gap
+        against = _against(lights.links) > len(lights.accepted) and lights.fix is not Fix.NONE
         self._placed, self._known = result.placed, _axes(result.known_axes)
         moved = result.jumps > self._jumps and self._odd
         self._jumps = result.jumps
-        self._odd = gap is not None and gap > SURPRISE
+        self._odd = against or (gap is not None and gap > SURPRISE)
         return Light(
             alive=alive,
             used=alive and lights.fix is Fix.GOOD and bool(lights.accepted),
             placed=result.placed,
             lost=lights.fix is Fix.LOST,
-            agrees=None if gap is None or not alive else not self._odd,
+            agrees=None if not alive or (gap is None and not against) else not self._odd,
             moved=moved,
             known=self._known,
         )
@@ -179,6 +181,11 @@ class Observer:
 def _axes(known: Array) -> tuple[bool, bool, bool]:
     x, y, yaw = (bool(axis) for axis in known)
     return x, y, yaw
+
+
+def _against(links: tuple[light.Link, ...]) -> int:
+    """How many lamps are received that cannot be so at the place light is held to have told."""
+    return sum(link.state in (light.LinkState.OCCLUDED, light.LinkState.REJECTED) for link in links)
 
 
 def _places(result: StepResult | None) -> int | None:

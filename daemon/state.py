@@ -278,7 +278,7 @@ def _lidar_gone(evidence: Evidence) -> Reason:
 def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[State, Reason]:
     """The part of the table for a pose that light and odometry hold without a laser."""
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
-        return State.LOST, Reason.UNCERTAIN
+        return _say_vague(light)
     if light.lost or _contradicted(memory, evidence):
         return State.RELOCATING, Reason.LIGHT_LOST
     dark = evidence.t_mono - (memory.lit_last or 0.0)
@@ -300,7 +300,7 @@ def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[Sta
 def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The part of the table for a pose that is held: is it lost, degraded, unproved or good."""
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
-        return State.LOST, Reason.UNCERTAIN
+        return _say_vague(evidence.light)
     if evidence.light is not None and evidence.light.lost:
         return State.RELOCATING if memory.failed else State.DEGRADED, Reason.LIGHT_LOST
     if memory.failed >= FAILED_SCANS:
@@ -324,6 +324,13 @@ def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     if memory.state is State.TRACKING or _proved(memory, evidence) or _agreed(memory, evidence):
         return State.TRACKING, Reason.NONE
     return (State.DEGRADED, Reason.CONFIRMING) if memory.state is State.DEGRADED else (State.MAPPING, Reason.UNPROVED)
+
+
+def _say_vague(light: Light | None) -> tuple[State, Reason]:
+    """A pose too uncertain to be used: lost, unless light is just finding it."""
+    if light is not None and light.alive and light.placed and light.agrees:
+        return State.RELOCATING, Reason.UNPLACED
+    return State.LOST, Reason.UNCERTAIN
 
 
 def _missing(memory: Memory, evidence: Evidence) -> Reason | None:

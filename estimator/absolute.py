@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from estimator import se2
+from estimator.keyframe import Virtual
 from estimator.linear3 import invert3
 from estimator.mapframe import move_map, shift_map
 from estimator.records import Array, Command, Order
@@ -33,9 +34,9 @@ DRIFT = np.array((5e-5, 5e-5, 2e-6))
 """Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of: some
 7 mm and 0.08 deg by the root of the way."""
 
-YOUNG, YOUNG_M = 8.0, 4.0
-"""A position from light that has just begun is surer of itself than it may be: its variance counts so many times more
-at the start, and that fades with the way driven (its equations bend while gains and heading are being found)."""
+TRUST, YOUNG, YOUNG_M = 2.0, 8.0, 4.0
+"""By how much the variance of a position from light is raised: always, because errors of the light model hang together
+farther than it knows; and at the start, fading with the way driven, because gains and heading are being found."""
 SURPRISE_S = 1.0
 """Light that disagrees for longer than this is believed: nothing else knows where in the building the robot is."""
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
@@ -45,6 +46,8 @@ SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
+ANY_HEADING = math.pi**2 / 3.0
+"""Variance of a heading that may be any, rad^2."""
 BLIND_S = 0.5
 """Without a match for so long, light and odometry are all there is."""
 KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
@@ -123,11 +126,11 @@ def on_lights(state: State, lights: LightsResult) -> None:
     tie = state.absolute
     assert tie is not None
     tie.gap = None
-    if lights.fix in (Fix.NONE, Fix.STARTING, Fix.LOST, Fix.AMBIGUOUS):
+    if lights.fix is not Fix.GOOD:
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    lights = replace(lights, covariance=lights.covariance * youth(tie), gained=lights.gained / youth(tie))
+    lights = doubted(tie, lights)
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     R = se2.rotation(state.T_map_odom[2])
     P = R @ tie.P @ R.T
@@ -191,9 +194,21 @@ def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     tie.placed, tie.odd_since, tie.fresh, tie.since = True, None, 0.0, state.next_key
 
 
-def youth(tie: Absolute) -> float:
-    """Factor on the variance of a position from light that has not been driven with for long."""
-    return 1.0 + YOUNG * math.exp((tie.way_young - tie.way) / YOUNG_M)
+def virtual(state: State) -> Virtual | None:
+    """What light alone says of the place just now, None where it says nothing good."""
+    if state.light is None or state.light.result.fix is not Fix.GOOD:
+        return None
+    lights = state.light.result
+    moved = se2.between(pose_at(state, max(lights.t_mono, lights.t_pose)), state.fused.T_odom_base)
+    return Virtual(se2.compose(lights.T_map_base, moved), lights.covariance, lights.accepted)
+
+
+def doubted(tie: Absolute, lights: LightsResult) -> LightsResult:
+    """The lights' result with less trust in it; no heading is less certain than one that may be any."""
+    factor = TRUST + YOUNG * math.exp((tie.way_young - tie.way) / YOUNG_M)
+    P = lights.covariance * factor
+    most = np.array((1.0, 1.0, math.sqrt(min(1.0, ANY_HEADING / max(float(P[2, 2]), 1e-12)))))
+    return replace(lights, covariance=P * most * most[:, None], gained=lights.gained / factor)
 
 
 def blind(state: State) -> bool:

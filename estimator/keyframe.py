@@ -14,6 +14,19 @@ Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
 """Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Virtual:
+    """The paper's virtual consistent state components: what light alone said of the place, free of laser and drift.
+
+    Attributes:
+        T_map_base, covariance: of the `lights` filter, for the keyframe's instant. accepted: IDs of the lamps used (S).
+    """
+
+    T_map_base: Array
+    covariance: Array
+    accepted: frozenset[int]
+
+
 @dataclass(slots=True, eq=False)
 class Keyframe:
     """A scan kept.
@@ -22,6 +35,7 @@ class Keyframe:
         T_map_keyframe: follows every correction of the map. T_odom_keyframe: where it was laid, never changes.
         T_base_lidar: mount. bearing_rad: shared with the other keyframes of the same lidar.
         turned_rad: yaw turned from the first to the last beam. range_m: float32. beam: uint8 of `Beam`.
+        virtual: what light said, None where it said nothing good.
     """
 
     key: int
@@ -32,6 +46,7 @@ class Keyframe:
     turned_rad: float
     range_m: npt.NDArray[np.float32]
     beam: npt.NDArray[np.uint8]
+    virtual: Virtual | None = None
 
     @property
     def T_odom_lidar(self) -> Array:

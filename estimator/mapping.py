@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from estimator import keyframe, localmap, se2
+from estimator import absolute, keyframe, localmap, se2
 from estimator.fusion import covariance, noise_of
 from estimator.keyframe import Keyframe
 from estimator.lines import lines_of
@@ -45,9 +45,23 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
     moving.P = NOTHING.copy()
     if state.absolute is not None:
         state.absolute.X = np.zeros((3, 3))
+        frame.virtual = absolute.virtual(state)
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key
+
+
+def lay_anchor(state: State) -> None:
+    """Without a laser there is nothing to keep; every stretch of the way still hangs on a place that light has told."""
+    tie, T = state.absolute, state.fused.T_odom_base
+    x, y, yaw = se2.between(state.T_odom_anchor, T).tolist()
+    settings = state.settings
+    near = math.hypot(x, y) <= settings.keyframe_m and abs(yaw) <= settings.keyframe_rad
+    if tie is None or not tie.placed or not absolute.blind(state) or near:
+        return
+    if settings.history:
+        state.retired[state.next_key] = se2.compose(state.T_map_odom, T)
+    state.anchor, state.T_odom_anchor, state.next_key = state.next_key, T, state.next_key + 1
 
 
 def turned_back(state: State, P_map: Array) -> Array:

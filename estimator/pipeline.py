@@ -13,7 +13,7 @@ from estimator.fusion import covariance, fuse, noise_of
 from estimator.grid import Grid
 from estimator.keyframe import unturned
 from estimator.linear3 import invert3
-from estimator.mapping import keyframe_due, lay_keyframe, update_map
+from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
 from estimator.matching import Prior, View
 from estimator.records import Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
 from estimator.result import MatchResult, Reason, StepResult
@@ -34,6 +34,7 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
         predict(state, record)
         if isinstance(record, SampleBlock | LightEpoch):
             see_lights(state, record)
+            lay_anchor(state)
         if isinstance(record, Scan):
             points = virtual_frame(state, record)
             match = match_scan(state, record, points, limits)
