@@ -11,11 +11,14 @@ from estimator.kernel import kernel
 from estimator.optics import COLUMNS, expect
 from estimator.records import Array
 
-STEPS: Final = 60
-"""More than a descent from a metre away needs (5 to 12); one that has not settled by then is not a solution."""
+STEPS: Final = 80
+"""A descent from a metre away needs 5 to 12; only to the line between lamps in a row is it slow (quartic)."""
 LONGEST_M: Final = 1.5
 """No step is longer: the model is far from linear over more than that."""
 SETTLED_M: Final = 1e-7
+LATE: Final = 10
+GAINED: Final = 1e-2
+"""One that still lowers the cost by that part in the last few steps has not found a minimum."""
 FAINTEST: Final = 1e-5
 """Of the strength right below the lamp: expectations are not let fall below it, so that logarithms stay finite."""
 
@@ -93,7 +96,8 @@ def damped(normal: Array, damping: float, step: Array) -> bool:
     for j in range(n):
         for k in range(n):
             a[j, k] = normal[j, k]
-        a[j, j] = a[j, j] * (1.0 + damping) + 1e-12
+        scale = max(normal[0, 0], normal[1, 1]) if j < 2 else normal[j, j]  # x and y alike: the axes mean nothing
+        a[j, j] += damping * scale + 1e-12
     invert(a)
     for j in range(n):
         step[j] = 0.0
@@ -109,8 +113,10 @@ def damped(normal: Array, damping: float, step: Array) -> bool:
 def by_strength(lamps: Array, rx: Array, data: Array, prior: Array, theta: Array, normal: Array) -> float:
     """Descend from ``theta`` (changed in place) by `strength_step`; returns the cost, inf if it did not settle."""
     cost = strength_step(lamps, rx, data, prior, theta, normal)
-    damping, step, trial, system = 1e-3, np.zeros(4), np.zeros(4), np.zeros((4, 5))
-    for _ in range(STEPS):
+    damping, step, trial, system, late = 1e-3, np.zeros(4), np.zeros(4), np.zeros((4, 5)), cost
+    for k in range(STEPS):
+        if k == STEPS - LATE:
+            late = cost
         if not damped(normal, damping, step):
             return np.inf
         trial[:] = theta + step
@@ -123,15 +129,17 @@ def by_strength(lamps: Array, rx: Array, data: Array, prior: Array, theta: Array
             damping = 10.0 * max(damping, 1e-4)
         if moved < SETTLED_M:
             return float(cost)
-    return np.inf
+    return float(cost) if late - cost < GAINED * cost else np.inf
 
 
 @kernel("f8(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])")
 def by_range(lamps: Array, data: Array, theta: Array, normal: Array) -> float:
     """Descend from ``theta`` (changed in place) by `range_step`; returns the cost, inf if it did not settle."""
     cost = range_step(lamps, data, theta, normal)
-    damping, step, trial, system = 1e-3, np.zeros(2), np.zeros(2), np.zeros((2, 3))
-    for _ in range(STEPS):
+    damping, step, trial, system, late = 1e-3, np.zeros(2), np.zeros(2), np.zeros((2, 3)), cost
+    for k in range(STEPS):
+        if k == STEPS - LATE:
+            late = cost
         if not damped(normal, damping, step):
             return np.inf
         trial[:] = theta + step
@@ -143,4 +151,4 @@ def by_range(lamps: Array, data: Array, theta: Array, normal: Array) -> float:
             damping = 10.0 * max(damping, 1e-4)
         if moved < SETTLED_M:
             return float(cost)
-    return np.inf
+    return float(cost) if late - cost < GAINED * cost else np.inf

@@ -11,18 +11,18 @@ from estimator.lamps import Lamp, Receiver, Survey
 from estimator.links import (
     Circle,
     Doubt,
-    Geometry,
     Located,
     Method,
     Prior,
     Received,
     Solver,
     Why,
-    best_count,
     locate,
     shortest,
     without_floor,
 )
+from estimator.links_adaptive import adapted
+from estimator.links_model import usable
 from estimator.optics import expected
 from estimator.records import Array
 
@@ -190,9 +190,11 @@ def test_nothing_raises_and_what_is_returned_is_finite(
 
 def perturbed(received: Received, survey: Survey, doubt: Doubt, rng: np.random.Generator) -> Received:
     """Errors of exactly the kind that the model of errors describes (but for tilt)."""
-    g = Geometry(received, survey, doubt)
-    error = rng.multivariate_normal(np.zeros(len(received.lamps)), g.covariance(doubt))
-    return Received(received.lamps, received.amplitude * np.exp(error), received.variance)
+    links = usable(received, survey, Method(doubt=doubt, rim=0.0))
+    error = rng.multivariate_normal(np.zeros(len(links.at)), links.covariance(doubt))
+    amplitude = received.amplitude.copy()
+    amplitude[links.at] *= np.exp(error)
+    return Received(received.lamps, amplitude, received.variance)
 
 
 @pytest.mark.jit
@@ -245,14 +247,30 @@ def test_without_floor_undoes_a_known_floor() -> None:
     assert nearest(locate(without_floor(received, survey), survey, Method(Solver.LS)), (4.0, 4.5)) < 1e-6
 
 
+def count(received: Received, survey: Survey, method: Method) -> int:
+    return len(adapted(usable(received, survey, method), survey, method))
+
+
 def test_adaptive_number_fits_the_solver() -> None:
     """Far links spoil the plain solver (floor, error of d^2) and help the weighted one."""
     survey = survey_of(PAPER, 0.016)
     received = receive(survey, (5.0, 5.0))
-    plain = best_count(received, survey, Method(Solver.LS, None))
-    weighted = best_count(received, survey, Method(Solver.ML, None))
+    plain = count(received, survey, Method(Solver.LS, None))
+    weighted = count(received, survey, Method(Solver.ML, None))
     assert 3 <= plain < weighted == len(shortest(received, survey, 0.6))
-    assert best_count(received, survey, Method(Solver.ML, 5)) == 5
+    assert count(received, survey, Method(Solver.ML, 5)) == 5
     assert len(locate(received, survey, Method(Solver.LS, None, adaptive=True)).used) == plain
-    two = received.pick((0, 1))
-    assert best_count(two, survey, Method()) == 2
+    assert count(received.pick((0, 1)), survey, Method()) == 2
+
+
+@pytest.mark.parametrize("blocked", range(4))
+def test_adaptive_leaves_out_what_contradicts(blocked: int) -> None:
+    """A lamp half hidden by a shelf, be it the nearest: without it the place is exact again."""
+    survey = survey_of(PAPER, 0.016)
+    received = receive(survey, (4.6, 5.3))
+    hidden = shortest(received, survey)[blocked]
+    received.amplitude[hidden] *= 0.4
+    spoilt = locate(received, survey, Method(link_n=None))
+    found = locate(received, survey, Method(link_n=None, adaptive=True))
+    assert hidden not in found.used
+    assert nearest(found, (4.6, 5.3)) < 0.02 < nearest(spoilt, (4.6, 5.3))
