@@ -21,7 +21,6 @@ from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch, LinkFlag, Samp
 from estimator.cdma_follow import SPURIOUS, Decoder, follow
 from estimator.cdma_profile import Profile
 from estimator.cdma_search import BIN, Found, Job
-from estimator.cdma_track import UNTRIED
 
 Array = npt.NDArray[np.float64]
 
@@ -30,11 +29,16 @@ LONGEST: Final = 10
 
 CLIP_SHARE: Final = 0.2
 """Of a block at the rails, beyond which what is left says nothing."""
-RAIL: Final = 1.0 / 128.0
-"""Share of the range beside either rail that counts as the rail: amplifiers stop up to 25 mV short of 3.3 V."""
 
 STORED_PPM: Final = 200.0
 """A stored sample clock is good to this."""
+
+REFINING, PEELING, TAKING = 80, 45, 4
+"""Codes that could be tried in the time in which a sample clock is refined, lamps are taken out of a block, one lamp
+is made a candidate."""
+
+AGAIN: Final = 2
+"""Times that a block is searched again without what was found in it."""
 
 FULL_ROUND: Final = 8
 """Sweeps without a confirmed lamp until all sample clocks are tried."""
@@ -72,27 +76,46 @@ def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
 
 
 def search(decoder: Decoder, codes: int) -> None:
-    """Look for further lamps: try up to ``codes`` more codes on the block last offered (6 us each with profile A)."""
-    if decoder.search.idle:
-        clocks = _trial_clocks(decoder) if decoder.offered else []
-        if decoder.offered is None:
+    """Look for further lamps, with as much work as it takes to try ``codes`` codes (6 us each with profile A).
+
+    What else there is to do counts as so many codes, or has a call of its own.
+    """
+    while codes > 0:
+        if decoder.found is not None:
+            found, decoder.found = decoder.found, None
+            codes -= _take(decoder, *found)
+        elif decoder.search.idle and not _begin(decoder):
             return
-        decoder.search.start(decoder.offered, clocks)
-        decoder.offered = None
-        decoder.barren *= len(clocks) == 1
-    done = decoder.search.step(codes)
+        else:
+            codes = _sweep(decoder, codes)
+
+
+def _begin(decoder: Decoder) -> bool:
+    """Start to search the block last offered, if there is one."""
+    clocks = _trial_clocks(decoder) if decoder.offered else []
+    if decoder.offered is None:
+        return False
+    decoder.search.start(decoder.offered, clocks)
+    decoder.offered = None
+    decoder.barren *= len(clocks) == 1
+    return True
+
+
+def _sweep(decoder: Decoder, codes: int) -> int:
+    """Go on with the sweep; returns what is left of the effort."""
+    left, done = decoder.search.step(codes)
     if done is not None:
         decoder.barren += 1
-        _take(decoder, *done)
+        decoder.found = done if done[-1] else None
+    return left
 
 
 def _trial_clocks(decoder: Decoder) -> list[float]:
     """The known clock alone; all of the range while none is known, and again when the known one confirms no lamp."""
     tracks, clocks = decoder.tracks, decoder.clocks
-    if clocks.known and decoder.barren < FULL_ROUND:
+    if (clocks.known or clocks.guess is not None or len(tracks.slots)) and decoder.barren < FULL_ROUND:
         return [clocks.clock]
-    if len(tracks.slots) and decoder.barren < FULL_ROUND:
-        return [clocks.clock]
+    clocks.guess = None
     if len(tracks.slots):  # candidates that came to nothing: start from a block without them
         for slot in tracks.slots:
             tracks.drop(int(slot))
@@ -101,20 +124,20 @@ def _trial_clocks(decoder: Decoder) -> list[float]:
     return [k * BIN for k in range(-reach, reach + 1)]
 
 
-def _take(decoder: Decoder, job: Job, clock: float, found: list[Found]) -> None:
-    """Make candidates of what a sweep found; the first ever also tell the sample clock."""
-    tracks, clocks = decoder.tracks, decoder.clocks
-    if not found:
-        return
+def _take(decoder: Decoder, job: Job, clock: float, found: list[Found]) -> int:
+    """Make candidates of what a sweep found; the first ever tell the sample clock only. Returns its cost in codes."""
+    tracks, clocks, cost = decoder.tracks, decoder.clocks, TAKING * len(found)
+    settled = clocks.known or clocks.guess is not None
+    if not len(tracks.slots) and (clock != clocks.clock or not settled):
+        clocks.suppose(decoder.search.refine(job, clock, found[0]))
+        return REFINING  # a sweep over all clocks takes so long that the phases in its block are no longer true
     decoder.offered = None  # in a block from before, these lamps have not been taken out
-    if not len(tracks.slots) and clock != clocks.clock:
-        clock, phase = decoder.search.refine(job, clock, found[0])
-        clocks.clock, clocks.clock_var = clock, UNTRIED**2
-        tracks.add(found[0].code, phase - job.lag, job.t_middle, found[0].amplitude)
     for candidate in found:
         tracks.add(candidate.code, candidate.phase - job.lag, job.t_middle, candidate.amplitude)
-    if not job.again:
+    if job.again < AGAIN:
         decoder.search.start(decoder.search.peeled(job, found), [clocks.clock])
+        cost += PEELING
+    return cost
 
 
 def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, BlockFlag]:
@@ -130,7 +153,7 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
         return None, BlockFlag.MALFORMED
     if words.min() == words.max():
         return None, BlockFlag.FLAT
-    clipped = (words <= RAIL * top) | (words >= (1.0 - RAIL) * top)
+    clipped = (words <= 0.0) | (words >= top)
     if np.mean(clipped) > CLIP_SHARE:
         return None, BlockFlag.SATURATED
     mask = np.where(clipped, 0.0, 1.0)

@@ -13,7 +13,7 @@ from estimator.cdma_epoch import BlockFlag, SampleBlock
 from estimator.cdma_mains import Mains
 from estimator.cdma_pieces import side_lobe
 from estimator.cdma_profile import Profile
-from estimator.cdma_search import DOMINANCE, Job, Search
+from estimator.cdma_search import DOMINANCE, Job, Outcome, Search
 from estimator.cdma_solve import joint_fit
 from estimator.cdma_stall import judge, mend
 from estimator.cdma_template import Shape, pulse_energy
@@ -34,6 +34,12 @@ STAMP_MARGIN_S: Final = 120e-6
 PATIENCE: Final = 2
 """Noisy blocks in a row from which nothing is learned; what disturbs more than those is there to stay."""
 
+CROSSED: Final = 0.1
+"""Cross-correlation of partial code periods, rms."""
+
+QUIET: Final = 1.2
+"""Noise over its usual level that is nothing but chance."""
+
 SPURIOUS: Final = 0.01
 """Of the strongest lamp: below this, errors of the template's shape can look like lamps."""
 
@@ -50,6 +56,7 @@ class Decoder:
         self.search = Search(profile)
         self.search.warm(round(profile.epoch_s * profile.sample_rate), self.clocks.clock)
         self.offered: Job | None = None
+        self.found: Outcome | None = None
         self.barren = 0
         self.odd = 0
         self.noise = 0.0
@@ -144,9 +151,11 @@ def _listen(decoder: Decoder, fit: Fit) -> None:
 
 
 def _weigh(decoder: Decoder, fit: Fit) -> None:
-    """Amplitudes."""
+    """Amplitudes. What is left over beyond the usual may be a lamp, and codes are not orthogonal."""
     tracks, slots = decoder.tracks, decoder.tracks.slots
-    tracks.amplitude[slots], tracks.amplitude_var[slots] = fit.amplitude, fit.amplitude_var
+    excess = max(fit.noise_var - (QUIET * decoder.usual_noise) ** 2, 0.0) if decoder.usual_noise else 0.0
+    crossed = CROSSED**2 * excess / pulse_energy(decoder.profile)
+    tracks.amplitude[slots], tracks.amplitude_var[slots] = fit.amplitude, fit.amplitude_var + crossed
     decoder.noise = float(np.sqrt(fit.noise_var))
 
 
@@ -165,7 +174,8 @@ def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
     A candidate must be stronger than the cross-correlation of a lamp that would explain all that is left over.
     """
     tracks, slots = decoder.tracks, decoder.tracks.slots
-    for k in np.flatnonzero((tracks.life[slots] == Life.TENTATIVE) | suspicious):
+    doubtful = suspicious & (solved.fit.amplitude > CLEAR * np.sqrt(solved.fit.amplitude_var))  # the dark stay put
+    for k in np.flatnonzero((tracks.life[slots] == Life.TENTATIVE) | doubtful):
         beside = side_lobe(solved.block, solved.prior, solved.fit, int(k), decoder.shape.table)
         if beside:
             tracks.move(int(slots[k]), beside)

@@ -9,6 +9,7 @@ the rest wait for the next block, from which the strong ones will have been take
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -48,6 +49,9 @@ FINE_LAGS: Final = np.arange(-2, 3) * 0.25
 SAME_CLOCK: Final = 4e-4
 """Spectra are computed anew when the clock has moved by so much (a fiftieth of a chip at the ends of a period)."""
 
+STALE: Final = 6
+"""Times as long it takes to try a code whose spectrum is not kept for this clock."""
+
 MOST_FOUND: Final = 12
 
 
@@ -68,7 +72,7 @@ class Job:
     Attributes:
         block: with the residual in place of its photocurrent. t_middle: s. lag: common lag of that block, chips.
         codes, phases: of each known lamp, lag included. floor: smallest amplitude worth reporting.
-        again: whether lamps found in an earlier sweep over the same block have been taken out.
+        again: how often lamps found in an earlier sweep over the same block have been taken out.
     """
 
     block: Sampled
@@ -77,12 +81,16 @@ class Job:
     codes: Index
     phases: Array
     floor: float
-    again: bool = False
+    again: int = 0
 
     @property
     def y(self) -> Array:
         """(N,) residual in ADC steps."""
         return self.block.y
+
+
+Outcome = tuple[Job, float, list[Found]]
+"""What was searched, at which clock, and what was found in it."""
 
 
 class Search:
@@ -95,6 +103,8 @@ class Search:
         self._energy = pulse_energy(profile)
         self._cache: Spectrum = np.empty((0, 0), np.complex64)
         self._cache_clock: Array = np.empty(0)
+        self._product: Spectrum = self._cache
+        self._lags: npt.NDArray[np.float32] = np.empty((0, 0), np.float32)
         self._size = 0
         self._job: Job | None = None
         self._plan: list[float] = []
@@ -116,21 +126,27 @@ class Search:
         self._limit = THRESHOLD if len(clocks) == 1 else COLD_THRESHOLD
         self._spectrum = _spectrum(job.y, self._size)
 
-    def step(self, codes: int) -> tuple[Job, float, list[Found]] | None:
-        """Try up to ``codes`` more codes; at the end of the sweep return (job, clock of the best trial, candidates)."""
+    def step(self, codes: int) -> tuple[int, Outcome | None]:
+        """Try up to ``codes`` more codes, fewer if their spectra have to be made first.
+
+        Returns what is left of the effort, and at the end of the sweep its outcome.
+        """
         job = self._job
         if job is None:
-            return None
+            return 0, None
         trial, first = divmod(self._next, len(self._codes))
         last = min(first + codes, len(self._codes))
+        cost = 1
+        if np.any(np.abs(self._cache_clock[first:last] - self._plan[trial]) > SAME_CLOCK):
+            last, cost = min(first + max(codes // STALE, 1), last), STALE
         self._found[trial] += self._try(job, self._plan[trial], first, last)
         self._next += last - first
         if self._next < len(self._plan) * len(self._codes):
-            return None
+            return codes - cost * (last - first), None
         self._job = None
         strongest = [max((f.z for f in found), default=0.0) for found in self._found]
         best = int(np.argmax(strongest))
-        return job, self._plan[best], _dominant(self._found[best])
+        return codes - cost * (last - first), (job, self._plan[best], _dominant(self._found[best]))
 
     def _spc(self, clock: float) -> float:
         """Samples per chip."""
@@ -155,8 +171,11 @@ class Search:
         self._prepare(np.arange(len(self._codes)), clock)
 
     def _correlation(self, codes: Spectrum, block: Spectrum) -> npt.NDArray[np.float32]:
-        """(K, F) correlation of a block with one period of each code that begins at each lag."""
-        return np.fft.irfft(codes * block, self._size).astype(np.float32, copy=False)
+        """(K, F) correlation of a block with one period of each code that begins at each lag; valid until the next."""
+        product, out = self._product[: len(codes)], self._lags[: len(codes)]
+        np.multiply(codes, block, out=product)
+        np.fft.irfft(product, self._size, out=out)  # type: ignore[arg-type]  # numpy's stubs know double only
+        return out
 
     def _try(self, job: Job, clock: float, first: int, last: int) -> list[Found]:
         n, spc = len(job.y), self._spc(clock)
@@ -208,10 +227,12 @@ class Search:
         if self._cache.shape[1] != size // 2 + 1:
             self._cache = np.empty((len(self._codes), size // 2 + 1), np.complex64)
             self._cache_clock = np.full(len(self._codes), np.inf)
+            self._product = np.empty_like(self._cache)
+            self._lags = np.empty((len(self._codes), size), np.float32)
         self._size = size
 
-    def refine(self, job: Job, clock: float, found: Found) -> tuple[float, float]:
-        """Clock and phase of one candidate by trial around it: 11 rates x 5 lags; the phase is at the middle."""
+    def refine(self, job: Job, clock: float, found: Found) -> float:
+        """The clock by one candidate, by trial around it: 11 rates x 5 lags."""
         spc, n = self._spc(clock), len(job.y)
         rate, shift = np.meshgrid(1.0 - FINE_RATES, FINE_LAGS / spc)
         phase, rate = found.phase + shift.ravel(), rate.ravel()
@@ -224,7 +245,7 @@ class Search:
         total = np.concatenate([np.zeros((len(rate), 1)), np.cumsum(waves[0] * job.y, axis=1)], axis=1)
         score = np.abs(np.diff(np.take_along_axis(total, bounds, axis=1), axis=1)).sum(axis=1)
         best = int(np.argmax(score))
-        return (1.0 + clock) * float(rate[best]) - 1.0, float(phase[best] % self._profile.length)
+        return (1.0 + clock) * float(rate[best]) - 1.0
 
     def peeled(self, job: Job, found: list[Found]) -> Job:
         """The same block without what has just been found in it, for another look at what that had covered.
@@ -242,9 +263,10 @@ class Search:
         )  # fmt: skip
         block = replace(job.block, y=without(job.block, prior, self._table))
         codes = np.append(job.codes, [f.code for f in found])
-        return Job(block, job.t_middle, job.lag, codes, np.append(job.phases, phase), job.floor, True)
+        return Job(block, job.t_middle, job.lag, codes, np.append(job.phases, phase), job.floor, job.again + 1)
 
 
+@cache
 def _fast_length(n: int) -> int:
     """Smallest even number of at least ``n`` without prime factors above 5, for which the FFT is quick."""
     odd: list[int] = [3**i * 5**j for i in range(11) for j in range(8)]

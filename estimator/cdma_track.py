@@ -57,7 +57,7 @@ FINEST: Final = 3e-4
 HITS, MISSES, LOST = 2, 2, 20
 """Blocks until a candidate is a lamp; until it is dropped; until a lamp is given up."""
 
-FAINT, CLEAR, EVIDENT = 4.0, 8.0, 20.0
+FAINT, CLEAR, EVIDENT = 5.0, 8.0, 20.0
 """Sigmas below which a lamp is not seen, and that count as seen once and as seen often enough."""
 
 
@@ -81,6 +81,7 @@ class Clocks:
         self.clock = 0.0 if clock_ppm is None else clock_ppm * 1e-6
         self.clock_var = UNTRIED**2
         self.proven, self._proven_var = self.clock, self.clock_var
+        self.guess: float | None = None
         self.state = np.zeros(2)  # lag, drift
         self.cov = np.diag([(STAMP_S * self._chip_rate) ** 2, (3e-5) ** 2])
 
@@ -105,12 +106,18 @@ class Clocks:
 
     def prove(self) -> None:
         """The sample clock has been confirmed by a lamp beyond doubt."""
-        self.known = True
+        self.known, self.guess = True, None
         self.proven, self._proven_var = self.clock, self.clock_var
+
+    def suppose(self, clock: float) -> None:
+        """A search over the whole range says so; the next ones, over newer blocks, will confirm it or not."""
+        self.clock = self.guess = clock
+        self.clock_var = UNTRIED**2
 
     def rest(self) -> None:
         """No lamp left: back to the last sample clock that was proven, so that chance finds do not wear it out."""
-        self.clock, self.clock_var = self.proven, max(self._proven_var, self.clock_var)
+        self.clock = self.proven if self.guess is None else self.guess
+        self.clock_var = max(self._proven_var, self.clock_var)
 
 
 class Tracks:
@@ -160,8 +167,8 @@ class Tracks:
     def add(self, code: int, phase: float, t: float, amplitude: float) -> None:
         """A candidate, its phase at time ``t`` without the common lag; ignored if all slots are taken.
 
-        A lamp that is known and seen there is left alone; one that is known but faint has been lost sight of, and is
-        put where the candidate is.
+        A lamp that is known and seen there is left alone; one that is known but faint has been lost sight of: it is
+        put where the candidate is, and has to be confirmed anew.
         """
         free = np.flatnonzero(self.life == Life.FREE)
         chips = (self.t - t) * self._chip_rate
@@ -170,6 +177,7 @@ class Tracks:
         known = np.flatnonzero(same & (apart < APART))
         if len(known) and self.faint(known).all():
             self._place(int(known[0]), phase, t)
+            self.life[known[0]] = Life.TENTATIVE
         if len(known) or not len(free):
             return
         k = int(free[0])

@@ -122,13 +122,13 @@ class Limits:
         icp_iterations: cap on matching iterations.
         points: cap on query points per match (the scan is thinned evenly above it).
         update_map: whether keyframe and map work may run in this cycle.
-        codes: how many light codes may be searched for lamps not seen yet (6 us each with profile A).
+        codes: effort for lamps not seen yet, in light codes that could be searched (6 us each with profile A).
     """
 
     icp_iterations: int
     points: int
     update_map: bool
-    codes: int = 129
+    codes: int = 150
 
 
 UNLIMITED: Final = Limits(icp_iterations=50, points=100_000, update_map=True)

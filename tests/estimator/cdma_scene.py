@@ -19,6 +19,9 @@ Array = npt.NDArray[np.float64]
 SAMPLES = 1111
 """50 ms of profile A."""
 
+EFFORT = 150
+"""Codes per slice of search: 1 ms with profile A."""
+
 
 def currents(x: float, y: float) -> Array:
     """Mean photocurrents (A) of a 4 x 4 ceiling of 10 x 10 m at 2.6 m above a photodiode; no field of view."""
@@ -72,7 +75,7 @@ class Run:
         self.t = block.t1 + float(self.ceiling.rng.uniform(1e-4, 1e-3))
         epoch = decode(self.decoder, sampled(block))
         for _ in range(self.slices):
-            search(self.decoder, 2**self.profile.degree + 1)
+            search(self.decoder, EFFORT)
         return block, epoch
 
     def blocks(self, count: int) -> Iterator[tuple[Block, LightEpoch]]:
