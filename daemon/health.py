@@ -243,7 +243,7 @@ ADC_NOUNS: Final[tuple[tuple[type[HalError], Fault], ...]] = (
 def _photodiode(now: Vitals, before: Vitals) -> Iterable[Fault]:
     if now.adc_error is not None:
         yield next(fault for noun, fault in ADC_NOUNS if isinstance(now.adc_error, noun))
-    elif not now.adc and now.adc_link is Link.STREAMING and now.unfit == before.unfit:
+    elif not (now.adc or before.adc) and now.adc_link is Link.STREAMING and 0 < before.cycles < now.cycles:
         yield Fault.ADC_SILENT
     blocks, lost = now.blocks - before.blocks, now.lost - before.lost
     unfit, stalled = now.unfit - before.unfit, now.stalled - before.stalled

@@ -32,7 +32,7 @@ from daemon.lights import Lights, SurveyError, load_lights, new_state
 from daemon.network import Feeds, Network
 from daemon.notify import notify
 from daemon.photodiode import AdcMaker, BlockWatch, make_adc
-from daemon.publish.snapshot import Snapshot
+from daemon.publish.snapshot import Snapshot, State
 from daemon.sampleclock import SampleClock
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
@@ -56,6 +56,8 @@ QUIET_S: Final = 2.0
 """Seconds a part may take to stop: the lidar has to be told to switch its laser off."""
 EXTEND_US: Final = 30_000_000
 """Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
+PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
+"""States in which there is a pose to speak of."""
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
 
 
@@ -255,7 +257,7 @@ class _FirstPose:
         self._said = False
 
     def __call__(self, snapshot: Snapshot) -> None:
-        if snapshot.pose is not None and not self._said:
+        if snapshot.pose is not None and snapshot.state in PLACED and not self._said:
             self._said = True
             log.info("first pose %.2f s after the start, %.0f MB", process_age_s(), resident_mb())
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from hal.adc import AdcStatus, Blemish, RawSamples, WrongChip
+from hal.adc import AdcStatus, Blemish, BusStuck, RawSamples, WrongChip
 from hal.clock import Clock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.i2c import AsyncBus, BusOpener, read, write
@@ -27,7 +27,7 @@ from hal.photodiode.follow import Followed, Follower
 from hal.photodiode.judge import Judge
 from hal.photodiode.level import PERIOD_S, LevelInput, LevelMeter, ask
 from hal.photodiode.sampler import Sampler, describe
-from hal.photodiode.silence import WatchedBus
+from hal.photodiode.silence import HANG_S, WatchedBus
 from hal.photodiode.timebase import SLOWER
 from hal.photodiode.trouble import explain, policy_for
 
@@ -116,7 +116,7 @@ class PhotodiodeAdc:
     async def _connection(self, on_samples: Callable[[RawSamples], None]) -> None:
         """Open, stream, recover on the open bus as long as that makes sense; raises to have it opened anew."""
         self._status.link = Link.OPENING
-        bus = WatchedBus(await self._opener(self._bus), self._block_s, self._explain, self._note_silence)
+        bus = WatchedBus(await self._open(), self._block_s, self._explain, self._note_silence)
         listening = asyncio.create_task(bus.listen())
         found: Capability | None = None
         try:
@@ -130,6 +130,23 @@ class PhotodiodeAdc:
         finally:
             listening.cancel()
             await bus.close()
+
+    async def _open(self) -> AsyncBus:
+        """Open the bus; an open that hangs in the kernel is told, and waited for: another try would hang as well."""
+        opening = asyncio.ensure_future(self._opener(self._bus))
+        try:
+            await asyncio.wait({opening}, timeout=HANG_S)
+            if not opening.done():
+                problem = f"the bus has been opening for {HANG_S:g} s"
+                remedy = "the adapter's driver hangs, or the bus server does: restart it, or the computer"
+                self._note_silence(BusStuck(self._bus, problem, remedy), True)
+            return await opening
+        except asyncio.CancelledError:
+            opening.cancel()
+            (bus,) = await asyncio.gather(opening, return_exceptions=True)
+            if not isinstance(bus, BaseException):  # it was open already
+                await bus.close()
+            raise
 
     async def _prepare(self, bus: AsyncBus) -> Capability:
         """Find the chip, make sure that it is the right one, and measure what the adapter can do."""

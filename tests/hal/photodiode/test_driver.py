@@ -10,6 +10,7 @@ import pytest
 
 from hal.adc import Blemish
 from hal.fake.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
+from hal.i2c import AsyncBus
 from hal.lidar import Link
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
 from tests.hal.photodiode.bench import Bench, falsehoods, on_bench, on_fake
@@ -172,5 +173,50 @@ def test_what_cannot_be_is_refused_at_once(chip: str, address: int, block_s: flo
             PhotodiodeAdc(
                 "/dev/i2c-1", address, chip, clock=bench.clock, opener=bench.opener, sampling=Sampling(block_s)
             )
+
+    on_fake(body)
+
+
+def test_an_open_that_hangs_is_told() -> None:
+    async def body(bench: Bench) -> None:
+        real, opened = bench.opener, 0
+
+        async def opener(name: str) -> AsyncBus:
+            nonlocal opened
+            opened += 1
+            await asyncio.sleep(20.0)
+            return await real(name)
+
+        bench.opener = opener
+        driver = bench.driver()
+        async with bench.running(driver):
+            await asyncio.sleep(3.1)
+            assert "has been opening for 3 s" in str(driver.status.error)
+            assert driver.status.link is Link.WAITING
+            await bench.more(3, 20.0, driver)
+            assert driver.status.error is None
+            assert opened == 1
+
+    on_fake(body)
+
+
+def test_stopping_during_an_open_that_hangs() -> None:
+    async def body(bench: Bench) -> None:
+        ended = asyncio.Event()
+
+        async def opener(_name: str) -> AsyncBus:
+            try:
+                await asyncio.sleep(1e6)
+            finally:
+                ended.set()
+            raise AssertionError
+
+        bench.opener = opener
+        for seconds in (1.0, 10.0):
+            ended.clear()
+            async with bench.running(bench.driver()):
+                await asyncio.sleep(seconds)
+            await asyncio.sleep(0.0)
+            assert ended.is_set()
 
     on_fake(body)
