@@ -29,6 +29,8 @@ LONGEST: Final = 10
 
 CLIP_SHARE: Final = 0.2
 """Of a block at the rails, beyond which what is left says nothing."""
+RAIL: Final = 1.0 / 128.0
+"""Share of the range beside either rail that counts as the rail: amplifiers stop up to 25 mV short of 3.3 V."""
 
 STORED_PPM: Final = 200.0
 """A stored sample clock is good to this."""
@@ -153,7 +155,7 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
         return None, BlockFlag.MALFORMED
     if words.min() == words.max():
         return None, BlockFlag.FLAT
-    clipped = (words <= 0.0) | (words >= top)
+    clipped = (words <= RAIL * top) | (words >= (1.0 - RAIL) * top)
     if np.mean(clipped) > CLIP_SHARE:
         return None, BlockFlag.SATURATED
     mask = np.where(clipped, 0.0, 1.0)

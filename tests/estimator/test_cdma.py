@@ -238,6 +238,19 @@ def test_clipped_samples_are_left_out() -> None:
     assert np.nanmax(np.abs(run.errors(block, epoch)[:8])) < 0.01
 
 
+@pytest.mark.parametrize("short_of_rail", [0.0, 16.0])
+def test_an_amplifier_that_stops_short_of_its_rails(short_of_rail: float) -> None:
+    """Flicker of 26 uA in a range of +-25 uA: a tenth of the samples stand where the amplifier stops."""
+    run = Run(ceiling(17))
+    run.settle(20)
+    run.ceiling.ambient = Ambient(flicker_a=26e-6)
+    block = run.ceiling.block(run.t, run.samples)
+    words = np.clip(block.words, short_of_rail, 4095.0 - short_of_rail)
+    epoch = decode(run.decoder, SampleBlock(block.t0, block.t1, words, block.nominal_rate))
+    assert epoch.block == BlockFlag.CLIPPED
+    assert np.nanmax(np.abs(run.errors(block, epoch)[:8])) < 0.01
+
+
 @pytest.mark.parametrize(
     ("damage", "flag"),
     [
