@@ -17,9 +17,9 @@ from estimator.records import Array
 WIDTH: Final = 12
 """Elements of the state that one link depends on: pose; common gain, floor, lean, order; the four of its lamp."""
 
-SLOT, LN, NOISE, SHIFT, SIGMA, LINK_COLUMNS = range(6)
+SLOT, LN, NOISE, SHIFT, SIGMA, SHIFT_X, SHIFT_Y, LINK_COLUMNS = range(8)
 """Columns of a link: slot, ln of the amplitude, variance of that, ln correction by a residual map, sigma of the model
-there (negative: the general one)."""
+there (negative: the general one), the correction's gradient (1/m)."""
 
 RESIDUAL, SPREAD, WHITE, DIRECT, COS_BETA, TOTAL, SLOPES = range(7)
 """Columns of what :func:`linearise` says of a link: ln(received / expected); its variance by the state alone; variance
@@ -91,7 +91,7 @@ def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: 
         out[i, DIRECT], out[i, COS_BETA] = direct, said[2]
         out[i, TOTAL] = total * np.exp(gain)
         h = out[i, SLOPES:]
-        h[0], h[1] = J[0] / total, J[1] / total
+        h[0], h[1] = J[0] / total + links[i, SHIFT_X], J[1] / total + links[i, SHIFT_Y]
         h[2] = (J[2] - by * J[0] + bx * J[1]) / total
         h[3], h[4] = 1.0, J[4] * floor / total
         h[5], h[6] = J[10] / total, J[11] / total

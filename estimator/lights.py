@@ -25,7 +25,18 @@ from estimator.linear3 import invert3
 from estimator.records import Array, Imu, Odometry
 from estimator.result import Fix, LightsResult, Link, LinkState
 
-__all__ = ["Lights", "LightsSettings", "carry_to", "new_lights", "place", "predict", "reset", "result", "update"]
+__all__ = [
+    "Lights",
+    "LightsSettings",
+    "carry_to",
+    "lean",
+    "new_lights",
+    "place",
+    "predict",
+    "reset",
+    "result",
+    "update",
+]
 
 HELD_S = 1.0
 """After so long without a usable link the pose is said to be held."""
@@ -70,6 +81,18 @@ def carry_to(lights: Lights, t_mono: float) -> None:
     """Bring the pose to an instant at the present velocity; an instant in the past changes nothing."""
     if math.isfinite(t_mono):
         lights_motion.carry_to(lights, t_mono)
+
+
+def lean(lights: Lights, slope_x: float, slope_y: float) -> None:
+    """How the robot leans now, as an IMU tells by gravity, beyond how it stood at calibration.
+
+    Args:
+        lights: all of the filter.
+        slope_x: of the receiver's axis in base_link, as in `lamps.Receiver`.
+        slope_y: the same, to the left.
+    """
+    if math.isfinite(slope_x) and math.isfinite(slope_y):
+        lights.lean = (slope_x, slope_y)
 
 
 def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:

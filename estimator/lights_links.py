@@ -174,22 +174,20 @@ def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight],
             continue
         busy.add(slot)
         sight.slot = slot
-        rows.append((slot, math.log(sight.amplitude), sight.variance / sight.amplitude**2, 0.0, -1.0))
+        rows.append((slot, math.log(sight.amplitude), sight.variance / sight.amplitude**2, 0.0, -1.0, 0.0, 0.0))
         kept.append(sight)
     links = np.array(rows, dtype=np.float64).reshape(len(rows), ekf_links.LINK_COLUMNS)
     if lights.corrections is not None and kept:
         ids = [sight.lamp.lamp_id for sight in kept if sight.lamp is not None]
-        shift, sigma = lights.corrections.at(ids, float(track.x[ekf.X]), float(track.x[ekf.Y]))
-        links[:, ekf_links.SHIFT], links[:, ekf_links.SIGMA] = np.where(sigma < 0.0, 0.0, shift), sigma
+        links[:, ekf_links.SHIFT :] = lights.corrections.at(ids, track.x[:3])
     return kept, links
 
 
 def view_of(lights: Lights, back: Array) -> Array:
     """What the kernels need besides state and links."""
-    model = lights.settings.model
-    return np.concatenate(
-        [pack_receiver(lights.survey.receiver), back, (model.ln, model.floor, model.white, model.edge)]
-    )
+    model, rx = lights.settings.model, pack_receiver(lights.survey.receiver)
+    rx[7:9] += lights.lean
+    return np.concatenate([rx, back, (model.ln, model.floor, model.white, model.edge)])
 
 
 def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, level_drop: bool) -> None:

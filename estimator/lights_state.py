@@ -29,8 +29,13 @@ class Pause(Enum):
 class Corrections(Protocol):
     """A residual map: how the model errs for a lamp at a place (walls, shape of the luminaire)."""
 
-    def at(self, lamp_ids: Sequence[int], x: float, y: float) -> tuple[Array, Array]:
-        """Mean and sigma of ln(received / model), one each per lamp; sigma negative where the map knows nothing."""
+    def at(self, lamp_ids: Sequence[int], T_map_base: Array) -> Array:
+        """What to add to ln of the expected strengths.
+
+        Returns:
+            One row per lamp: mean and sigma of ln, the mean's gradient along x and y (1/m). A negative sigma: the map
+            does not know this lamp.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +205,8 @@ class Lights:
         t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: where the start began.
         t_lost: since when most links contradict, inf if they do not. absent: by lamp ID, (instant, way) since which it
             should be received but is not.
-        corrections: a residual map, or None. level: running mean of the DC channel, A.
+        corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
+        level: running mean of the DC channel, A.
         lost: the last start was made necessary by a contradiction.
     """
 
@@ -217,6 +223,7 @@ class Lights:
     t_lost: float = math.inf
     absent: dict[int, tuple[float, float]] = field(default_factory=dict)
     corrections: Corrections | None = None
+    lean: tuple[float, float] = (0.0, 0.0)
     level: float | None = None
     lost: bool = False
     result: LightsResult | None = None

@@ -41,7 +41,10 @@ def links_of(x: Array, slots: list[int], seed: int) -> Array:
     rng = np.random.default_rng(seed)
     pose = se2.compose(x[:3], BACK)
     seen = expected([LAMPS[k] for k in slots], Survey(LAMPS, RECEIVER), pose).amplitude
-    rows = [(k, np.log(a) + 0.01 * rng.standard_normal(), 1e-4, 0.01, -1.0) for k, a in zip(slots, seen, strict=True)]
+    rows = [
+        (k, np.log(a) + 0.01 * rng.standard_normal(), 1e-4, 0.01, -1.0, 0.0, 0.0)
+        for k, a in zip(slots, seen, strict=True)
+    ]
     return np.array(rows)
 
 
