@@ -6,6 +6,7 @@ diffuse share, the receiver's order, lean and lever arm. What the drive cannot t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.calibrate_problem import COMMONS, OWNS, Common, Own, Priors, Problem, linear, problem, survey_at
-from estimator.calibrate_rows import Rows, thinned
+from estimator.calibrate_rows import Rows, joined, thinned
 from estimator.calibrate_solve import Solution, solve
 from estimator.lamps import Survey
 from estimator.records import Array
@@ -96,7 +97,15 @@ def calibrate(survey: Survey, rows: Rows, priors: Priors = PRIORS, start: Array 
     Raises:
         TooLittle: fewer than 30 strengths in plain view, or no lamp with six.
     """
-    rows = thinned(rows)
+    return _fitted(survey, thinned(rows), priors, start)
+
+
+def calibrate_from(survey: Survey, parts: Sequence[Rows], priors: Priors) -> Calibrated:
+    """The same from rows that are thinned already, in parts; raises `TooLittle`."""
+    return _fitted(survey, joined(parts), priors, None)
+
+
+def _fitted(survey: Survey, rows: Rows, priors: Priors, start: Array | None) -> Calibrated:
     task = problem(survey, priors)
     if start is not None:
         task.before[Common.FRAME_X : Common.FRAME_YAW + 1] = start

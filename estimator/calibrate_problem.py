@@ -33,6 +33,9 @@ class Common(IntEnum):
     FRAME_Y = 8
     FRAME_YAW = 9
     HEIGHT = 10  # of all lamps, m
+    BULGE = 11  # departure of the lamps' type from cos^m between axis and rim, ln
+    OVAL_C = 12  # by which the type is wider along x than along y, ln
+    OVAL_S = 13  # the same along the diagonals
 
 
 class Own(IntEnum):
@@ -45,6 +48,10 @@ class Own(IntEnum):
     X = 4  # m
     Y = 5
     Z = 6
+    GLOW_EAST = 7  # light by way of a wall on that side, 1 m from the lamp, as a share of the direct light at its nadir
+    GLOW_WEST = 8
+    GLOW_NORTH = 9
+    GLOW_SOUTH = 10
 
 
 COMMONS: Final = len(Common)
@@ -55,6 +62,10 @@ LEAST_ORDER: Final = 0.05
 LARGEST_SLOPE: Final = 0.5
 RIM_RAD: Final = 0.07
 """Nearer than this to the edge of the field of view nobody knows how much comes through."""
+LEAST_FLOOR: Final = 0.015
+BREADTH_M: Final = 1.7
+FADING_M: Final = 1.2
+FARTHEST_M: Final = 3.0
 FLOOR_DOUBT: Final = 0.5
 """By how much of itself the diffuse part may differ from place to place."""
 
@@ -68,6 +79,9 @@ class Priors:
         order: Lambert orders, as a part of ``0.5 + order``. slope: of lamps. place: of lamps in x and y, z: in z.
         floor: the diffuse share. rx_order, rx_slope, lever: the receiver.
         frame, frame_yaw: where the drive's frame lies in the survey's. height: common to all lamps.
+        pattern: departure of the lamps' type from Lambert's law, ln. glow: of each lamp by way of walls, by side.
+            Only a survey by drive looks for these two, so that lamps at the edge of the way are not drawn aside; they
+            cannot be kept in a survey.
     """
 
     gain: float = 0.5
@@ -82,6 +96,8 @@ class Priors:
     frame: float = 0.0
     frame_yaw: float = 0.0
     height: float = 0.0
+    pattern: float = 0.0
+    glow: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,13 +148,18 @@ class Linear:
 def problem(survey: Survey, priors: Priors) -> Problem:
     """A survey with what is known of it before the drive."""
     r = survey.receiver
-    common = np.array((0.0, survey.floor, r.order, r.slope_x, r.slope_y, r.x, r.y, 0.0, 0.0, 0.0, 0.0))
+    common = np.array((0.0, survey.floor, r.order, r.slope_x, r.slope_y, r.x, r.y, *[0.0] * 7))
     p = priors
     rx = (p.rx_order, p.rx_slope, p.rx_slope, p.lever, p.lever)
-    common_prior = np.array((p.gain, p.floor, *rx, p.frame, p.frame, p.frame_yaw, p.height))
-    own = np.array([(0.0, q.order, q.slope_x, q.slope_y, q.x, q.y, q.z) for q in survey.lamps]).reshape(-1, OWNS)
+    common_prior = np.array((p.gain, p.floor, *rx, p.frame, p.frame, p.frame_yaw, p.height, *[p.pattern] * 3))
+    own = np.array([(0.0, q.order, q.slope_x, q.slope_y, q.x, q.y, q.z, *[0.0] * 4) for q in survey.lamps]).reshape(
+        -1, OWNS
+    )
     own_prior = np.array(
-        [(q.sigma_ln, p.order * (0.5 + q.order), p.slope, p.slope, p.place, p.place, p.z) for q in survey.lamps]
+        [
+            (q.sigma_ln, p.order * (0.5 + q.order), p.slope, p.slope, p.place, p.place, p.z, *[p.glow] * 4)
+            for q in survey.lamps
+        ]
     ).reshape(-1, OWNS)
     return Problem(survey, np.r_[common, own.ravel()], np.r_[common_prior, own_prior.ravel()])
 
@@ -169,11 +190,35 @@ def linear(task: Problem, rows: Rows, theta: Array) -> Linear:
     dx, dy = pose[:, 0] - theta[Common.FRAME_X], pose[:, 1] - theta[Common.FRAME_Y]
     common[:, Common.FRAME_YAW] = J[:, Wrt.YAW] - dy * J[:, Wrt.X] + dx * J[:, Wrt.Y]
     common[:, Common.HEIGHT] = J[:, Wrt.LAMP_Z]
-    doubt = FLOOR_DOUBT * floor * J[:, Wrt.FLOOR]
+    common[:, Common.BULGE :] = _pattern(lamps[rows.lamp], pose, receiver[2])
+    glow, own_glow = _glow(lamps[rows.lamp], pose, J[:, Wrt.FLOOR], theta[COMMONS:].reshape(-1, OWNS)[rows.lamp])
+    doubt = FLOOR_DOUBT * max(floor, LEAST_FLOOR) * J[:, Wrt.FLOOR]
     inside = np.cos(task.survey.receiver.half_fov_rad - RIM_RAD)
     seen = (out[:, 2] > inside) & (out[:, 1] > 0.5 * amplitude)
-    residual = np.log(rows.amplitude / amplitude)
-    return Linear(np.where(np.isfinite(residual), residual, 0.0), common, J[:, _OWN_COLUMNS], doubt, seen)
+    residual = np.log(rows.amplitude / amplitude) - common[:, Common.BULGE :] @ theta[Common.BULGE : COMMONS] - glow
+    own = np.hstack((J[:, _OWN_COLUMNS], own_glow))
+    return Linear(np.where(np.isfinite(residual), residual, 0.0), common, own, doubt, seen)
+
+
+def _pattern(lamps: Array, pose: Array, z: float) -> Array:
+    """(n, 3) how the departures from Lambert's law act at each row; how they change with place is left out."""
+    dx, dy, h = pose[:, 0] - lamps[:, 0], pose[:, 1] - lamps[:, 1], lamps[:, 2] - z
+    d2 = dx**2 + dy**2 + h**2
+    return np.column_stack((4.0 * (d2 - h**2) * h**2 / d2**2, (dx**2 - dy**2) / d2, 2.0 * dx * dy / d2))
+
+
+def _glow(lamps: Array, pose: Array, share: Array, own: Array) -> tuple[Array, Array]:
+    """(n,) ln that light by way of walls adds, and its derivatives (n, 4); ``share``: d ln amplitude / d floor.
+
+    Light from the lit patch of a wall beside a lamp fades about exponentially with the distance from the wall, so that
+    where the wall stands does not matter, and like a bell along it.
+    """
+    way = pose[:, :2] - lamps[:, :2]
+    sides = np.column_stack((way[:, 0], -way[:, 0], way[:, 1], -way[:, 1]))
+    across = way[:, [1, 1, 0, 0]] / BREADTH_M
+    each = share[:, None] * np.exp((np.minimum(sides, FARTHEST_M) - 1.0) / FADING_M - 0.5 * across**2)
+    factor = np.maximum(1.0 + (each * own[:, Own.GLOW_EAST :]).sum(axis=1), 0.2)
+    return np.log(factor), each / factor[:, None]
 
 
 def placed(theta: Array, pose: Array) -> Array:

@@ -1,13 +1,15 @@
 """Robust least squares over a problem of calibration: Levenberg-Marquardt on ln strength with Cauchy's loss.
 
-Cost    sum_i c^2/2 ln(1 + (r_i / (c s_i))^2) + 1/2 sum_k ((theta_k - before_k) / prior_k)^2
-with    s_i^2 = scale^2 (0.03^2 + doubt_i^2) + noise_i^2
+Cost    sum_i q_i c^2/2 ln(1 + (r_i / (c s_i))^2) + 1/2 sum_k ((theta_k - before_k) / prior_k)^2
+with    s_i^2 = scale^2 (0.03^2 + doubt_i^2) + noise_i^2,   q_i = 1 / (rows in the same patch of floor)
+
+A thousand rows beside one wall are few facts, because the model's error is the same for all strengths from one patch.
+All of a patch together weigh as one row, so that the priors keep their weight against them.
 
 The scale is found from the residuals themselves (median absolute deviation) and the fit repeated. A strength far below
 what is expected was blocked, one far above came by a mirror or from another lamp: both are left out after the first
-round. A thousand rows beside one wall are few facts, because the model's error is the same for all strengths from one
-patch of floor. The covariance is therefore the larger, parameter by parameter, of two: that of as many rows as there
-are patches, and White's sandwich over patches, which shows what really scatters (H. White, Econometrica 48, 1980).
+round. The covariance is the larger, parameter by parameter, of two: that of as many facts as there are patches, and
+White's sandwich over patches, which shows what really scatters (H. White, Econometrica 48, 1980).
 """
 
 from __future__ import annotations
@@ -68,7 +70,8 @@ def solve(task: Problem, rows: Rows, start: Array | None = None) -> Solution:
         here = linear(task, rows, theta)
         used = here.seen & (_in_sigmas(here, rows, scale, BLOCKED, STRANGE) if turn > 0 else True)
         theta, cost, converged = _descend(task, rows.chosen(used), theta, scale)
-        scale = _scale(linear(task, rows.chosen(used), theta), rows.chosen(used), task)
+        # of all that is in plain view, left out or not: the scale of what was kept would shrink round by round
+        scale = _scale(linear(task, rows.chosen(here.seen), theta), rows.chosen(here.seen), task)
     last = linear(task, rows, theta)
     covariance = _covariance(task, rows.chosen(used), theta, scale)
     return Solution(theta, covariance, used, last.residual, scale * MODEL_LN, cost, converged)
@@ -95,11 +98,18 @@ def _scale(here: Linear, rows: Rows, task: Problem) -> float:
     return max(float(np.sqrt(max(total - float(np.median(rows.sigma**2 / unit)), 0.0))), LEAST_SCALE)
 
 
-def _cost(task: Problem, here: Linear, s: Array, theta: Array) -> float:
+def _importance(rows: Rows) -> Array:
+    """(n,) each row's part in its patch."""
+    groups = patches(rows.pose, rows.lamp)
+    part: Array = 1.0 / np.bincount(groups)[groups] if len(rows) else np.zeros(0)
+    return part
+
+
+def _cost(task: Problem, here: Linear, s: Array, q: Array, theta: Array) -> float:
     share = here.residual / s
     free = task.free
     held = (theta[free] - task.before[free]) / task.prior[free]
-    return float(0.5 * CAUCHY**2 * np.log1p((share / CAUCHY) ** 2).sum() + 0.5 * held @ held)
+    return float(0.5 * CAUCHY**2 * (q @ np.log1p((share / CAUCHY) ** 2)) + 0.5 * held @ held)
 
 
 def _weight(here: Linear, s: Array) -> Array:
@@ -127,10 +137,10 @@ def _descend(task: Problem, rows: Rows, theta: Array, scale: float) -> tuple[Arr
     free = task.free
     held = np.diag(1.0 / task.prior[free] ** 2)
     here = linear(task, rows, theta)
-    s = sigmas(here, rows, scale)
-    cost, damping = _cost(task, here, s, theta), 1e-4
+    s, q = sigmas(here, rows, scale), _importance(rows)
+    cost, damping = _cost(task, here, s, q, theta), 1e-4
     for _ in range(STEPS):
-        A, b = _normal(task, rows, here, _weight(here, s))
+        A, b = _normal(task, rows, here, q * _weight(here, s))
         A, b = A[np.ix_(free, free)] + held, b[free] - held @ (theta[free] - task.before[free])
         while damping < 1e8:
             step = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
@@ -138,7 +148,7 @@ def _descend(task: Problem, rows: Rows, theta: Array, scale: float) -> tuple[Arr
             trial[free] += step
             trial = bounded(trial)
             there = linear(task, rows, trial)
-            reached = _cost(task, there, s, trial)
+            reached = _cost(task, there, s, q, trial)
             if reached <= cost:
                 break
             damping *= 8.0
@@ -152,22 +162,19 @@ def _descend(task: Problem, rows: Rows, theta: Array, scale: float) -> tuple[Arr
 
 
 def _covariance(task: Problem, rows: Rows, theta: Array, scale: float) -> Array:
-    """The larger of sandwich and patch-wise information, see above; zero for what was taken as given."""
+    """The larger of sandwich and information, see above; zero for what was taken as given."""
     p, free = len(theta), task.free
     here = linear(task, rows, theta)
-    weight = _weight(here, sigmas(here, rows, scale))
-    groups = patches(rows.pose, rows.lamp)
+    weight = _importance(rows) * _weight(here, sigmas(here, rows, scale))
     held = np.diag(1.0 / task.prior[free] ** 2)
     pick = np.ix_(free, free)
     inverse = np.linalg.inv(_normal(task, rows, here, weight)[0][pick] + held)
-    share = weight / np.bincount(groups)[groups] if len(rows) else weight
-    fewer = np.linalg.inv(_normal(task, rows, here, share)[0][pick] + held)
     scores = _scores(task, rows, here, weight)[:, free]
     few = len(scores) / max(len(scores) - len(free), 0.5 * len(scores), 1.0)
     sandwich = inverse @ (few * scores.T @ scores + held) @ inverse
-    stretch = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(fewer), 1.0))
+    stretch = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
     covariance = np.zeros((p, p))
-    covariance[pick] = stretch[:, None] * fewer * stretch[None, :]
+    covariance[pick] = stretch[:, None] * inverse * stretch[None, :]
     return covariance
 
 
