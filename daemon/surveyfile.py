@@ -94,17 +94,28 @@ class ReceiverEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """The whole file."""
 
-    lamp: Annotated[tuple[LampEntry, ...], Meta(min_length=1, description="the lamps")]
+    lamp: Annotated[
+        tuple[LampEntry, ...], Meta(description="the lamps; [] with a [receiver]: the lamps describe themselves")
+    ]
     floor: Annotated[float, Meta(ge=0.0, le=0.5, description="diffuse light, part of a lamp's own at its nadir")] = (
         _SURVEY.floor
     )
     depth: Annotated[float, Meta(ge=0.002, le=0.95, description="modulation depth of the lamps")] = _SURVEY.depth
-    receiver: ReceiverEntry = ReceiverEntry()
+    receiver: ReceiverEntry | None = None
+
+    def __post_init__(self) -> None:
+        if not self.lamp and self.receiver is None:
+            raise ValueError("Expected lamps, or a [receiver] for lamps that describe themselves, got neither")
+
+    @property
+    def eye(self) -> ReceiverEntry:
+        """The receiver, a plain one where the file does not say."""
+        return self.receiver or ReceiverEntry()
 
     def survey(self) -> Survey:
         """As the estimator takes it; lamps in order of their numbers."""
         lamps = sorted((entry.lamp() for entry in self.lamp), key=lambda lamp: lamp.lamp_id)
-        return Survey(tuple(lamps), self.receiver.receiver(), self.floor, self.depth)
+        return Survey(tuple(lamps), self.eye.receiver(), self.floor, self.depth)
 
 
 def order_of(half_angle_deg: float) -> float:
@@ -231,8 +242,8 @@ def _check_lamps(path: Path, text: str, tree: SurveyTree) -> None:
         if entry.lamp_id in seen:
             raise SurveyError(f"{place}: that `lamp_id` is taken already{_at(text, seen[entry.lamp_id], ' by line ')}")
         seen[entry.lamp_id] = index
-        if entry.z < tree.receiver.z + HEADROOM_M:
-            raise SurveyError(f"{place}: hangs at z = {entry.z} m, not above the receiver (z = {tree.receiver.z} m)")
+        if entry.z < tree.eye.z + HEADROOM_M:
+            raise SurveyError(f"{place}: hangs at z = {entry.z} m, not above the receiver (z = {tree.eye.z} m)")
         for other in tree.lamp[:index]:
             if math.dist((entry.x, entry.y, entry.z), (other.x, other.y, other.z)) < NEAREST_M:
                 raise SurveyError(f"{place}: hangs where lamp {other.lamp_id} hangs; correct or delete one of them")

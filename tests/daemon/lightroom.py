@@ -53,11 +53,11 @@ class Lit:
         return np.asarray(0.5 + current / ceiling.receiver.full_scale_a)
 
 
-def plugged(clock: Clock, source: Lit, chip: str = "MCP3221", address: int = 0x4D) -> tuple[FakeBuses, FakeAdc]:
+def plugged(clock: Clock, source: Lit, bus: str = BUS) -> tuple[FakeBuses, FakeAdc]:
     """A fake converter on a bus of its own."""
-    device = FakeAdc(source, clock, chip=chip, address=address)
+    device = FakeAdc(source, clock)
     buses = FakeBuses(clock)
-    buses.plug(BUS, device)
+    buses.plug(bus, device)
     return buses, device
 
 

@@ -7,6 +7,7 @@ import socket
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from daemon import configfile
@@ -21,6 +22,7 @@ from hal.fake.models import UST_10LX, Unit
 from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
 from hal.port import Port
+from tests.daemon.lightroom import Lit, plugged
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "systemd").glob("*.toml"))
 
@@ -83,7 +85,16 @@ def test_every_example_starts(file: Path) -> None:
             return await plugs("lidar", baud)
 
         snapshots: list[Snapshot] = []
-        world = World(clock, opener=open_whatever, make_worker=CycleWorker, warm_up=warm, sinks=(snapshots.append,))
+        buses, adc = plugged(clock, Lit((41, 49, 73, 81)), bus=settings.photodiode.bus)
+        adc.add_level(lambda t_mono: np.full_like(t_mono, 0.4))
+        world = World(
+            clock,
+            opener=open_whatever,
+            make_worker=CycleWorker,
+            warm_up=warm,
+            sinks=(snapshots.append,),
+            buses=buses,
+        )
         daemon = Daemon(settings, world)
         stop = asyncio.Event()
         running = asyncio.create_task(daemon.run(stop))
@@ -99,7 +110,11 @@ def test_every_example_starts(file: Path) -> None:
         patch.setattr("hal.hokuyo.discover.candidates", lambda: ["/dev/ttyACM0"])
         snapshots, daemon, block = run_virtual(go())
     expected = State.DEGRADED if settings.odometry.port else State.TRACKING  # nobody sends odometry here
-    assert snapshots[-1].state is expected
-    assert block["state"] == expected
+    if settings.photodiode.fitted:
+        assert block["links"] == 4
+        assert block["light_fix"] is not None
+    else:
+        assert snapshots[-1].state is expected
+        assert block["state"] == expected
     assert block["map_x"] is not None
     assert daemon.cycle.parts.scans.T_base_lidar[0] == settings.lidar.mount.x

@@ -166,6 +166,15 @@ def test_files_that_are_no_survey(tmp_path: Path, content: bytes) -> None:
         read_survey(path)
 
 
+def test_a_receiver_alone_is_a_survey_of_lamps_that_describe_themselves(tmp_path: Path) -> None:
+    path = tmp_path / "lights.toml"
+    path.write_text("lamp = []\n[receiver]\nz = 0.4\n")
+    survey = read_survey(path)
+    assert (survey.lamps, survey.receiver.z) == ((), 0.4)
+    write_survey(path, survey, force=True)
+    assert read_survey(path) == survey
+
+
 def test_missing_and_unreadable(tmp_path: Path) -> None:
     with pytest.raises(SurveyError, match="no such survey"):
         read_survey(tmp_path / "none.toml")
