@@ -14,4 +14,5 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _write(folder: Folder, outcome: replay.Outcome) -> None:
-    folder.write_each(map_files(outcome.rerun.render(), outcome.rerun.ledger.final().poses))
+    rerun = outcome.rerun
+    folder.write_each(map_files(rerun.render(), rerun.ledger.final().poses, rerun.lamps()))

@@ -1,4 +1,7 @@
-"""A map with a trajectory as a picture to look at: walls dark on white, the path coloured from its start to its end."""
+"""A map with a trajectory as a picture to look at: walls dark on white, the path coloured from its start to its end.
+
+Ceiling lamps, where the map lies in their survey, are rings filled with yellow.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,21 @@ PATH: Final = np.array(((37, 99, 235), (16, 185, 129), (245, 158, 11), (220, 38,
 
 START: Final = np.array((37.0, 99.0, 235.0))
 END: Final = np.array((220.0, 38.0, 38.0))
+LAMP: Final = np.array((250.0, 204.0, 21.0))
+_LAMP_PX: Final = 6.0
+_RING_PX: Final = 2.0
 _LINE_PX: Final = 1.2
 _DOT_PX: Final = 7.0
 _BAR_PX: Final = 3.0
 
 
-def draw(grid: Grid, path: Array) -> npt.NDArray[np.uint8]:
+def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.uint8]:
     """RGB pixels (rows, columns, 3), top row first.
 
     Args:
         grid: the map.
         path: (n, 2 or more) positions in the map frame in order of time, metres; n may be 0.
+        lamps: (k, 2) positions of lamps in the map frame; those beyond the map's edge are not drawn.
     """
     probability = grid.probability
     if probability.size == 0:
@@ -41,6 +48,10 @@ def draw(grid: Grid, path: Array) -> npt.NDArray[np.uint8]:
     scale = max(1, round(SMALLEST_SIDE / max(probability.shape)))
     pixels = _shade(probability[::-1].repeat(scale, axis=0).repeat(scale, axis=1))
     places = _to_pixels(grid, path, scale, len(pixels))
+    if lamps is not None and len(lamps) > 0:
+        at = _to_pixels(grid, lamps, scale, len(pixels))
+        _stamp(pixels, at, np.tile(WALL, (len(at), 1)), _LAMP_PX + _RING_PX)
+        _stamp(pixels, at, np.tile(LAMP, (len(at), 1)), _LAMP_PX)
     if len(places) > 0:
         _draw_path(pixels, places)
     _draw_bar(pixels, scale / grid.resolution)

@@ -195,7 +195,7 @@ def _write_all(folder: Folder, outcome: Outcome) -> None:
         ("trajectory.tum", tum(final)),
         ("online.tum", tum(ledger.online())),
         ("loops.csv", _loops(ledger)),
-        *map_files(grid, final.poses),
+        *map_files(grid, final.poses, outcome.rerun.lamps()),
         ("summary.json", _json(summary(outcome, grid))),
     ]
     try:

@@ -8,6 +8,8 @@ from array import array
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+
 from daemon.bridge import SampleBridge, ScanBridge
 from daemon.budget import FixedBudget
 from daemon.config import Config
@@ -20,7 +22,7 @@ from daemon.sources import Event, Source, Turn
 from daemon.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
 from estimator.grid import Grid
-from estimator.records import UNLIMITED, Limits, Order, Record
+from estimator.records import UNLIMITED, Array, Limits, Order, Record
 from estimator.result import StepResult
 from hal.adc import AdcStatus, RawSamples
 from hal.imu import RawImu
@@ -159,6 +161,13 @@ class Rerun:
             except ValueError:
                 continue
         return pipeline.render_map(self._state, RESOLUTIONS_M[-1])
+
+    def lamps(self) -> Array | None:
+        """(k, 2) surveyed places of the lamps in the map frame; None until light has told where the map lies."""
+        tie, light = self._state.absolute, self._state.light
+        if tie is None or light is None or not tie.placed:
+            return None
+        return np.array([(lamp.x, lamp.y) for lamp in light.setup.survey.lamps]).reshape(-1, 2)
 
     def _arrive(self, t_rx: float) -> None:
         self._clock.t_mono = max(self._clock.t_mono, t_rx)

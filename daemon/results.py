@@ -137,10 +137,10 @@ def map_yaml(grid: Grid, image: str) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def map_files(grid: Grid, path: Array) -> list[tuple[str, bytes]]:
-    """map.pgm, map.yaml and map.png (with ``path``, positions (n, 2 or more) in m) by name."""
+def map_files(grid: Grid, path: Array, lamps: Array | None = None) -> list[tuple[str, bytes]]:
+    """map.pgm, map.yaml and map.png by name, with ``path``, positions (n, 2 or more), and ``lamps``, (k, 2), in m."""
     return [
         ("map.pgm", pgm(grid)),
         ("map.yaml", map_yaml(grid, "map.pgm")),
-        ("map.png", encode_png(draw(grid, path))),
+        ("map.png", encode_png(draw(grid, path, lamps))),
     ]

@@ -66,7 +66,7 @@ class Absolute:
             unknown. odd_since: since when they have disagreed.
         way, way_young: driven so far, and when light last began to find the place.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
-        since: ID of the first keyframe laid after light and pose agreed for the last time.
+        since: ID of the first keyframe laid after the pose was known for the last time.
         t_match: instant of the latest match. poses: T_odom_base of the last second, each with its instant.
     """
 
@@ -140,7 +140,6 @@ def on_lights(state: State, lights: LightsResult) -> None:
     if not tie.placed or _contradicted(tie, lights) or _surer(tie, lights):
         follow(state, lights, T_odom_base)
     elif lights.fix is Fix.GOOD and tie.odd_since is None:
-        tie.since = state.next_key
         gain(state, lights, T_odom_base, off)
 
 
@@ -178,20 +177,27 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     after = _symmetric(invert3(invert3(before) + _positive(G)))
     keep = R.T @ after @ invert3(before) @ R
     tie.P, tie.X = R.T @ after @ R, keep @ tie.X
-    T = se2.compose(state.T_map_odom, T_odom_base) + after @ told
-    move_map(state, se2.compose(T, se2.inverse(T_odom_base)))
+    correct(state, se2.compose(state.T_map_odom, T_odom_base) + after @ told, T_odom_base)
+    if np.all(np.diag(after) < KNOWN):
+        tie.since = state.next_key
 
 
 def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
-    """Take the lights' pose as it is; what was laid since light and pose agreed for the last time comes along."""
+    """Take the lights' pose as it is."""
     tie = state.absolute
     assert tie is not None
-    T_map_odom = se2.compose(lights.T_map_base, se2.inverse(T_odom_base))
-    R = se2.rotation(T_map_odom[2])
-    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), tie.since)
-    move_map(state, T_map_odom)
+    correct(state, lights.T_map_base, T_odom_base)
+    R = se2.rotation(state.T_map_odom[2])
     tie.P, tie.X = R.T @ lights.covariance @ R, np.zeros((3, 3))
-    tie.placed, tie.odd_since, tie.fresh, tie.since = True, None, 0.0, state.next_key
+    tie.placed, tie.odd_since, tie.fresh = True, None, 0.0
+
+
+def correct(state: State, T_map_base: Array, T_odom_base: Array) -> None:
+    """Move the map; what was laid since the pose was last known comes along, what is older stays where it is."""
+    assert state.absolute is not None
+    T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
+    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), state.absolute.since)
+    move_map(state, T_map_odom)
 
 
 def virtual(state: State) -> Virtual | None:
