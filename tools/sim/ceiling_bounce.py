@@ -22,6 +22,9 @@ Float32 = npt.NDArray[np.float32]
 REFERENCE_ALBEDO: Final = 0.75
 """Of a painted wall in infrared; `rho` is its reflectance for the lamps' light, other surfaces are in proportion."""
 
+SMALLEST_M: Final = 0.12
+"""Posts and reveals narrower than this give nothing back."""
+
 
 @dataclass(frozen=True, slots=True)
 class Finish:
@@ -123,7 +126,7 @@ def _patches(world: World, zone: Zone, finish: Finish) -> tuple[Array, Array, fl
     for (_, ax, ay, bx, by, material), top in zip(shapes[chosen], tops[chosen], strict=True):
         length = float(np.hypot(bx - ax, by - ay))
         rho = finish.rho * albedo[int(material)] / REFERENCE_ALBEDO
-        if rho < 0.01 or length < 0.02:
+        if rho < 0.01 or length < SMALLEST_M:
             continue
         count = int(np.ceil(length / size))
         part = (np.arange(count) + 0.5) / count

@@ -16,13 +16,14 @@ from estimator.cdma_epoch import LightEpoch
 from estimator.cdma_profile import PROFILE_A
 from hal.adc import AdcStatus, Blemish, RawSamples
 from hal.clock import Clock
-from hal.fake.adc import FakeAdc, FakeBuses
+from hal.fake.adc import FakeBuses
 from hal.fake.schedule import Target
 from hal.i2c import BusOpener
 from hal.lidar import Link
 from tools.sim.ceiling_links import EPOCH_S, PERIOD_S
 from tools.sim.scene import Scene
 from tools.sim.scene_light import LINK, SceneLight
+from tools.sim.serve_light import converter
 
 BUS: Final = "/dev/i2c-simulated"
 LEVEL: Final = "ads1115@0x48/0"
@@ -48,15 +49,6 @@ def light_up(world: World, light: SceneLight, clock: Clock) -> dict[str, Target]
     buses.plug(BUS, device)
     world.buses = buses
     return {"adc": device}
-
-
-def converter(light: SceneLight, clock: Clock) -> FakeAdc:
-    """A fake MCP3221, and an ADS1115 as DC channel if the scenario has one, under the lamps."""
-    device = FakeAdc(light.sample, clock)
-    device.bus.scl_error = light.lights.scl_error
-    if light.lights.level:
-        device.add_level(light.level)
-    return device
 
 
 class _Ticking:

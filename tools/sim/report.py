@@ -3,6 +3,7 @@
 ::
 
     python -m tools.sim.report paper_room --seconds 275
+    python -m tools.sim.report paper_room --lights link --seconds 300 --no-lidar
     python -m tools.sim.report corridor_loop --lidar UST-20LX --seconds 200 --empty --csv run.csv
 """
 
@@ -20,8 +21,10 @@ from daemon.publish.snapshot import State
 from daemon.state import REASONS, Reason
 from hal.fake.models import MODELS
 from tools.sim.buildings import BUILDINGS
+from tools.sim.ceiling import Effects
 from tools.sim.harness import Run, run
 from tools.sim.scene import Scenario
+from tools.sim.scene_light import LINK, WAVEFORM, Lights
 
 WRONG_M = 0.3
 """A pose further off than this is wrong, whatever is said about it."""
@@ -39,7 +42,21 @@ def describe(out: Run) -> str:
         "states: " + ", ".join(f"{name} {count / len(out.state):.1%}" for name, count in states.most_common()),
         f"TRACKING and more than {WRONG_M} m off: {np.mean(tracking & (off > WRONG_M)):.1%} of the time",
     ]
-    return "\n".join(lines + changes(out))
+    return "\n".join(lines + alone(out) + changes(out))
+
+
+def alone(out: Run) -> list[str]:
+    """A line about the position from lights alone, where there are any."""
+    rows = [(k, s.light) for k, s in enumerate(out.snapshots) if s.light is not None]
+    if not rows:
+        return []
+    known = [(k, light.pose) for k, light in rows if light.pose is not None]
+    if not known:
+        return ["lights alone: never a position"]
+    off = np.array([np.hypot(pose[0] - out.site[k, 0], pose[1] - out.site[k, 1]) for k, pose in known])
+    text = f"lights alone: known {len(known) / len(rows):.0%} of the time, "
+    text += f"rms {np.sqrt(np.mean(off**2)):.3f} m, median {np.median(off):.3f} m, largest {off.max():.3f} m"
+    return [text + f"; {np.mean([len(light.links) for _, light in rows]):.1f} links"]
 
 
 def changes(out: Run) -> list[str]:
@@ -69,13 +86,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--empty", action="store_true", help="nobody walks about")
     parser.add_argument("--no-odometry", action="store_true", help="the laser alone")
-    parser.add_argument("--faults", type=Path, help="TOML schedule of lidar faults")
+    parser.add_argument("--no-lidar", action="store_true", help="lights alone (with --lights)")
+    parser.add_argument("--lights", choices=(WAVEFORM, LINK), help="coded lamps overhead, at this fidelity")
+    parser.add_argument("--spread", type=float, default=0.05, help="of the lamps' powers (default %(default)s)")
+    parser.add_argument("--faults", type=Path, help="TOML schedule of faults of lidar and adc")
     parser.add_argument("--csv", type=Path, help="write every snapshot beside the truth")
     options = parser.parse_args(arguments)
-    scenario = Scenario(options.building, options.lidar, options.seed, people=not options.empty)
+    lights = Lights(options.lights, Effects(gain_spread=options.spread)) if options.lights else None
+    scenario = Scenario(options.building, options.lidar, options.seed, people=not options.empty, lights=lights)
     faults = options.faults.read_text(encoding="utf-8") if options.faults else ""
     begin = time.perf_counter()
-    out = run(options.seconds, scenario, faults=faults, odometry=not options.no_odometry)
+    lidar, odometry = not options.no_lidar, not options.no_odometry
+    out = run(options.seconds, scenario, faults=faults, odometry=odometry, lidar=lidar)
     print(describe(out))
     print(f"{options.seconds / (time.perf_counter() - begin):.1f} times as fast as real time")
     if options.csv:

@@ -1,9 +1,10 @@
-"""The simulated world as a process of its own, in real time: a lidar on a pty or TCP, odometry datagrams, the truth.
+"""The simulated world as a process of its own, in real time: lidar, light, odometry datagrams, the truth.
 
 ::
 
     python -m tools.sim --building paper_room --pty /tmp/lidar --odometry udp://127.0.0.1:5601
     python -m tools.sim --building office_floor --lidar UST-20LX --tcp 127.0.0.1:10940 --truth truth.tum
+    python -m tools.sim --pty /tmp/lidar --odometry udp://127.0.0.1:5601 --light unix:/tmp/i2c --survey lamps.toml
     python -m tools.sim --log intel.clf.gz --pty /tmp/lidar --odometry udp://127.0.0.1:5601
 
 It meets the daemon only there. The robot stands still until the lidar is first read, or until it is told to drive.
@@ -25,17 +26,21 @@ from typing import Any
 
 import numpy as np
 
+from daemon.surveyfile import SurveyError
 from hal.errors import HalError
 from hal.fake.faults import FaultError
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import MODELS, Unit
 from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
+from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.tcp_server import TcpServer
 from tools.sim.buildings import BUILDINGS
+from tools.sim.ceiling import Effects
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
 from tools.sim.hybrid import HybridScene
 from tools.sim.scene import Scenario, Scene, SimulatedScene
+from tools.sim.scene_light import Lights
+from tools.sim.serve_light import serve_light, write_plan
 
 LOG_LEAD_S = 3.0
 """A log starts this long after the simulator, so that its first scans find a reader."""
@@ -57,6 +62,9 @@ class Options:
     tcp: str | None
     odometry: str | None
     truth: str | None
+    light: str | None
+    survey: Path | None
+    spread: float
     faults: Path | None
     clock_ppm: float
     seconds: float
@@ -78,7 +86,14 @@ def parser() -> argparse.ArgumentParser:
     add("--tcp", metavar="HOST:PORT", help="the lidar over TCP; port 0 chooses a free one")
     add("--odometry", metavar="udp://HOST:PORT", help="where wheel odometry datagrams go")
     add("--truth", metavar="udp://HOST:PORT|FILE", help="where the true pose goes: JSON datagrams, or a TUM file")
-    add("--faults", type=Path, metavar="FILE", help="TOML schedule of lidar faults, starts at once")
+    add(
+        "--light",
+        metavar="unix:/PATH|tcp://HOST:PORT",
+        help="coded lamps, seen by a converter on an I2C bus served here",
+    )
+    add("--survey", type=Path, metavar="FILE", help="write the plan of the lamps here, a survey for the daemon")
+    add("--spread", type=float, default=0.05, help="of the lamps' powers about the plan (default %(default)s)")
+    add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults of `lidar` and `adc`, starts at once")
     add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
     return made
@@ -94,10 +109,13 @@ def make_scene(options: Options, t_mono: float) -> Scene:
             people=not options.empty,
             dwell_s=options.dwell,
             laps=options.laps,
+            lights=Lights(effects=Effects(gain_spread=options.spread)) if options.light or options.survey else None,
         )
         scene = SimulatedScene(scenario, held=options.hold)
         asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, scene.release)
         return scene
+    if options.light or options.survey:
+        raise ValueError("--light and --survey need a building; a log has no lamps")
     if options.hold:
         raise ValueError("--hold holds a robot in a building; a log goes on by its own clock")
     from hal.replay.carmen import read_carmen
@@ -114,16 +132,34 @@ async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None
     device = FakeHokuyo(scene.model, scene.scan, unit=unit, rotor=scene.rotor())
     async with AsyncExitStack() as stack:
         stack.callback(device.close)
+        targets: dict[str, Target] = {"lidar": device}
+        there = {"model": scene.model.modl, "start": scene.truth(np.array([loop.time()]))[0].tolist()}
+        there |= await _light_up(options, scene, targets, stack)
         if options.faults is not None:
-            schedule = FaultSchedule({"lidar": device})
+            schedule = FaultSchedule(targets)
             stack.callback(schedule.close)
             schedule.load(options.faults.read_text(encoding="utf-8"))
         lidar = await _connect(options, device, stack)
         feeds = _feeds(options, scene, stack)
-        say({"lidar": lidar, "model": scene.model.modl, "start": scene.truth(np.array([loop.time()]))[0].tolist()})
+        say({"lidar": lidar, **there})
         await _until_told(options.seconds, feeds)
     counts = device.counts
     say({"scans": device.scans_sent, "sent": counts.sent, "unheard": counts.unheard, "lost": counts.lost_in_sensor})
+
+
+async def _light_up(
+    options: Options, scene: Scene, targets: dict[str, Target], stack: AsyncExitStack
+) -> dict[str, Any]:
+    """Offer the light; returns what the daemon's ``photodiode.bus`` has to be."""
+    light = scene.light if isinstance(scene, SimulatedScene) else None
+    if light is None:
+        return {}
+    if options.survey is not None:
+        write_plan(light, options.survey)
+    if options.light is None:
+        return {}
+    targets["adc"], bus = await serve_light(light, options.light, stack)
+    return {"light": bus, "lamps": len(light.ceiling.fixtures)}
 
 
 async def _connect(options: Options, device: FakeHokuyo, stack: AsyncExitStack) -> str:
@@ -188,7 +224,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     try:
         asyncio.run(serve(options, _say))
-    except (HalError, FaultError, OSError, ValueError) as error:
+    except (HalError, FaultError, SurveyError, OSError, ValueError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     return 0

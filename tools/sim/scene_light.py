@@ -98,6 +98,11 @@ class SceneLight:
         self.survey = survey_of(self.ceiling) if lights.survey else Survey()
         self._links, self._frames = Links(self.ceiling, seed=seed), frames(self.ceiling)
 
+    def prepare(self) -> None:
+        """Work out beforehand what else would take seconds when the robot first gets to a room."""
+        drive = self._scene.drive
+        self.ceiling.by_the_walls(drive.pose(np.linspace(0.0, drive.lap_s, 600))[:, :2])
+
     def sample(self, t_mono: Array) -> Array:
         """The converter's input as a fraction of its range at each instant."""
         self._begin(float(t_mono[-1]))
