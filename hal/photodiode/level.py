@@ -1,7 +1,7 @@
 """The optional DC channel: mean light at the amplifier, by which dark and dazzled are told apart.
 
 The photodiode's signal path is AC-coupled, so that both look the same there. An ADS1015 or ADS1115 on the same bus
-measures the amplifier's output before the coupling capacitor, once a second, between two blocks. Whatever happens to
+measures the amplifier's output before the coupling capacitor, twice a second, between two blocks. Whatever happens to
 it, sampling goes on without it.
 """
 
@@ -22,7 +22,8 @@ log = logging.getLogger(__name__)
 
 _NOT_ACKNOWLEDGED: Final = NACKS | {errno.EIO}
 _ASKED: Final = 3
-PERIOD_S: Final = 1.0
+PERIOD_S: Final = 0.5
+"""More often than conditions of the light last until they are told: what is told then is not of before."""
 STALE_S: Final = 3.0
 SETTLE_S: Final = 0.02
 """From a new configuration to a result of it: two conversions at 128 samples/s, whose clock is 10 % slow."""
