@@ -83,7 +83,7 @@ class LampWatch:
         states = [link.state for link in received]
         said = {
             Fault.NO_LAMPS: self._dark.now(t_mono, not received),
-            Fault.TWIN_LAMPS: self._twin.now(t_mono, LinkState.TWIN in states),
+            Fault.TWIN_LAMPS: self._twin.now(t_mono, _twins(received)),
             Fault.SURVEY_CONTRADICTED: self._wrong.now(t_mono, _contradicted(lights, states)),
         }
         self._look_at_each(t_mono, lights.links)
@@ -112,6 +112,12 @@ class LampWatch:
         if self.odd.get(link.lamp_id, (None,))[0] is not fault:
             log.warning("lamp %d (code %d) %s", link.lamp_id, link.code, _SAID[fault])
         self.odd[link.lamp_id] = (fault, t_mono)
+
+
+def _twins(received: list[Link]) -> bool:
+    """Whether two of the lamps received cannot be told apart: neither by their places, nor because one is known."""
+    lamps = [link.lamp_id for link in received if link.lamp_id is not None]
+    return any(link.state is LinkState.TWIN for link in received) or len(set(lamps)) < len(lamps)
 
 
 def _contradicted(lights: LightsResult, states: list[LinkState]) -> bool:

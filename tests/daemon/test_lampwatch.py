@@ -73,6 +73,18 @@ def test_a_place_given_up_again_and_again_speaks_against_the_survey() -> None:
     assert faults == {Fault.SURVEY_CONTRADICTED}
 
 
+def test_one_lamp_received_twice_is_two_lamps() -> None:
+    watch = LampWatch()
+    once = lights((ACCEPTED, ACCEPTED, ACCEPTED))
+    twice = replace(once, links=(*once.links, replace(once.links[0], amplitude=1e-8)))
+    for turn in range(100):
+        watch.on_step(50.0 + turn * EPOCH_S, once, fresh=True)
+    assert watch.faults == frozenset()
+    for turn in range(100, 200):
+        watch.on_step(50.0 + turn * EPOCH_S, twice, fresh=True)
+    assert watch.faults == {Fault.TWIN_LAMPS}
+
+
 def test_one_lamp_too_many_is_no_contradiction() -> None:
     watch = Watch()
     assert watch.see(30.0, ACCEPTED, ACCEPTED, UNSURVEYED, UNSURVEYED, UNSURVEYED) == frozenset()
