@@ -11,7 +11,7 @@ RUN    := $(BIN)/python -W default
 .DEFAULT_GOAL := help
 
 
-.PHONY: help venv demo test test-system test-all check bench lock docs clean
+.PHONY: help venv demo test test-system test-all check bench experiments lock docs clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -54,6 +54,9 @@ $(PEERS): $(STAMP) requirements/bench.lock
 
 bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against peers in the same run
 	$(RUN) -m tools.bench $(ARGS)
+
+experiments: venv  ## what positions from light reach, in simulated rooms and on recordings (LUMILOOP_DATA)
+	$(RUN) -m tools.experiments lights $(ARGS)
 
 docs: venv  ## regenerate the documents that come from code
 	$(RUN) -m daemon.publish.document docs

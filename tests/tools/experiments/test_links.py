@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimator.lamps import Survey
 from estimator.links import Method, Solver
-from tools.experiments import adaptive, fig4
+from tools.experiments import adaptive, fig4, fig4_recorded
 from tools.experiments.places import CENTRED, error, grid, sheet_of, spots
 from tools.experiments.report import Work
 from tools.sim.ceiling import IDEAL, Ceiling
@@ -92,3 +93,12 @@ def test_adaptive_experiment_runs() -> None:
             values = [float(v) for v in line[1 : len(adaptive.FIXED) + 2]]
             assert np.isfinite(values).all()
             assert line[-2] == pytest.approx(values[-1] / min(values[:-1]))
+
+
+def test_recorded_strengths(log_root: Path) -> None:
+    """The weighted solver gains with every link on real light, too; the plain one does not."""
+    for part in fig4_recorded.recorded(True, Work()):
+        rows = {str(row[0]): np.array(row[1:], dtype=float) for row in part.rows}
+        assert rows["ml, median"][2] <= 1.1 * rows["ml, median"][0]
+        assert rows["ml, median"][2] < 10.0
+        assert rows["ml, 90th percentile"][2] < rows["ls, 90th percentile"][2]
