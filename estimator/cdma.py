@@ -32,6 +32,12 @@ CLIP_SHARE: Final = 0.2
 RAIL: Final = 1.0 / 128.0
 """Share of the range beside either rail that counts as the rail: amplifiers stop up to 25 mV short of 3.3 V."""
 
+RATE: Final = 0.05
+"""Largest relative difference between a block's nominal rate and the profile's."""
+
+NEW_CLOCK: Final = 4
+"""Blocks from the past in a row until they are taken for the present."""
+
 STORED_PPM: Final = 200.0
 """A stored sample clock is good to this."""
 
@@ -62,8 +68,13 @@ def new_decoder(profile: Profile, clock_ppm: float | None = None) -> Decoder:
 
 
 def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
-    """Follow all known lamps through one block and report them. Blocks must come in order of time."""
+    """Follow all known lamps through one block and report them. Never raises, whatever is in the block.
+
+    Blocks must come in order of time; one from the past is malformed, several in a row are a new clock.
+    """
     sampled, flags = _prepare(decoder, block)
+    if sampled is not None and not _onward(decoder, block):
+        sampled, flags = None, BlockFlag.MALFORMED
     if sampled is not None:
         t_middle = 0.5 * (block.t_begin + block.t_end)
         decoder.clocks.predict(decoder.tracks.predict(t_middle))
@@ -75,6 +86,19 @@ def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
         if decoder.odd != 1:  # what one block has left over may be a stall; if the next has it too, it is a lamp
             _offer(decoder, residual, t_middle)
     return _epoch(decoder, block, flags)
+
+
+def _onward(decoder: Decoder, block: SampleBlock) -> bool:
+    """Whether time goes on with this block; if it has gone back for good, the phases of all lamps are forgotten."""
+    tracks = decoder.tracks
+    forward = 0.5 * (block.t_begin + block.t_end) > tracks.t
+    decoder.past = 0 if forward else decoder.past + 1
+    if decoder.past < NEW_CLOCK:
+        return forward
+    for slot in tracks.slots:
+        tracks.drop(int(slot))
+    tracks.t, decoder.past, decoder.offered, decoder.found = -np.inf, 0, None, None
+    return True
 
 
 def search(decoder: Decoder, codes: int) -> None:
@@ -147,7 +171,9 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
     profile = decoder.profile
     words = np.asarray(block.words, np.float64)
     n, top = len(words), 2.0**profile.front_end.bits - 1.0
-    if not (np.all(np.isfinite(words)) and block.rate > 0.0 and block.t_end > block.t_begin):
+    if not (np.all(np.isfinite(words)) and -np.inf < block.t_begin < block.t_end < np.inf):
+        return None, BlockFlag.MALFORMED
+    if not abs(block.rate / profile.sample_rate - 1.0) <= RATE:
         return None, BlockFlag.MALFORMED
     if not 1.0 <= n / (block.rate * profile.period_s) <= LONGEST:
         return None, BlockFlag.LENGTH

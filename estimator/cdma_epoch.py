@@ -21,7 +21,7 @@ class BlockFlag(IntFlag):
     CLIPPED = 1  # some samples at the rails; they were left out
     SATURATED = 2  # too many at the rails: no amplitudes
     FLAT = 4  # no variation at all: dark and unlit, or a dead converter
-    MALFORMED = 8  # words that the converter cannot have sent
+    MALFORMED = 8  # words, a rate or times that cannot be
     LENGTH = 16  # shorter than a code period, or longer than can be afforded
     STALLED = 32  # the bus stood still inside; amplitudes are not to be used
     MENDED = 64  # the bus stood still inside, and that was corrected

@@ -58,6 +58,7 @@ class Decoder:
         self.offered: Job | None = None
         self.found: Outcome | None = None
         self.barren = 0
+        self.past = 0
         self.odd = 0
         self.noise = 0.0
         self.usual_noise = 0.0
@@ -155,7 +156,7 @@ def _weigh(decoder: Decoder, fit: Fit) -> None:
     tracks, slots = decoder.tracks, decoder.tracks.slots
     excess = max(fit.noise_var - (QUIET * decoder.usual_noise) ** 2, 0.0) if decoder.usual_noise else 0.0
     crossed = CROSSED**2 * excess / pulse_energy(decoder.profile)
-    tracks.amplitude[slots], tracks.amplitude_var[slots] = fit.amplitude, fit.amplitude_var + crossed
+    tracks.weigh(slots, fit.amplitude, fit.amplitude_var + crossed)
     decoder.noise = float(np.sqrt(fit.noise_var))
 
 

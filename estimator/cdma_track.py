@@ -134,6 +134,7 @@ class Tracks:
         self.phase, self.rate = np.zeros(CAPACITY), np.zeros(CAPACITY)
         self.cov = np.zeros((CAPACITY, 2, 2))
         self.amplitude, self.amplitude_var = np.zeros(CAPACITY), np.zeros(CAPACITY)
+        self._dark = np.zeros(CAPACITY, bool)
         self.hits: Index = np.zeros(CAPACITY, np.int64)
         self.misses: Index = np.zeros(CAPACITY, np.int64)
         self.rings = BitRings(CAPACITY)
@@ -193,12 +194,18 @@ class Tracks:
         var = self._crystal**2
         self.cov[k] = [[NEW_PHASE**2 + var * chips**2, var * chips], [var * chips, var]]
         self.hits[k] = self.misses[k] = 0
+        self._dark[k] = False
         self.rings.forget(k)
 
     def faint(self, slots: Index) -> npt.NDArray[np.bool_]:
         """Which of these lamps were not seen in the last block."""
-        dark: npt.NDArray[np.bool_] = self.amplitude[slots] < FAINT * np.sqrt(self.amplitude_var[slots])
+        dark: npt.NDArray[np.bool_] = self._dark[slots]
         return dark
+
+    def weigh(self, slots: Index, amplitude: Array, variance: Array) -> None:
+        """Amplitudes of a block. A lamp that was dark must be clearly seen: chance reaches 5 sigmas once in a while."""
+        self.amplitude[slots], self.amplitude_var[slots] = amplitude, variance
+        self._dark[slots] = amplitude < np.where(self._dark[slots], CLEAR, FAINT) * np.sqrt(variance)
 
     def drop(self, slot: int) -> None:
         """Forget a lamp."""
