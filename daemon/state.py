@@ -371,8 +371,7 @@ def _agreed(memory: Memory, evidence: Evidence) -> bool:
 
 def _remember(memory: Memory, evidence: Evidence) -> Memory:
     now = evidence.t_mono
-    if evidence.light is not None:
-        memory = _take_light(memory, evidence.light, now)
+    memory = replace(memory, odd_since=None) if evidence.light is None else _take_light(memory, evidence.light, now)
     if not evidence.lidar or (evidence.silence is not None and evidence.silence >= SILENT_PERIODS):
         return _forget_laser(memory, evidence)
     since = memory.disagree_since if memory.disagree_since is not None else now
@@ -403,7 +402,7 @@ def _take_light(memory: Memory, light: Light, now: float) -> Memory:
     odd = light.agrees is False
     memory = replace(memory, odd_since=(now if memory.odd_since is None else memory.odd_since) if odd else None)
     if light.moved or light.lost:
-        memory = replace(memory, doubt=True, lit_since=None)
+        memory = replace(memory, doubt=True, lit_since=None, good=0)
     if light.used and light.placed and not odd:
         begun = memory.lit_since is None or now - (memory.lit_last or now) > DARK_S
         return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now)

@@ -1,8 +1,10 @@
-"""``make demo``: the real daemon and a simulated robot in the paper's room; live pose against truth, a map picture.
+"""``make demo``: the real daemon and a simulated robot under coded lamps; live pose against truth, a map picture.
 
-The simulator is one process (a lidar on a pty, odometry and truth as datagrams), the daemon another (``lumiloop run``).
-This process reads the pose over Modbus, as any PLC would, and compares it with the truth of the same instant. At the
-end the map is taken from the daemon's own recording. Loopback only; nothing is left running.
+The simulator is one process (a lidar on a pty, a photodiode's converter on an I2C bus behind a socket, odometry and
+truth as datagrams), the daemon another (``lumiloop run``). This process reads the pose and the links over Modbus, as
+any PLC would, and compares the pose with the truth of the same instant. On the way the photodiode and then the lidar
+are switched off and on again; keys do the same at any time. At the end the map is taken from the daemon's own
+recording. Loopback only; nothing is left running.
 """
 
 from __future__ import annotations
@@ -21,12 +23,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.publish.client import NoAnswer, Reader
+from daemon.publish.client import NoAnswer, Reader, Reading
 from daemon.publish.snapshot import State
-from tools.demo_score import GOOD, Score, Track, pose_of, summary, verdict
+from tools.demo_acts import NAMES, OrderRefused, Stage, complaint, keyboard, pressed, programme
+from tools.demo_score import READY, Score, Track, pose_of, summary, verdict
 
 ROOT: Final = Path(__file__).parents[1]
 OUT: Final = Path("out/demo")
@@ -39,6 +43,13 @@ STOP_S: Final = 10.0
 INTERRUPTED: Final = 130
 CONFIG: Final = "demo.toml"
 RECORDING: Final = "recording"
+BUS: Final = "i2c"
+SURVEY: Final = "lamps.toml"
+CONTROL: Final = "control"
+OLD_S: Final = 1.0
+"""Links that have not been told anew for so long are not shown."""
+SHOWN: Final = 4
+"""Links in a line, the strongest."""
 LIDAR_X: Final = 0.15
 """Where the simulated robot carries its lidar (:class:`tools.sim.robot.Body`), told to the daemon as `lidar.mount`."""
 
@@ -88,14 +99,17 @@ def free_port() -> int:
     raise DemoError("no port is free on 127.0.0.1 for both TCP and UDP; close some programs")
 
 
-def write_config(folder: Path, modbus: int, odometry: int) -> Path:
+def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) -> Path:
     """The daemon's configuration for this run."""
     path = folder / CONFIG
-    path.write_text(
+    text = (
         f'name = "demo"\nbind = "127.0.0.1"\n\n'
         f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
         f"[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\n"
     )
+    if lights:
+        text += f'\n[photodiode]\nbus = "unix:{folder / BUS}"\n\n[lights]\nsurvey = "{SURVEY}"\n'
+    path.write_text(text)
     return path
 
 
@@ -130,10 +144,10 @@ def wait_for_simulator(simulator: subprocess.Popen[str], patience: Patience) -> 
 
 
 def wait_for_pose(daemon: subprocess.Popen[str], reader: Reader, patience: Patience) -> None:
-    """Until the daemon says that it follows the laser."""
+    """Until the daemon says that it follows a sensor."""
     while True:
         with contextlib.suppress(NoAnswer):
-            if int(reader.read()["state"] or 0) in GOOD:
+            if int(reader.read()["state"] or 0) in READY:
                 return
         patience.wait(daemon, "daemon.log")
 
@@ -141,10 +155,21 @@ def wait_for_pose(daemon: subprocess.Popen[str], reader: Reader, patience: Patie
 # the show
 
 
-def watch(reader: Reader, track: Track, score: Score, seconds: float, children: list[subprocess.Popen[str]]) -> None:
+@dataclass(frozen=True, slots=True)
+class Show:
+    """What the demo watches and moves."""
+
+    reader: Reader
+    track: Track
+    stage: Stage
+    children: list[subprocess.Popen[str]]
+
+
+def watch(show: Show, score: Score, seconds: float) -> None:
     """Read the pose twenty times a second and print a line every second; 0 seconds: for ever."""
-    print("    t |      x       y     yaw |  error          | state     scans  cycle  Modbus reads")
-    print("    s |      m       m     deg |     cm     deg  |              Hz     ms  per s     ms")
+    reader, track, children = show.reader, show.track, show.children
+    print("    t |      x       y     yaw |  error          | state       scans  cycle  reads | lamp:strength, uA")
+    print("    s |      m       m     deg |     cm     deg  |                Hz     ms  per s |")
     begin = time.monotonic()
     line_at, read_at = begin + LINE_PERIOD_S, begin
     reads = 0
@@ -163,6 +188,9 @@ def watch(reader: Reader, track: Track, score: Score, seconds: float, children: 
         score.trip_s.append(now - asked)
         track.collect()
         score.take(reading, None if reading["t_mono"] is None else track.at(float(reading["t_mono"])))
+        show.stage.press(pressed(), now - begin)
+        for told in [*show.stage.play(now - begin, int(reading["state"] or 0)), *score.news()]:
+            print(f"----- {told}", flush=True)
         if now >= line_at:
             print(line(now - begin, score, (score.reads - reads) / (now - line_at + LINE_PERIOD_S)), flush=True)
             line_at, reads = now + LINE_PERIOD_S, score.reads
@@ -180,8 +208,21 @@ def line(t: float, score: Score, rate: float) -> str:
         off = f"{100 * score.error_m[-1]:6.1f}  {math.degrees(score.error_rad[-1]):+7.2f}"
     state = State(int(reading["state"] or 0)).name
     scans, cycle = reading["scan_rate"] or 0.0, 1e3 * float(reading["cycle"] or 0.0)
-    trip = 1e3 * score.trip_s[-1]
-    return f"{t:5.1f} |{where} |{off}  | {state:<9}{scans:6.1f} {cycle:6.2f} {rate:6.1f} {trip:6.2f}"
+    return f"{t:5.1f} |{where} |{off}  | {state:<11}{scans:6.1f} {cycle:6.2f} {rate:6.1f} | {links(reading)}"
+
+
+def links(reading: Reading) -> str:
+    """How many lamps the position rests on, and the strongest with their IDs and strengths in microamperes."""
+    if reading.get("light_fix") is None:
+        return "no photodiode" if reading.get("links") is None else f"{reading['links']} links"
+    if not reading["links"] or float(reading["light_age"] or 0.0) > OLD_S:
+        return "no light"
+    shown = []
+    for row in range(1, SHOWN + 1):
+        lamp, strength = reading[f"link_{row}_lamp"], reading[f"link_{row}_strength"]
+        if lamp is not None and strength is not None:
+            shown.append(f"{int(lamp)}:{1e6 * float(strength):.3f}")
+    return f"{int(reading['light_used'] or 0):2d} of {int(reading['links']):2d} used  {'  '.join(shown)}"
 
 
 def export_map(folder: Path, out: Path) -> str:
@@ -196,27 +237,28 @@ def export_map(folder: Path, out: Path) -> str:
     return ""
 
 
+def simulator_words(options: argparse.Namespace, folder: Path, odometry: int, truth: int) -> list[str]:
+    """The simulator's command line."""
+    words = [sys.executable, "-m", "tools.sim", "--building", options.building, "--seed", str(options.seed), "--hold"]
+    words += ["--pty", str(folder / "lidar"), "--odometry", f"udp://127.0.0.1:{odometry}"]
+    words += ["--truth", f"udp://127.0.0.1:{truth}", "--control", str(folder / CONTROL)]
+    if not options.dark:
+        words += ["--light", f"unix:{folder / BUS}", "--survey", str(folder / SURVEY)]
+    return words
+
+
 def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> None:
     """Run simulator and daemon, and watch; everything is stopped when this returns or raises."""
     modbus, odometry = free_port(), free_port()
-    config = write_config(folder, modbus, odometry)
+    config = write_config(folder, modbus, odometry, lights=not options.dark)
     daemon_words = [sys.executable, "-m", "daemon", "run", "--config", str(config), "--record", str(folder / RECORDING)]
+    stage = Stage(folder / CONTROL, [] if options.dark else programme(options.seconds))
+    score.acts, score.surveyed = stage.acts, not options.dark
     with contextlib.ExitStack() as stack:
         truth = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         truth.bind(("127.0.0.1", 0))
         truth.setblocking(False)
-        words = [
-            sys.executable,
-            "-m",
-            "tools.sim",
-            "--building",
-            options.building,
-            "--seed",
-            str(options.seed),
-            "--hold",
-        ]
-        words += ["--pty", str(folder / "lidar"), "--odometry", f"udp://127.0.0.1:{odometry}"]
-        words += ["--truth", f"udp://127.0.0.1:{truth.getsockname()[1]}"]
+        words = simulator_words(options, folder, odometry, truth.getsockname()[1])
         patience = Patience(out)
         simulator = stack.enter_context(running(words, out / "simulator.log", stdout=subprocess.PIPE))
         wait_for_simulator(simulator, patience)
@@ -224,8 +266,11 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
         reader = stack.enter_context(Reader("127.0.0.1", modbus))
         wait_for_pose(daemon, reader, patience)
         print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
+        if sys.stdin.isatty() and not options.dark:
+            print("keys: p switches the photodiode off or on, l the lidar")
         simulator.send_signal(signal.SIGUSR1)
-        watch(reader, Track(truth), score, options.seconds, [daemon, simulator])
+        stack.enter_context(keyboard())
+        watch(Show(reader, Track(truth), stage, [daemon, simulator]), score, options.seconds)
 
 
 def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
@@ -236,10 +281,10 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
     except KeyboardInterrupt:
         if not score.reads:
             return INTERRUPTED
-    except DemoError as error:
+    except (DemoError, OrderRefused) as error:
         wrong = str(error)
     figures = summary(score)
-    wrong = wrong or verdict(figures)
+    wrong = wrong or verdict(figures) or complaint(score.acts)
     if score.error_m:
         wrong = export_map(folder, out) or wrong
         off, turned = figures["error_m"], figures["error_deg"]
@@ -247,6 +292,9 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
             f"{figures['driven_m']:.1f} m driven; error median {100 * off['median']:.1f} cm, "
             f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg"
         )
+    for act in score.acts:
+        seen, back = (("never" if t is None else f"after {t:.1f} s") for t in (act.seen, act.back))
+        print(f"{NAMES[act.device]} off: not TRACKING {seen}; on again: TRACKING {back}")
     (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
     print(f"figures: {out / 'summary.json'}")
     if wrong:
@@ -258,10 +306,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the demo; 0 if the pose was good, 1 if not, 130 if interrupted before there was anything to show."""
     parser = argparse.ArgumentParser(prog="python -m tools.demo", description=__doc__.splitlines()[0])
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--seconds", type=float, default=60.0, help="how long to watch (default %(default)s)")
+    length.add_argument("--seconds", type=float, default=75.0, help="how long to watch (default %(default)s)")
     length.add_argument(
         "--forever", action="store_const", const=0.0, dest="seconds", help="until Ctrl-C; records 0.3 GB an hour"
     )
+    parser.add_argument("--dark", action="store_true", help="without lamps: lidar and odometry alone")
     parser.add_argument("--building", default="paper_room", help="see `python -m tools.sim --help`")
     parser.add_argument("--seed", type=int, default=0, help="of noise, slip and people")
     parser.add_argument("--out", type=Path, default=OUT, help="where results go (default %(default)s)")

@@ -13,10 +13,14 @@ from typing import Any, Final
 
 from daemon.publish.client import Reading
 from daemon.publish.snapshot import State
+from daemon.state import REASONS, Reason
+from tools.demo_acts import Act
 
 ABSURD_M: Final = 0.5
 """Median position error beyond which the demo has failed."""
 GOOD: Final = (State.MAPPING, State.TRACKING)
+READY: Final = (*GOOD, State.DEGRADED, State.RELOCATING)
+"""States in which the daemon follows a sensor."""
 
 Pose = tuple[float, float, float]
 
@@ -51,6 +55,8 @@ class Score:
     """What has been read and how good it was; errors in m and rad."""
 
     origin: tuple[Pose, Pose] | None = None  # the first pose and the truth of its instant
+    surveyed: bool = False  # the map frame is the survey's, hence the truth's, from the first TRACKING on
+    acts: list[Act] = field(default_factory=list)
     error_m: list[float] = field(default_factory=list)
     error_rad: list[float] = field(default_factory=list)
     states: dict[str, int] = field(default_factory=dict)
@@ -62,6 +68,7 @@ class Score:
     driven_m: float = 0.0
     watched_s: float = 0.0
     _was: Pose | None = None
+    _told: tuple[int, int] | None = None
 
     def take(self, reading: Reading, truth: Pose | None) -> None:
         """One reading of the published block, and where the robot truly was then."""
@@ -74,6 +81,10 @@ class Score:
         pose = pose_of(reading)
         if pose is None or truth is None:
             return
+        if self.origin is None and self.surveyed:
+            if state != State.TRACKING.name:
+                return
+            self.origin = truth, truth
         if self.origin is None:
             self.origin = pose, truth
         want = in_map(truth, self.origin)
@@ -82,6 +93,14 @@ class Score:
         if self._was is not None:
             self.driven_m += math.hypot(truth[0] - self._was[0], truth[1] - self._was[1])
         self._was = truth
+
+    def news(self) -> list[str]:
+        """State and reason in words, once for each change."""
+        said = int(self.last["state"] or 0), int(self.last["reason"] or 0)
+        if said == self._told:
+            return []
+        self._told = said
+        return [f"{State(said[0]).name}: {REASONS[Reason(said[1])][0]}"]
 
 
 def pose_of(reading: Reading) -> Pose | None:
@@ -110,6 +129,7 @@ def summary(score: Score) -> dict[str, Any]:
         "error_m": {"median": statistics.median(errors), "max": max(errors), "last": errors[-1]} if known else None,
         "error_deg": {"median": statistics.median(angles), "max": max(angles), "last": angles[-1]} if known else None,
         "states": score.states,
+        "acts": [act.figures for act in score.acts],
         "scan_rate_hz": score.last.get("scan_rate"),
         "scans_missed": score.last.get("missed"),
         "cycle_ms": 1e3 * statistics.median(score.cycle_s) if score.cycle_s else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -9,14 +10,17 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from daemon.publish.snapshot import State
-from tools.demo import free_port, line, write_config
+from tools.demo import free_port, line, links, write_config
+from tools.demo_acts import OrderRefused, Stage, complaint, programme
 from tools.demo_score import Score, Track, in_map, summary, verdict
 from tools.sim.robot import Body
 
@@ -95,6 +99,85 @@ def test_configuration_is_good_and_mounts_the_lidar_where_the_robot_has_it(tmp_p
     assert settings.bind == "127.0.0.1"
     assert (settings.lidar.mount.x, settings.lidar.mount.y, settings.lidar.mount.yaw) == Body().lidar
     assert settings.modbus.port != settings.odometry.port
+    assert settings.photodiode.bus == f"unix:{tmp_path / 'i2c'}"
+    dark = load(write_config(tmp_path, free_port(), free_port(), lights=False))
+    assert not dark.photodiode.fitted
+
+
+@contextlib.contextmanager
+def simulator(path: Path, answer: str) -> Iterator[list[str]]:
+    """Something that takes orders as the simulator does; yields the orders as they come."""
+    orders: list[str] = []
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+        server.listen()
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    with connection, connection.makefile("rw") as lines:
+                        orders.append(lines.readline().strip())
+                        lines.write(f"ordered\n{answer}\n")
+                        lines.flush()
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield orders
+        server.shutdown(socket.SHUT_RDWR)
+
+
+def test_the_programme_switches_each_sensor_off_and_on_and_notes_what_became_of_the_state(tmp_path: Path) -> None:
+    acts = programme(60.0)
+    assert programme(20.0) == programme(0.0) == []
+    tracking, degraded = int(State.TRACKING), int(State.DEGRADED)
+    with simulator(tmp_path / "control", "ok") as orders:
+        stage = Stage(tmp_path / "control", acts)
+        for tenth in range(600):
+            t = 0.1 * tenth
+            off = any(act.begin + 0.5 <= t < act.end + 2.0 for act in acts)
+            stage.play(t, degraded if off else tracking)
+    assert orders == ["order off where=adc", "clear off adc", "order off where=lidar", "clear off lidar"]
+    assert [act.seen for act in acts] == pytest.approx([0.5, 0.5], abs=0.11)
+    assert [act.back for act in acts] == pytest.approx([2.0, 2.0], abs=0.11)
+    assert complaint(acts) == ""
+    acts[0].seen = None
+    assert "stayed TRACKING" in complaint(acts)
+    acts[0].seen, acts[1].back = 0.5, None
+    assert "has not become TRACKING" in complaint(acts)
+
+
+def test_a_key_switches_a_sensor_off_and_the_same_key_on_again(tmp_path: Path) -> None:
+    with simulator(tmp_path / "control", "ok") as orders:
+        stage = Stage(tmp_path / "control")
+        for t, key in ((1.0, "x"), (2.0, "l"), (3.0, ""), (4.0, "l")):
+            stage.press(key, t)
+            stage.play(t, int(State.TRACKING))
+    assert orders == ["order off where=lidar", "clear off lidar"]
+
+
+def test_a_simulator_that_refuses_or_is_gone_is_told_plainly(tmp_path: Path) -> None:
+    stage = Stage(tmp_path / "control", programme(60.0))
+    with pytest.raises(OrderRefused, match="does not take orders"):
+        stage.play(59.0, int(State.TRACKING))
+    with simulator(tmp_path / "control", "refused: no such word"), pytest.raises(OrderRefused, match="no such word"):
+        stage.play(59.0, int(State.TRACKING))
+
+
+def test_links_are_shown_with_lamp_and_strength() -> None:
+    lit = {"light_fix": 2, "light_used": 2, "links": 3, "light_age": 0.1}
+    lit |= {"link_1_lamp": 7, "link_1_strength": 1.25e-6, "link_2_lamp": None, "link_2_strength": 1e-6}
+    lit |= {"link_3_lamp": 9, "link_3_strength": 2e-7, "link_4_lamp": None, "link_4_strength": None}
+    assert links(lit) == " 2 of  3 used  7:1.250  9:0.200"
+    assert links({**lit, "light_age": 3.0}) == links({**lit, "links": 0}) == "no light"
+    assert links({"links": None}) == "no photodiode"
+
+
+def test_in_a_survey_errors_are_absolute_and_count_from_the_first_tracking() -> None:
+    score = Score(surveyed=True)
+    score.take(reading(State.RELOCATING, (9.0, 0.0, 0.0)), (5.0, 5.0, 0.0))
+    assert score.error_m == []
+    score.take(reading(pose=(5.0, 5.3, 0.0)), (5.0, 5.0, 0.0))
+    assert score.error_m == pytest.approx([0.3])
 
 
 def left_behind(mark: str) -> list[str]:
@@ -120,8 +203,8 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 
 @pytest.mark.system
 @pytest.mark.realtime
-def test_fifteen_seconds(tmp_path: Path) -> None:
-    demo = start(tmp_path, "--seconds", "15")
+def test_half_a_minute(tmp_path: Path) -> None:
+    demo = start(tmp_path, "--seconds", "22")
     text, _ = demo.communicate(timeout=240)
     assert demo.returncode == 0, text
     assert "TRACKING" in text

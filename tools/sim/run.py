@@ -28,6 +28,7 @@ import numpy as np
 
 from daemon.surveyfile import SurveyError
 from hal.errors import HalError
+from hal.fake.control import Control, serve_control
 from hal.fake.faults import FaultError
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import MODELS, Unit
@@ -66,6 +67,7 @@ class Options:
     survey: Path | None
     spread: float
     faults: Path | None
+    control: Path | None
     clock_ppm: float
     seconds: float
 
@@ -94,6 +96,7 @@ def parser() -> argparse.ArgumentParser:
     add("--survey", type=Path, metavar="FILE", help="write the plan of the lamps here, a survey for the daemon")
     add("--spread", type=float, default=0.05, help="of the lamps' powers about the plan (default %(default)s)")
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults of `lidar` and `adc`, starts at once")
+    add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
     add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
     return made
@@ -135,10 +138,12 @@ async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None
         targets: dict[str, Target] = {"lidar": device}
         there = {"model": scene.model.modl, "start": scene.truth(np.array([loop.time()]))[0].tolist()}
         there |= await _light_up(options, scene, targets, stack)
+        schedule = FaultSchedule(targets)
+        stack.callback(schedule.close)
         if options.faults is not None:
-            schedule = FaultSchedule(targets)
-            stack.callback(schedule.close)
             schedule.load(options.faults.read_text(encoding="utf-8"))
+        if options.control is not None:
+            stack.callback((await serve_control(Control(schedule), options.control)).close)
         lidar = await _connect(options, device, stack)
         feeds = _feeds(options, scene, stack)
         say({"lidar": lidar, **there})
