@@ -76,8 +76,8 @@ class Painter:
             loop_counter=self._loop[0],
             loop_new=self._loop[1],
             loop_old=self._loop[2],
-            links=None if facts.adc_ok is None else len(_received(result)),
-            light_id=next((link.lamp_id for link in _received(result)), None),
+            links=None if facts.adc_ok is None else len(_received(result, facts)),
+            light_id=next((link.lamp_id for link in _received(result, facts)), None),
             light=None if facts.adc_ok is None else _light(result, facts),
             scan_rate=facts.scan_rate,
             missed=facts.missed,
@@ -90,16 +90,16 @@ class Painter:
         )
 
 
-def _received(result: StepResult | None) -> tuple[Link, ...]:
-    """Links that are above the noise, strongest first."""
-    if result is None or result.lights is None:
+def _received(result: StepResult | None, facts: Facts) -> tuple[Link, ...]:
+    """Links that are above the noise, strongest first; none while no samples come."""
+    if result is None or result.lights is None or not facts.adc_ok:
         return ()
     return tuple(link for link in result.lights.links if link.state not in UNHEARD)
 
 
 def _light(result: StepResult | None, facts: Facts) -> LightPicture:
-    """What lights alone say."""
-    if result is None or result.lights is None:
+    """What lights alone say; nothing while no samples come, however well the place was known before."""
+    if result is None or result.lights is None or not facts.adc_ok:
         return LightPicture(blocks=facts.blocks, blocks_lost=facts.blocks_lost)
     lights = result.lights
     placed = lights.fix not in (Fix.NONE, Fix.LOST)

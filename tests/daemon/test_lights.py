@@ -15,7 +15,7 @@ from daemon.budget import FixedBudget
 from daemon.config import NO_DEVICE, Config, LidarConfig, ModbusConfig, PhotodiodeConfig
 from daemon.lights import Lights
 from daemon.main import Daemon, World
-from daemon.publish.snapshot import Snapshot
+from daemon.publish.snapshot import LightPicture, Snapshot
 from daemon.worker import CycleWorker
 from estimator.cdma_profile import PROFILE_A
 from hal.clock import LoopClock, run_virtual
@@ -171,6 +171,8 @@ def test_a_converter_that_falls_silent_is_shown_within_five_blocks(lidar: bool) 
         t_last = bench.loop.time()
         bench.order("what = 'gone'")
         gone = await bench.until(lambda snapshot: snapshot.adc_ok is False, 2.0)
+        assert gone.light == LightPicture(blocks=gone.light.blocks, blocks_lost=gone.light.blocks_lost)
+        assert (gone.links, gone.light_id) == (0, None), "what was seen before is not seen now"
         assert gone.t_sent - t_last <= (5.0 if not lidar else 7.0) * BLOCK_S  # a URG's scans are two blocks apart
         bench.faults.clear()
         await bench.until(lambda snapshot: bool(snapshot.adc_ok) and decoded(snapshot), 10.0)
