@@ -14,8 +14,11 @@ from pathlib import Path
 import pytest
 
 from daemon import warmup
+from daemon.lights import Lights
 from daemon.warmup import Warmth, kernel_count, warm_up
+from estimator.cdma_profile import PROFILE_A
 from estimator.kernel import CACHE_DIR
+from estimator.lamps import Survey
 
 ROOT = Path(__file__).parents[2]
 
@@ -158,3 +161,25 @@ def test_the_first_start_ever_says_that_it_compiles_and_how_long(tmp_path: Path)
     assert "kernels compiled in" in texts[0]
     assert "compiled=False" in texts[1]
     assert "compil" not in texts[1].replace("compiled=False", "")
+
+
+def test_with_a_photodiode_the_cost_of_the_search_is_measured() -> None:
+    warmth = warmup.load(Lights(Survey(), PROFILE_A))
+    assert 0.5 < warmth.code_us < 2000.0
+    assert warmup.load().code_us == 0.0
+
+
+def test_a_start_without_a_photodiode_loads_nothing_of_light() -> None:
+    code = (
+        "import sys; import daemon.main\n"
+        "assert 'numba' not in sys.modules, 'kernels are loaded beside the loop'\n"
+        "from daemon import warmup; warmup.load()\n"
+        "light = {'estimator.cdma', 'estimator.light', 'estimator.lights', 'hal.photodiode.driver', 'hal.i2c_thread'}\n"
+        "print(sorted(light & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_kernels_of_light_are_counted_only_where_there_is_a_photodiode() -> None:
+    assert kernel_count() < kernel_count(lights=True)
