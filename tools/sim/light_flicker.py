@@ -42,3 +42,39 @@ def worst(lamp: Lamp, chip_rate: float, degree: int, manchester: bool = True) ->
     """Largest modulation of any line over its no-effect limit; below 1 nobody sees or suffers anything."""
     frequency, modulation = lines(lamp, chip_rate, degree, manchester)
     return float(np.max(modulation / no_effect(frequency)))
+
+
+BANDS = ((0.0, 90.0), (90.0, 1250.0), (1250.0, 3000.0))
+"""Hz; above, the standard sets no limit."""
+
+PROFILES = {"A": (5000.0, 7, 0.30), "B": (825.0, 6, 0.10), "D": (20_000.0, 9, 0.30)}
+"""Chips per second, degree, depth; as in docs/air-interface.md."""
+
+
+def table(name: str, data: bool) -> list[str]:
+    """Markdown rows: of each band, the line that comes nearest to its limit, over a sample of the profile's codes."""
+    chip_rate, degree, depth = PROFILES[name]
+    every = 1 if degree < 9 and not data else 16
+    lamps = [Lamp(code, 1.0, depth=depth, data=data) for code in range(0, 2**degree + 1, every)]
+    spectra = [lines(lamp, chip_rate, degree) for lamp in lamps]
+    frequency, modulation = spectra[0][0], np.max([spectrum[1] for spectrum in spectra], axis=0)
+    rows = []
+    for low, high in BANDS:
+        inside = (frequency >= low) & (frequency < high)
+        if inside.any():
+            f, m = frequency[inside], modulation[inside]
+            k = int(np.argmax(m / no_effect(f)))
+            limits = f"{no_effect(f)[k]:.2f} | {low_risk(f)[k]:.2f}"
+            what = f"{name}{', with frames' if data else ''}"
+            rows.append(
+                f"| {what} | {low:g} to {high:g} | {f[k]:.1f} | {m[k]:.3f} | {limits} | {m[k] / no_effect(f)[k]:.2f} |"
+            )
+    return rows
+
+
+if __name__ == "__main__":
+    print("| profile | band, Hz | worst line, Hz | modulation, % | no effect, % | low risk, % | of no effect |")
+    print("|---|---|---|---|---|---|---|")
+    for profile in PROFILES:
+        for framed in (False, True):
+            print("\n".join(table(profile, framed)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tools.sim.light_flicker import lines, low_risk, no_effect, worst
+from tools.sim.light_flicker import lines, low_risk, no_effect, table, worst
 from tools.sim.light_transmitter import Lamp
 
 LAMP = Lamp(code=0, current_a=1.0, lamp_id=1234, position_m=(12.5, -3.25, 2.8))
@@ -43,3 +45,10 @@ def test_limits_are_the_standards() -> None:
     np.testing.assert_allclose(low_risk(f)[:2], [1.25, 8.0])
     assert np.isinf(no_effect(f)[3])
     assert np.isinf(low_risk(f)[2])
+
+
+def test_the_table_of_the_page_on_the_air_interface() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "air-interface.md").read_text()
+    for name in ("A", "B", "D"):
+        for row in table(name, data=False):
+            assert row in page
