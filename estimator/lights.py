@@ -18,9 +18,9 @@ from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
-from estimator.lights_links import Sight, judge, relearn, settled, sights, table, view_of
-from estimator.lights_start import begin, decide, headings, mixture, new_track, places
-from estimator.lights_state import Corrections, Lights, LightsSettings, Track
+from estimator.lights_links import Sight, distrust, judge, relearn, settled, sights, table, view_of
+from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places
+from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3
 from estimator.records import Array, Imu, Odometry
 from estimator.result import Fix, LightsResult, Link, LinkState
@@ -28,6 +28,7 @@ from estimator.result import Fix, LightsResult, Link, LinkState
 __all__ = [
     "Lights",
     "LightsSettings",
+    "Pause",
     "carry_to",
     "lean",
     "new_lights",
@@ -43,6 +44,10 @@ HELD_S = 1.0
 LOST_S = 2.0
 LOST_SHARE = 0.5
 """When more than this share of the links contradicts for so long, another place is looked for."""
+ODD_S, ODD_SHARE = 0.15, 0.4
+"""When two links, and more than this share, are stronger than they can be for so long, the place is not believed."""
+PROOF_M = 3.0
+"""Way without contradiction after which a place found anew is believed."""
 DRIFTED_M = 0.7
 """A place less certain than that is not corrected but looked for anew: the equations are too bent there."""
 ITERATE_M, ITERATE_RAD = 0.03, 0.03
@@ -108,13 +113,13 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
     old = lights.tracks[0] if lights.tracks else None
     keep_gains(lights)
     lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old)]
-    lights.t_lost, lights.lost = math.inf, False
+    lights.t_lost, lights.t_odd, lights.lost = math.inf, math.inf, False
 
 
 def reset(lights: Lights) -> None:
     """Forget the place and everything learned about lamps; those that described themselves stay known."""
     lights.tracks, lights.gains, lights.absent = [], {}, {}
-    lights.t_lost, lights.lost, lights.level, lights.result = math.inf, False, None, None
+    lights.t_lost, lights.t_odd, lights.lost, lights.level, lights.result = math.inf, math.inf, False, None, None
 
 
 def update(lights: Lights, epoch: LightEpoch, level: float | None = None) -> LightsResult:
@@ -146,7 +151,8 @@ def update(lights: Lights, epoch: LightEpoch, level: float | None = None) -> Lig
     lights.t_epoch = max(lights.t_epoch, epoch.t_end)
     best = lights.tracks[0] if lights.tracks else None
     lights.result = describe(lights, [sight.link(best) for sight in seen], epoch)
-    lights.result = replace(lights.result, gained=gained, gained_by=gained_by)
+    if lights.result.fix is not Fix.LOST:
+        lights.result = replace(lights.result, gained=gained, gained_by=gained_by)
     return lights.result
 
 
@@ -180,10 +186,18 @@ def look_around(lights: Lights, epoch: LightEpoch) -> None:
     elif lights.tracks:
         return
     found = places(lights, epoch)
+    if lights.tracks:
+        found = [place for place in found if fits_prior(lights.tracks[0], place)] or found
     if found:
         keep_gains(lights)
         begin(lights, found, yaws, sigma)
         lights.way_epoch = lights.course.way
+
+
+def fits_prior(track: Track, place: Place) -> bool:
+    """Whether a place lies within four sigmas of where a hypothesis takes the robot to be."""
+    spread = math.sqrt(float(track.P[0, 0] + track.P[1, 1])) + 0.5
+    return math.hypot(place.x - float(track.x[0]), place.y - float(track.x[1])) < 4.0 * spread
 
 
 def keep_gains(lights: Lights) -> None:
@@ -273,6 +287,10 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
     if used:
         lights.t_used = now
     relearn(lights, lights.tracks[0])
+    distrust(lights, lights.tracks[0])
+    rejected = states.count(LinkState.REJECTED)
+    odd = rejected >= 2 and rejected > ODD_SHARE * (used + against)
+    lights.t_odd = min(lights.t_odd, now) if odd else math.inf
     if against <= LOST_SHARE * (used + against):
         lights.t_lost = math.inf
         return
@@ -323,6 +341,11 @@ def fix_of(lights: Lights, P: Array) -> Fix:
         if lights.lost and lights.course.way == lights.way_start:
             return Fix.LOST
         return Fix.AMBIGUOUS if spread > 0.8 else Fix.STARTING
+    if lights.course.t_mono - lights.t_odd > ODD_S:
+        lights.lost, lights.way_odd = True, lights.course.way
+        return Fix.LOST
+    if lights.lost and lights.course.way - max(lights.way_start, lights.way_odd) < PROOF_M:
+        return Fix.STARTING
     if lights.course.t_mono - lights.t_used > HELD_S:
         return Fix.HELD
     return Fix.GOOD if spread < 0.5 and P[2, 2] < 0.25**2 else Fix.STARTING

@@ -34,6 +34,12 @@ RELEARN_S, RELEARN_M = 15.0, 3.0
 """A link that contradicts so long and far, and always by the same factor, is a lamp of another power: learn it anew."""
 STEADY = 0.12
 """Spread of its ln residual up to which a contradiction is called steady."""
+TOO_STRONG = 3.0
+"""Times what a lamp gives at the edge of view, which none near that edge can give."""
+MOVED_LEANS = 3.0
+"""So many sigmas of lean are what a lamp may have; more is a lamp in another place."""
+FIRST_ERROR = 5.0
+"""Variance of a model error at first sight: later, gain and lean have taken up what always is the same in it."""
 STRIKES = 2
 """So often a lamp is learned anew; one that contradicts again stands somewhere else."""
 
@@ -159,7 +165,7 @@ def occupy(lights: Lights, track: Track, lamp: Lamp, slot: int) -> None:
     for j in range(ekf.OWN):
         ekf.cut(track.P, track.n, at + j)
         track.x[at + j] = 0.0 if j == ekf.ERROR else mean[j]
-        track.P[at + j, at + j] = 1.0 if j == ekf.ERROR else variance[j]
+        track.P[at + j, at + j] = FIRST_ERROR if j == ekf.ERROR else variance[j]
     track.slots[lamp.lamp_id] = slot
 
 
@@ -203,8 +209,8 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, level_dro
         r, S = row[ekf_links.RESIDUAL], row[ekf_links.SPREAD] + row[ekf_links.WHITE]
         sight.residual, sight.sigma = r, math.sqrt(max(S, 0.0))
         if row[ekf_links.COS_BETA] < cos_rim or row[ekf_links.DIRECT] < 0.5:
-            outside = gating and row[ekf_links.COS_BETA] < cos_out
-            sight.state = REJECTED if outside and sight.amplitude > rim_of(lights, track, sight) else RIM
+            most = (1.0 if row[ekf_links.COS_BETA] < cos_out else TOO_STRONG) * rim_of(lights, track, sight)
+            sight.state = REJECTED if gating and sight.amplitude > most else RIM
         elif gating:
             sight.state = gate(lights, track, sight, level_drop)
         elif r * r > 4.0 * S:
@@ -235,6 +241,8 @@ def gate(lights: Lights, track: Track, sight: Sight, level_drop: bool) -> LinkSt
         return RIM
     r, sigma = sight.residual, sight.sigma
     watch = track.watches.setdefault(sight.lamp.lamp_id, Watch())
+    if watch.moved:
+        return REJECTED
     low = r < -settings.weak * (0.67 if level_drop else 1.0) * sigma
     high = r > settings.strong * sigma
     if low or high:
@@ -258,7 +266,23 @@ def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
         return
     clear = [i for i, sight in enumerate(kept) if sight.state is ACCEPTED]
     drop = clear if lights.settings.pause is Pause.PAPER and len(clear) < n else clear[n:]
-    out[drop, ekf_links.WHITE] = math.inf
+    for i in drop:
+        kept[i].state = LinkState.PAUSED
+        out[i, ekf_links.WHITE] = math.inf
+
+
+def distrust(lights: Lights, track: Track) -> None:
+    """A lamp whose strengths can only be explained by a lean that no lamp has hangs elsewhere: it is not used again."""
+    limit = MOVED_LEANS * lights.settings.model.lean
+    for lamp_id, slot in track.slots.items():
+        at = ekf.FIRST + ekf.OWN * slot + ekf.TILT_X
+        spread = float(track.P[at, at] + track.P[at + 1, at + 1])
+        if math.hypot(track.x[at], track.x[at + 1]) < limit + 2.0 * math.sqrt(max(spread, 0.0)):
+            continue
+        track.watches.setdefault(lamp_id, Watch()).moved = True
+        for j in (at, at + 1):
+            ekf.cut(track.P, track.n, j)
+            track.x[j], track.P[j, j] = 0.0, lights.settings.model.lean**2
 
 
 def relearn(lights: Lights, track: Track) -> None:

