@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from daemon.health import Fault
-from estimator.cdma_epoch import UNUSABLE
+from estimator.cdma_epoch import UNUSABLE, BlockFlag
 from estimator.result import Fix, LightsResult, Link, LinkState
 
 log = logging.getLogger(__name__)
@@ -59,12 +59,12 @@ class LampWatch:
     """Watches the epochs go by.
 
     Attributes:
-        faults: of lamps and survey, as of the latest epoch. spoiled: blocks from which no strength could be taken.
+        faults: of lamps and survey, as of the latest epoch. stalled: blocks in which the bus stood still.
         odd: lamps with what is wrong with them, and when that was last so.
     """
 
     faults: frozenset[Fault] = frozenset()
-    spoiled: int = 0
+    stalled: int = 0
     odd: dict[int, tuple[Fault, float]] = field(default_factory=dict)
     _t_epoch: float = float("-inf")
     _lamps: dict[tuple[int, LinkState], _Lasting] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class LampWatch:
         if lights is None or not fresh:
             return
         if lights.block & UNUSABLE:
-            self.spoiled += 1
+            self.stalled += BlockFlag.STALLED in lights.block
             return
         received = [link for link in lights.links if link.state not in _UNHEARD]
         states = [link.state for link in received]

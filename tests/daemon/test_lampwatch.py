@@ -119,8 +119,10 @@ def test_blocks_without_strengths_are_counted_and_say_nothing_of_lamps() -> None
     for _ in range(400):
         watch.t += EPOCH_S
         watch.watch.on_step(watch.t, spoiled, fresh=True)
-    assert watch.watch.spoiled == 400
+    assert watch.watch.stalled == 400
     assert watch.watch.faults == {Fault.LAMP_DEAD}
+    watch.watch.on_step(watch.t, lights((), block=BlockFlag.FLAT), fresh=True)
+    assert watch.watch.stalled == 400, "darkness is no stall"
 
 
 def test_a_step_without_a_block_is_no_epoch() -> None:
