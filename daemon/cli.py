@@ -60,6 +60,8 @@ def _parser() -> argparse.ArgumentParser:
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
     _status(commands.add_parser("status", help="show what a running daemon publishes"))
     _map(commands.add_parser("map", help="work with maps"))
+    _calibrate(commands.add_parser("calibrate", help="lamps, receiver, wheels and mount, from a recorded drive"))
+    _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
     _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
     return parser
 
@@ -121,6 +123,31 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the files")
     _config_arguments(export)
     export.set_defaults(body=_later("daemon.export", "main"))
+
+
+def _calibrate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="REC", help="recording of a teach drive (lumiloop run --record)")
+    parser.add_argument("--survey", type=Path, metavar="FILE", help="survey to start from; default: the recording's")
+    parser.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "DEG"), help="where the drive began in it")
+    parser.add_argument("--odometry", action="store_true", help="wheel scale and track instead of lights")
+    parser.add_argument("--lidar-mount", action="store_true", help="where the lidar sits, instead of lights")
+    _written(parser, "lights-calibrated.toml")
+    parser.set_defaults(body=_later("daemon.calibrate", "main"))
+
+
+def _survey(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="REC", help="recording of a drive under the lamps")
+    parser.add_argument("--height", type=float, metavar="M", help="of the lamps above the floor; default: estimated")
+    _written(parser, "lights.toml")
+    parser.set_defaults(body=_later("daemon.survey", "main"))
+
+
+def _written(parser: argparse.ArgumentParser, name: str) -> None:
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", default=Path(name), help=f"survey to write; default: {name}"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    _config_arguments(parser)
 
 
 def _codes(parser: argparse.ArgumentParser) -> None:

@@ -62,6 +62,8 @@ LEAST_ORDER: Final = 0.05
 LARGEST_SLOPE: Final = 0.5
 RIM_RAD: Final = 0.07
 """Nearer than this to the edge of the field of view nobody knows how much comes through."""
+DARKEST: Final = 0.002
+"""Of the diffuse share: no room is darker, and a filter that starts from nothing could not tell it."""
 LEAST_FLOOR: Final = 0.015
 BREADTH_M: Final = 1.7
 FADING_M: Final = 1.2
@@ -168,7 +170,7 @@ def bounded(theta: Array) -> Array:
     """Parameters pulled back to what can be."""
     theta = theta.copy()
     own = theta[COMMONS:].reshape(-1, OWNS)
-    theta[Common.FLOOR] = max(theta[Common.FLOOR], 0.0)
+    theta[Common.FLOOR] = max(theta[Common.FLOOR], DARKEST)
     theta[Common.RX_ORDER] = max(theta[Common.RX_ORDER], LEAST_ORDER)
     own[:, Own.ORDER] = np.maximum(own[:, Own.ORDER], LEAST_ORDER)
     own[:, Own.SLOPE_X : Own.SLOPE_Y + 1] = np.clip(

@@ -156,7 +156,7 @@ def _descend(task: Problem, rows: Rows, theta: Array, scale: float) -> tuple[Arr
             return theta, cost, True
         gained, theta, here, damping = cost - reached, trial, there, max(0.2 * damping, 1e-9)
         cost = reached
-        if gained < 1e-7 * (1.0 + cost):
+        if gained < 1e-5 * (1.0 + cost):
             return theta, cost, True
     return theta, cost, False
 

@@ -1,0 +1,176 @@
+"""The commands `calibrate` and `survey`: what they say, write and refuse; drives are made without a recording here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import daemon.calibrate
+import daemon.survey
+from daemon import cli
+from daemon.residualfile import ResidualError, read_residuals, residuals_beside, write_residuals
+from daemon.results import Trajectory
+from daemon.surveyfile import read_survey, write_survey
+from daemon.teach import Drive, heard, poses_at
+from estimator.cdma_epoch import BlockFlag, LightEpoch
+from estimator.optics import expected
+from estimator.residual import ResidualMap
+from hal.errors import DataInvalid
+from tests.estimator.teach import drive as way
+from tests.estimator.teach import nominal, real
+
+T0 = 1.7e9
+
+
+@pytest.fixture(scope="module")
+def taught() -> Drive:
+    """A drive whose map begins elsewhere than the survey, and is turned."""
+    survey = nominal(2)
+    truth = real(survey, 1)
+    t, pose = way(truth, 2, 2500)
+    c, s = np.cos(0.4), np.sin(0.4)
+    x, y = pose[:, 0] - 1.0, pose[:, 1] - 0.5
+    there = np.column_stack((c * x - s * y, s * x + c * y, pose[:, 2] + 0.4))
+    drive = Drive(Path("teach"), Trajectory(T0 + t, there), survey)
+    codes = np.array([lamp.code for lamp in survey.lamps])
+    g = np.random.default_rng(3)
+    for at, where in zip(t, pose, strict=True):
+        a = expected(truth.lamps, truth, where).amplitude * np.exp(0.01 * g.normal(size=len(codes)))
+        n = len(codes)
+        epoch = LightEpoch(
+            at, at, codes, a, (1e-3 * a) ** 2, np.zeros(n, np.int64), (None,) * n, BlockFlag.NONE, 0.0, None
+        )
+        drive.epochs.append((T0 + at, epoch))
+    wheels = np.column_stack((T0 + t, 0.98 * there[:, :2], np.unwrap(there[:, 2])))
+    drive.readings = wheels
+    return drive
+
+
+@pytest.fixture
+def played(taught: Drive, monkeypatch: pytest.MonkeyPatch) -> Drive:
+    """Both commands get that drive, whatever recording is named."""
+    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: taught)
+    monkeypatch.setattr(daemon.survey, "read_drive", lambda *_: taught)
+    return taught
+
+
+@pytest.mark.jit
+def test_calibrate_writes_a_better_survey_with_its_map(
+    played: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new.toml"
+    assert cli.main(["calibrate", "teach", "--out", str(out)]) == cli.OK
+    said = capsys.readouterr().out
+    assert "before" in said
+    assert "rx_slope_x" in said
+    assert "yaw -22.9" in said  # -0.4 rad
+    truth = real(nominal(2), 1)
+    survey = read_survey(out)
+    for found, lamp in zip(survey.lamps, truth.lamps, strict=True):
+        assert abs(np.log(found.power_w / lamp.power_w)) < 0.1
+        assert abs(found.slope_x - lamp.slope_x) < 0.02
+    assert "order +-" in out.read_text()
+    assert read_residuals(residuals_beside(out), survey) is not None
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    # nothing is overwritten unasked, and that is said before any work
+    assert cli.main(["calibrate", "teach", "--out", str(out)]) == cli.FAILED
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.jit
+def test_survey_writes_lamps_with_uncertainties(
+    played: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "lights.toml"
+    assert cli.main(["survey", "teach", "--height", "2.9", "--out", str(out)]) == cli.OK
+    assert "sigma m" in capsys.readouterr().out
+    found = {lamp.code: lamp for lamp in read_survey(out).lamps}
+    lamps = nominal(2).lamps
+    assert set(found) == {lamp.code for lamp in lamps}
+    apart = np.hypot(found[0].x - found[7].x, found[0].y - found[7].y)
+    assert apart == pytest.approx(2.5, abs=0.1)
+    assert "passed at" in out.read_text()
+    assert cli.main(["survey", "teach", "--out", str(out)]) == cli.FAILED
+
+
+def test_wheels_are_reported(played: Drive, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["calibrate", "teach", "--odometry", "--lidar-mount"]) == cli.OK
+    said = capsys.readouterr().out
+    assert "scale         1.0204" in said
+    assert "mount = { x =" in said
+
+
+def test_what_is_missing_is_said(
+    played: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "x.toml")]
+    for change, words in (
+        ({"survey": replace(played.survey, lamps=())}, "recorded without a survey; name one with --survey"),
+        ({"epochs": []}, "no light of any lamp was decoded"),
+        ({"epochs": played.epochs[:10]}, "--start X Y DEGREES"),
+    ):
+        fields = {name: getattr(played, name) for name in ("path", "poses", "survey", "epochs", "readings")}
+        other = Drive(**{**fields, **change})
+        monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_, other=other: other)
+        assert cli.main(["calibrate", "teach", *out]) == cli.FAILED
+        assert words in capsys.readouterr().err
+    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
+    assert cli.main(["calibrate", "teach", "--odometry"]) == cli.FAILED
+    assert "no odometry in it" in capsys.readouterr().err
+
+
+def test_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["calibrate", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == cli.FAILED
+    assert "none" in capsys.readouterr().err
+    assert cli.main(["survey", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == cli.FAILED
+
+
+def test_strengths_without_a_pose_near_are_left_out(taught: Drive) -> None:
+    stamps = np.array([0.0, 0.1, 5.0, 5.1])
+    poses = np.array([(0.0, 0, 3.1), (1.0, 0, -3.1), (2.0, 0, 0), (3.0, 0, 0)])
+    found, known = poses_at(Trajectory(stamps, poses), np.array([0.05, 2.0, 5.05, 9.0]))
+    assert known.tolist() == [True, False, True, False]
+    assert abs(abs(found[0, 2]) - np.pi) < 0.05  # the short way round
+    with pytest.raises(DataInvalid, match=r"photodiode\.bus"):
+        heard(Drive(Path("t"), taught.poses, taught.survey))
+
+
+def small_map() -> ResidualMap:
+    return ResidualMap((1, 2), np.ones((2, 4)), np.ones((2, 3, 3)), np.full((2, 3, 3), 0.1), 0.02)
+
+
+def test_a_map_reads_back_and_what_is_not_one_is_refused(tmp_path: Path) -> None:
+    survey, path = nominal(2), tmp_path / "a.residuals.npz"
+    assert read_residuals(path, survey) is None
+    write_residuals(path, small_map(), survey)
+    back = read_residuals(path, survey)
+    assert back is not None
+    assert back.lamp_ids == (1, 2)
+    assert np.array_equal(back.mean, small_map().mean)
+    with pytest.raises(ResidualError, match="another survey"):
+        read_residuals(path, replace(survey, floor=0.03))
+    data = bytearray(path.read_bytes())
+    for at in range(40, len(data), 97):
+        broken = bytearray(data)
+        broken[at] ^= 0x55
+        path.write_bytes(bytes(broken))
+        try:
+            same = read_residuals(path, survey)
+        except ResidualError:
+            continue
+        assert same is not None  # a byte that nobody reads
+        assert np.array_equal(same.mean, small_map().mean)
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(ResidualError, match="not a residual map"):
+        read_residuals(path, survey)
+    with pytest.raises(ResidualError, match="cannot write"):
+        write_residuals(tmp_path / "no" / "x.npz", small_map(), survey)
+
+
+def test_survey_beside_which_it_lies(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    write_survey(path, nominal(2))
+    assert residuals_beside(path).name == "hall.residuals.npz"
