@@ -168,6 +168,7 @@ _USES: Final[dict[LinkUse, str]] = {
     LinkUse.TWIN: "two lamps of this code are in view",
     LinkUse.UNSURVEYED: "no lamp of this code is known",
     LinkUse.MISSING: "not received, though it must be here: dead, or covered",
+    LinkUse.PAUSED: "clear, but not among those that are used",
 }
 _FIXES: Final[dict[LightFix, str]] = {
     LightFix.NONE: "no lamps in view, or too few",

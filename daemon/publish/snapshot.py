@@ -46,6 +46,7 @@ class LinkUse(IntEnum):
     TWIN = 6  # two lamps of this code are in view
     UNSURVEYED = 7  # no lamp of this code is known
     MISSING = 8  # not received, though it must be here: dead, or covered
+    PAUSED = 9  # clear, but not among those that are used (Link_n)
 
 
 @dataclass(frozen=True, slots=True)
