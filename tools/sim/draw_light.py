@@ -68,7 +68,7 @@ def draw(figure: Any, name: str, pixels: int = PIXELS) -> None:
     over[seen] = 100.0 * (
         received[seen, lamp] / book[seen, lamp] / np.median(received[seen, lamp] / book[seen, lamp]) - 1
     )
-    pictures = (
+    pictures: tuple[tuple[str, Array, dict[str, Any]], ...] = (
         ("strongest lamp, nA", 1e9 * received.max(axis=1), {"cmap": "inferno"}),
         (
             f"lamps above {1e9 * PLAIN_A:.0f} nA",
