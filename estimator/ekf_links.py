@@ -119,40 +119,50 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
     Returns:
         ln of the likelihood of these links together, each one's surprise capped.
     """
-    likelihood = 0.0
-    h, a, b, c, K = np.empty(WIDTH), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    at = np.empty(WIDTH, np.int64)
+    likelihood, count = 0.0, links.shape[0]
+    at, A = np.empty((count, WIDTH), np.int64), np.zeros((count, n))
+    K, b, c = np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, n))
     lin = around.copy()
-    for i in range(links.shape[0]):
+    for i in range(count):
+        for w in range(WIDTH):
+            at[i, w] = element(links[i, SLOT], w)
+            if out[i, WHITE] < np.inf:
+                h, k = out[i, SLOPES + w], at[i, w]
+                for j in range(n):
+                    A[i, j] += h * P[k, j]
+    for i in range(count):
         noise = out[i, WHITE]
         if not noise < np.inf:
             continue
-        nu = out[i, RESIDUAL]
-        a[:] = 0.0
+        nu, spread = out[i, RESIDUAL], 0.0
         for w in range(WIDTH):
-            k = at[w] = element(links[i, SLOT], w)
-            h[w] = out[i, SLOPES + w]
+            k = at[i, w]
             step = x[k] - lin[k]
             if w == YAW:
                 step = (step + np.pi) % (2.0 * np.pi) - np.pi
-            nu -= h[w] * step
-            for j in range(k):  # only the upper triangle is kept up while links are taken in
-                a[j] += P[j, k] * h[w]
-            for j in range(k, n):
-                a[j] += P[k, j] * h[w]
-        spread = 0.0
-        for w in range(WIDTH):
-            spread += h[w] * a[at[w]]
+            nu -= out[i, SLOPES + w] * step
+            spread += out[i, SLOPES + w] * A[i, k]
         S = max(spread, 0.0) + noise
         likelihood -= 0.5 * (min(nu * nu / S, SURPRISE_CAP) + np.log(S) + LOG_2PI)
         for j in range(n):
-            K[j] = a[j] / S
-            b[j] = a[j] - K[j] * spread
-            c[j] = noise * K[j] - a[j]
-            x[j] += K[j] * nu
-        for j in range(n):
-            for k in range(j, n):
-                P[j, k] += K[j] * c[k] - b[j] * K[k]
+            K[i, j] = A[i, j] / S
+            b[i, j] = A[i, j] - K[i, j] * spread
+            c[i, j] = noise * K[i, j] - A[i, j]
+            x[j] += K[i, j] * nu
+        for m in range(i + 1, count):  # what this update changes for the links still to come
+            if out[m, WHITE] < np.inf:
+                up = down = 0.0
+                for w in range(WIDTH):
+                    up += c[i, at[m, w]] * out[m, SLOPES + w]
+                    down += K[i, at[m, w]] * out[m, SLOPES + w]
+                for j in range(n):
+                    A[m, j] += K[i, j] * up - b[i, j] * down
+    for j in range(n):  # P + sum of K c' - b K', a row at a time: it stays in the cache
+        for i in range(count):
+            if out[i, WHITE] < np.inf:
+                u, v = K[i, j], b[i, j]
+                for k in range(j, n):
+                    P[j, k] += u * c[i, k] - v * K[i, k]
     for j in range(n):
         for k in range(j):
             P[j, k] = P[k, j]
