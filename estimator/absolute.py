@@ -34,7 +34,7 @@ DRIFT = np.array((5e-5, 5e-5, 2e-6))
 """Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of: some
 7 mm and 0.08 deg by the root of the way."""
 
-TRUST, YOUNG, YOUNG_M = 2.0, 8.0, 4.0
+TRUST, YOUNG, YOUNG_M = 2.0, 4.0, 4.0
 """By how much the variance of a position from light is raised: always, because errors of the light model hang together
 farther than it knows; and at the start, fading with the way driven, because gains and heading are being found."""
 SURPRISE_S = 1.0
