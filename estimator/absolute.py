@@ -170,7 +170,7 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     L_lights = invert3(lights.covariance)
     most = float(np.linalg.eigvals(lights.gained @ lights.covariance).real.max())
     part = min(1.0, tie.fresh / most) if most > 0.0 and not blind(state) else 1.0
-    tie.fresh -= part * max(most, 0.0)
+    tie.fresh = max(0.0, tie.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
     before = R @ tie.P @ R.T

@@ -68,6 +68,7 @@ def predict(state: State, record: Record) -> None:
         case Command():
             obey(state, record)
             absolute.on_order(state, record)
+            return  # RESET sets the odometry's covariance back: that is no motion
     absolute.on_motion(state, *before)
 
 

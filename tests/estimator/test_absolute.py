@@ -10,7 +10,7 @@ import pytest
 
 from estimator import se2
 from estimator.pipeline import keyframe_poses, step
-from estimator.records import UNLIMITED, Array, Command, LightEpoch, Order, Record, Scan
+from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
 from estimator.result import SURPRISE, Fix
 from tests.estimator.lit import Log, Truth, lit_state, play, scans, together
 from tools.sim.buildings import building
@@ -183,6 +183,23 @@ def test_an_order_places_the_map_and_light_takes_it_from_there() -> None:
     assert all(r.placed for r in log.results)
     assert log.rmse(0.0)[0] < 0.35
     assert log.rmse(0.0)[1] < 0.3
+
+
+def test_without_wheels_light_and_laser_find_the_heading_and_a_gap_of_the_laser_moves_nothing() -> None:
+    run = room(1, 36.0)
+    log = play(lit_state(run), without(together(run.light(), scans(run)), Scan, 15.0, 28.0), run.truth)
+    assert log.rmse(10.0, 15.0)[0] < 0.25
+    assert log.rmse(10.0, 15.0)[1] < 0.15  # not the mirror image that reverses
+    assert log.rmse(29.0)[0] < 0.3
+    assert log.rmse(29.0)[1] < 0.15
+
+
+def test_reset_at_a_pose_after_a_blind_drive_leaves_an_honest_covariance() -> None:
+    state = lit_state(room(1, 1.0))
+    for k in range(1, 600):
+        step(state, [Odometry(0.1 * (k - 1), 0.1 * k, np.array((0.05, 0.0, 0.01)))], UNLIMITED)
+    result = step(state, [Command(60.0, Order.RESET, np.array((1.0, 2.0, 0.0)))], UNLIMITED)
+    assert np.linalg.eigvalsh(result.covariance).min() > 0.0
 
 
 def test_reset_forgets_where_the_map_lies() -> None:
