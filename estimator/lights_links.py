@@ -204,7 +204,7 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, level_dro
     """
     half, rim = lights.survey.receiver.half_fov_rad, lights.settings.rim_rad
     cos_rim, cos_out = math.cos(max(half - rim, 0.1)), math.cos(half + rim)
-    gating = settled(track)
+    gating = settled(track) and len(lights.tracks) == 1  # hypotheses are compared by the same links
     for i, (sight, row) in enumerate(zip(kept, out[:, : ekf_links.SLOPES].tolist(), strict=True)):
         r, S = row[ekf_links.RESIDUAL], row[ekf_links.SPREAD] + row[ekf_links.WHITE]
         sight.residual, sight.sigma = r, math.sqrt(max(S, 0.0))

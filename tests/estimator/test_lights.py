@@ -13,6 +13,7 @@ from estimator.lamps import Survey
 from estimator.records import Array, Imu
 from estimator.result import Fix, LightsResult, LinkState
 from tests.estimator.light_room import LAMPS, SURVEY, Room, circle, drive, wheels
+from tools.sim.lightrun import room_run
 
 pytestmark = pytest.mark.jit
 
@@ -142,6 +143,19 @@ def test_without_odometry_it_follows_by_constant_velocity() -> None:
     assert result.fix is Fix.GOOD
     assert np.median([e for e, _ in errors[200:]]) < 0.08
     assert np.median([h for _, h in errors[200:]]) < math.radians(8.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_without_odometry_a_lamp_that_is_too_weak_does_not_decide_for_the_mirror_image(seed: int) -> None:
+    run = room_run(seed=seed, people=0)
+    filter_ = lf.new_lights(run.survey)
+    for epoch in run.light():
+        result = lf.update(filter_, epoch)
+        if result.fix is Fix.GOOD:
+            break
+    assert result.fix is Fix.GOOD
+    assert result.t_mono < 8.0
+    assert off(result, run.truth(np.array([result.t_pose]))[0])[1] < 4.0 * math.sqrt(result.covariance[2, 2])
 
 
 def test_a_gyro_gives_the_turn_and_its_bias_is_found() -> None:
