@@ -219,6 +219,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float, drop: bool) -> lis
     lights.way_epoch = lights.course.way
     views: list[tuple[Track, list[Sight]]] = []
     for track in lights.tracks:
+        lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
         likelihood = absorb(lights, track, seen, view_of(lights, back), drop)

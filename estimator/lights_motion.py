@@ -22,6 +22,7 @@ TRAIL_S: Final = 1.0
 GYRO_FRESH_S: Final = 0.1
 UNSEEN: Final = 0.5
 """m/s and rad/s of a robot that nobody watches."""
+REVERSE_M_S: Final = 0.1
 STILL: Final = 0.08
 """m/s; without odometry a slower robot is taken to stand."""
 FASTEST: Final = 20.0
@@ -187,6 +188,25 @@ def release(lights: Lights) -> None:
     for track in lights.tracks:
         set_speed(track, course.velocity, (0.5 * noise.speed, noise.sideways, 0.3))
     course.wheels, course.ahead = False, se2.identity()
+
+
+def face_forward(lights: Lights, track: Track) -> None:
+    """Without wheels, a robot found to reverse is its mirror image that drives forward: turn it round.
+
+    Strengths and gyro cannot tell the two apart; the photodiode stays where it is.
+    """
+    sigma = math.sqrt(max(float(track.P[ekf.SPEED, ekf.SPEED]), 0.0))
+    if lights.course.wheels or track.x[ekf.SPEED] > -max(REVERSE_M_S, 2.0 * sigma):
+        return
+    receiver = lights.survey.receiver
+    c, s = math.cos(track.x[ekf.YAW]), math.sin(track.x[ekf.YAW])
+    track.x[ekf.X] += 2.0 * (c * receiver.x - s * receiver.y)
+    track.x[ekf.Y] += 2.0 * (s * receiver.x + c * receiver.y)
+    track.x[ekf.YAW] = se2.wrap(float(track.x[ekf.YAW]) + math.pi)
+    for j in (ekf.SPEED, ekf.SIDE, ekf.LEAN_X, ekf.LEAN_Y):
+        track.x[j] = -track.x[j]
+        track.P[j, :] *= -1.0
+        track.P[:, j] *= -1.0
 
 
 def back_to(lights: Lights, t_mono: float) -> Array:
