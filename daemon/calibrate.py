@@ -16,8 +16,8 @@ import numpy as np
 from daemon import cli
 from daemon.fitplot import draw_calibration
 from daemon.replay import Given
-from daemon.residualfile import ResidualError, residuals_beside, write_residuals
-from daemon.surveyfile import SurveyError, read_survey, write_survey
+from daemon.residualfile import ResidualError, write_residuals
+from daemon.surveyfile import SurveyError, read_survey, residuals_beside, write_survey
 from daemon.teach import Drive, heard, read_drive, rows_for
 from daemon.wheels import report_wheels
 from estimator.align import Unaligned, align

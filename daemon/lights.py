@@ -5,6 +5,8 @@ It is read once, kept in a recording's head, and taken from there by a replay: t
 
 from __future__ import annotations
 
+import base64
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -13,12 +15,15 @@ import msgspec
 
 from daemon.config import Config
 from daemon.photodiode import profile_of
-from daemon.surveyfile import SurveyError, read_survey
+from daemon.surveyfile import SurveyError, read_survey, residuals_beside
 from estimator.cdma_profile import PROFILES, Profile
 from estimator.lamps import Survey
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from estimator.pipeline import Settings, State
+    from estimator.residual import ResidualMap
+
+log = logging.getLogger(__name__)
 
 __all__ = ["Lights", "SurveyError", "from_header", "load_lights", "new_state"]
 
@@ -33,15 +38,22 @@ class Lights:
     Attributes:
         survey: lamps and receiver; without lamps in it they have to describe themselves.
         profile: air interface. clock_ppm: stored error of the sample clock; None: to be found.
+        residuals: content of the residual map beside the survey, empty without one; read by the estimator's loader.
     """
 
     survey: Survey
     profile: Profile
     clock_ppm: float | None = None
+    residuals: bytes = b""
 
     def header(self) -> dict[str, Any]:
         """What a recording keeps in its head."""
-        kept = {"survey": msgspec.to_builtins(self.survey), "profile": self.profile.name, "clock_ppm": self.clock_ppm}
+        kept = {
+            "survey": msgspec.to_builtins(self.survey),
+            "profile": self.profile.name,
+            "clock_ppm": self.clock_ppm,
+            "residuals": base64.b64encode(self.residuals).decode(),
+        }
         return {HEADER: kept}
 
 
@@ -51,8 +63,22 @@ def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | No
     Raises:
         SurveyError: the survey cannot be used; names the place and the remedy.
     """
-    survey = read_survey(Path(settings.lights.survey)) if settings.lights.survey else Survey()
-    return Lights(survey, profile_of(settings.photodiode), clock_ppm) if settings.photodiode.fitted else None
+    path = settings.lights.survey
+    survey = read_survey(Path(path)) if path else Survey()
+    if not settings.photodiode.fitted:
+        return None
+    return Lights(survey, profile_of(settings.photodiode), clock_ppm, _residuals(Path(path)) if path else b"")
+
+
+def _residuals(survey: Path) -> bytes:
+    """Content of the map beside a survey, empty where there is none."""
+    path = residuals_beside(survey)
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise SurveyError(f"{path}: cannot be read: {error.strerror}; mend that, or move it away") from error
 
 
 def from_header(header: dict[str, Any]) -> Lights | None:
@@ -66,17 +92,36 @@ def from_header(header: dict[str, Any]) -> Lights | None:
         return None
     try:
         survey = msgspec.convert(kept["survey"], Survey)
-        return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"])
-    except (KeyError, TypeError, msgspec.ValidationError) as error:
+        residuals = base64.b64decode(kept.get("residuals", ""), validate=True)
+        return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"], residuals)
+    except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
         raise ValueError(f"the recording's lights are not of this version ({error})") from error
 
 
 def new_state(lights: Lights | None, settings: Settings | None = None) -> State:
-    """The estimator's state for a robot that has just been switched on; loads the estimator."""
+    """The estimator's state for a robot that has just been switched on; loads the estimator.
+
+    A residual map that cannot be used is named in the log, and the robot drives without.
+    """
     from estimator import pipeline
 
     if lights is None:
         return pipeline.new_state(settings)
     from estimator.light import LightsSetup
 
-    return pipeline.new_state(settings, LightsSetup(lights.survey, lights.profile, lights.clock_ppm))
+    return pipeline.new_state(settings, LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights)))
+
+
+def _learned(lights: Lights) -> ResidualMap | None:
+    """The residual map, None where there is none or it is of no use."""
+    if not lights.residuals:
+        return None
+    from daemon.residualfile import ResidualError, unpack
+
+    try:
+        residuals = unpack(lights.residuals, lights.survey, "the residual map beside the survey")
+    except ResidualError as error:
+        log.warning("%s; driving without it", error)
+        return None
+    log.info("residual map of %d lamps", len(residuals.lamp_ids))
+    return residuals

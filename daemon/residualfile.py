@@ -35,11 +35,6 @@ class ResidualError(Exception):
     """The map cannot be used or written; the text says why and what to do."""
 
 
-def residuals_beside(survey: Path) -> Path:
-    """Where a survey's map lies."""
-    return survey.with_suffix(".residuals.npz")
-
-
 def write_residuals(path: Path, residuals: ResidualMap, survey: Survey) -> None:
     """Write a map whole or not at all; raises `ResidualError`."""
     arrays = {
@@ -72,11 +67,24 @@ def read_residuals(path: Path, survey: Survey) -> ResidualMap | None:
         ResidualError: damaged, of another version, or learned with another survey.
     """
     try:
-        # numpy leaves a file open that it cannot make sense of
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            kept = {name: file[name] for name in (*_ARRAYS, "version", "survey", "check")}
+        content = path.read_bytes()
     except FileNotFoundError:
         return None
+    except OSError as error:
+        raise ResidualError(f"{path}: not a residual map ({error}); {_AGAIN}") from error
+    return unpack(content, survey, str(path))
+
+
+def unpack(content: bytes, survey: Survey, path: str) -> ResidualMap:
+    """A map from a file's content; ``path`` names it in errors.
+
+    Raises:
+        ResidualError: see :func:`read_residuals`.
+    """
+    try:
+        # numpy leaves a file open that it cannot make sense of
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            kept = {name: file[name] for name in (*_ARRAYS, "version", "survey", "check")}
     except _DAMAGE as error:
         raise ResidualError(f"{path}: not a residual map ({error}); {_AGAIN}") from error
     if kept["version"].tolist() != [VERSION]:

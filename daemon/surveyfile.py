@@ -123,6 +123,11 @@ def order_of(half_angle_deg: float) -> float:
     return -math.log(2.0) / math.log(math.cos(math.radians(half_angle_deg)))
 
 
+def residuals_beside(survey: Path) -> Path:
+    """Where a survey's residual map lies (daemon/residualfile.py), if it has one."""
+    return survey.with_suffix(".residuals.npz")
+
+
 def read_survey(path: Path) -> Survey:
     """Read a survey.
 

@@ -8,7 +8,9 @@ from estimator import cdma, lights
 from estimator.cdma_epoch import LightEpoch, SampleBlock
 from estimator.cdma_profile import PROFILE_A, Profile
 from estimator.lamps import Survey
+from estimator.lights_residual import Learned
 from estimator.records import Array, Imu, Odometry, Record
+from estimator.residual import ResidualMap
 from estimator.result import LightsResult
 
 
@@ -20,11 +22,13 @@ class LightsSetup:
         survey: the lamps and the receiver; without lamps in it, they have to describe themselves.
         profile: air interface and front end.
         clock_ppm: stored error of the sample clock, good to 200 ppm; None: not known yet.
+        residuals: what the survey does not explain, place by place, learned with this survey; None: no such map.
     """
 
     survey: Survey = field(default_factory=Survey)
     profile: Profile = PROFILE_A
     clock_ppm: float | None = None
+    residuals: ResidualMap | None = None
 
 
 class Light:
@@ -39,7 +43,8 @@ class Light:
         """Nothing seen yet; raises ValueError for a stored clock out of range or an impossible survey."""
         self.setup = setup
         self.decoder = cdma.new_decoder(setup.profile, setup.clock_ppm)
-        self.filter = lights.new_lights(setup.survey)
+        learned = None if setup.residuals is None else Learned(setup.residuals, setup.survey.receiver)
+        self.filter = lights.new_lights(setup.survey, corrections=learned)
         self.result = lights.result(self.filter)
 
     def predict(self, record: Record) -> None:

@@ -11,9 +11,9 @@ import pytest
 import daemon.calibrate
 import daemon.survey
 from daemon import cli
-from daemon.residualfile import ResidualError, read_residuals, residuals_beside, write_residuals
+from daemon.residualfile import ResidualError, read_residuals, write_residuals
 from daemon.results import Trajectory
-from daemon.surveyfile import read_survey, write_survey
+from daemon.surveyfile import read_survey, residuals_beside, write_survey
 from daemon.teach import Drive, heard, poses_at
 from estimator.cdma_epoch import BlockFlag, LightEpoch
 from estimator.optics import expected
