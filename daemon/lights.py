@@ -64,10 +64,11 @@ def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | No
         SurveyError: the survey cannot be used; names the place and the remedy.
     """
     path = settings.lights.survey
-    survey = read_survey(Path(path)) if path else Survey()
+    profile = profile_of(settings.photodiode)
+    survey = read_survey(Path(path)) if path else Survey(depth=profile.depth)
     if not settings.photodiode.fitted:
         return None
-    return Lights(survey, profile_of(settings.photodiode), clock_ppm, _residuals(Path(path)) if path else b"")
+    return Lights(survey, profile, clock_ppm, _residuals(Path(path)) if path else b"")
 
 
 def _residuals(survey: Path) -> bytes:

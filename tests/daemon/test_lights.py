@@ -13,11 +13,11 @@ import pytest
 
 from daemon.budget import FixedBudget
 from daemon.config import NO_DEVICE, Config, LidarConfig, ModbusConfig, PhotodiodeConfig
-from daemon.lights import Lights
+from daemon.lights import Lights, load_lights
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import LightPicture, Snapshot
 from daemon.worker import CycleWorker
-from estimator.cdma_profile import PROFILE_A
+from estimator.cdma_profile import PROFILE_A, PROFILE_B
 from hal.clock import LoopClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX_UG01
@@ -198,3 +198,9 @@ def test_a_lidar_that_goes_leaves_the_pace_to_the_lights_and_takes_it_back(caplo
         assert bench.daemon.cycle.inbox.blocks_dropped == 0
 
     run_daemon(scenario, lidar=True)
+
+
+def test_lamps_that_describe_themselves_are_modulated_as_the_profile_says() -> None:
+    lights = load_lights(Config(photodiode=PhotodiodeConfig(bus=BUS, profile="B")))
+    assert lights is not None
+    assert lights.survey.depth == PROFILE_B.depth != PROFILE_A.depth
