@@ -175,16 +175,14 @@ def level_dropped(lights: Lights, level: float | None) -> bool:
 
 
 def look_around(lights: Lights, epoch: LightEpoch) -> None:
-    """Start where there is no hypothesis; start again where the only one has become too vague."""
+    """Start where there is no hypothesis; start again where all have become too vague."""
     yaws, sigma = headings(lights.settings.headings)
-    if len(lights.tracks) == 1:
-        track = lights.tracks[0]
-        if math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0)) < DRIFTED_M:
+    if lights.tracks:
+        if min(float(track.P[0, 0] + track.P[1, 1]) for track in lights.tracks) < DRIFTED_M**2:
             return
-        if track.P[2, 2] < 0.35**2:
+        track = lights.tracks[0]
+        if len(lights.tracks) == 1 and track.P[2, 2] < 0.35**2:
             yaws, sigma = np.array((float(track.x[2]),)), math.sqrt(float(track.P[2, 2])) + 0.05
-    elif lights.tracks:
-        return
     found = places(lights, epoch)
     if lights.tracks:
         found = [place for place in found if fits_prior(lights.tracks[0], place)] or found
@@ -219,7 +217,8 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float, drop: bool) -> lis
     lights.way_epoch = lights.course.way
     views: list[tuple[Track, list[Sight]]] = []
     for track in lights.tracks:
-        lights_motion.face_forward(lights, track)
+        if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
+            lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
         likelihood = absorb(lights, track, seen, view_of(lights, back), drop)

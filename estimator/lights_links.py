@@ -28,6 +28,8 @@ FAINT_FLAG, TWIN_FLAG = int(LinkFlag.FAINT), int(LinkFlag.TWIN)  # an enum's loo
 
 TWIN_SHARE = 0.1
 """A second lamp of the same code adds to a link when it would be received at this share of the first or more."""
+NO_LIGHT_A = 1e-15
+"""A strength below that is rounding: one electron in a block is more."""
 DIFFUSE = 0.6
 """A strength below this share of what the lamp gives at the edge of view has not come straight."""
 RELEARN_S, RELEARN_M = 15.0, 3.0
@@ -84,7 +86,7 @@ def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]
     )
     found = []
     for code, amplitude, variance, flags, frame in rows:
-        if not (math.isfinite(amplitude) and variance >= 0.0):
+        if not (NO_LIGHT_A < amplitude < math.inf and variance >= 0.0):
             found.append(Sight(code, 0.0, math.inf, FAINT))
             continue
         sight = Sight(code, amplitude, variance)

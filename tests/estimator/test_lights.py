@@ -158,6 +158,36 @@ def test_without_odometry_a_lamp_that_is_too_weak_does_not_decide_for_the_mirror
     assert off(result, run.truth(np.array([result.t_pose]))[0])[1] < 4.0 * math.sqrt(result.covariance[2, 2])
 
 
+def test_without_odometry_a_robot_that_turns_back_is_seen_to_reverse() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    for k in range(1, 210):
+        t = 0.1 * k
+        u = min(max(t - 15.0, 0.0), 2.0)  # from forward to backward within two seconds
+        pose = circle(min(t, 15.0) + u - 0.5 * u * u - max(t - 17.0, 0.0))
+        result = lf.update(filter_, Room(seed=k).epoch(t, pose))
+    assert filter_.tracks[0].x[lf.ekf.SPEED] < -0.3
+    assert off(result, pose)[1] < math.radians(15.0)
+
+
+def test_lamps_switched_off_during_the_start_are_no_reason_to_look_for_ever() -> None:
+    filter_, room = lf.new_lights(SURVEY), Room(cover=lambda _lamp, t: 0.0 if 3.0 < t < 63.0 else 1.0)
+    for k in range(630):
+        lf.update(filter_, room.epoch(0.1 * k, circle(0.0)))
+    assert len(filter_.tracks) > 1
+    for k in range(630, 830):
+        result = lf.update(filter_, room.epoch(0.1 * k, circle(0.1 * k)))
+    assert result.fix is Fix.GOOD
+    assert off(result, circle(82.9))[0] < 0.15
+
+
+def test_strengths_beyond_all_light_change_nothing() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 6.0)
+    epoch = Room().epoch(6.1, circle(6.1))
+    epoch.amplitude[:2], epoch.variance[:2] = 1e-300, 0.0
+    assert np.isfinite(lf.update(filter_, epoch).covariance).all()
+
+
 def test_a_gyro_gives_the_turn_and_its_bias_is_found() -> None:
     filter_ = lf.new_lights(SURVEY)
     bias = 0.01
