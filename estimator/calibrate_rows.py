@@ -21,8 +21,9 @@ Index = npt.NDArray[np.int64]
 
 CELL_M: Final = 0.10
 SECTORS: Final = 8
-PATCH_M: Final = 1.5
-"""Model errors (walls, the lamp's own pattern) are alike within such a patch of floor."""
+PATCH_M: Final = 2.0
+"""Model errors (walls, the lamp's own pattern) are alike within such a patch of floor: the way over which the `lights`
+filter lets them fade too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
