@@ -38,7 +38,7 @@ TRUST, YOUNG, YOUNG_M = 2.0, 4.0, 4.0
 """By how much the variance of a position from light is raised: always, because errors of the light model hang together
 farther than it knows; and at the start, fading with the way driven, because gains and heading are being found."""
 SURPRISE_S = 1.0
-"""Light that disagrees for longer than this is believed: nothing else knows where in the building the robot is."""
+"""Light that is sure and disagrees for longer is believed: nothing else knows where in the building the robot is."""
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 """What stamps and lever arms make of a moving robot."""
 
@@ -61,7 +61,8 @@ class Absolute:
     """The tie of the odom frame to the survey's frame.
 
     Attributes:
-        placed: light has told where the map lies. P, X: see above, both 3x3, odom-aligned axes.
+        placed: light has told where the map lies. proved: it was sure of that, or a person said so.
+        P, X: see above, both 3x3, odom-aligned axes.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
         way, way_young: driven so far, and when light last began to find the place.
@@ -71,6 +72,7 @@ class Absolute:
     """
 
     placed: bool = False
+    proved: bool = False
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
     gap: float | None = None
@@ -137,10 +139,11 @@ def on_lights(state: State, lights: LightsResult) -> None:
     off = lights.T_map_base - se2.compose(state.T_map_odom, T_odom_base)
     off[2] = se2.wrap(off[2])
     tie.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if tie.placed else None
-    if not tie.placed or _contradicted(tie, lights) or _surer(tie, lights):
+    if not tie.placed or _contradicted(state, lights) or _surer(tie, lights):
         follow(state, lights, T_odom_base)
     elif lights.fix is Fix.GOOD and tie.odd_since is None:
         gain(state, lights, T_odom_base, off)
+    tie.proved = tie.proved or (lights.fix is Fix.GOOD and tie.odd_since is None)
 
 
 def on_order(state: State, command: Command) -> None:
@@ -150,12 +153,12 @@ def on_order(state: State, command: Command) -> None:
         return
     if command.order is Order.RESET:
         state.light.reset()
-        tie.placed, tie.gap, tie.odd_since, tie.since = False, None, None, 0
+        tie.placed, tie.proved, tie.gap, tie.odd_since, tie.since = False, False, None, None, 0
     if T_map_base is not None and np.isfinite(T_map_base).all():
         state.light.place(T_map_base, SAID)
         R = se2.rotation(state.T_map_odom[2])
         tie.P, tie.X = R.T @ SAID @ R, np.zeros((3, 3))
-        tie.placed, tie.gap, tie.odd_since, tie.fresh = True, None, None, 0.0
+        tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0
 
 
 def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
@@ -236,13 +239,19 @@ def pose_at(state: State, t_mono: float) -> Array:
     return after[1] if t_mono < after[0] else state.fused.T_odom_base
 
 
-def _contradicted(tie: Absolute, lights: LightsResult) -> bool:
-    """Whether light has disagreed with the pose for long enough to be believed."""
+def _contradicted(state: State, lights: LightsResult) -> bool:
+    """Whether light has disagreed with the pose for long enough to be believed.
+
+    Light that is still looking for its place says nothing against a pose that was proved and that the laser holds.
+    """
+    tie = state.absolute
+    assert tie is not None
     if tie.gap is None or tie.gap <= SURPRISE:
         tie.odd_since = None
         return False
     tie.odd_since = lights.t_mono if tie.odd_since is None else tie.odd_since
-    return lights.t_mono - tie.odd_since >= SURPRISE_S
+    believed = lights.fix is Fix.GOOD or not tie.proved or blind(state)
+    return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
 
 
 def _surer(tie: Absolute, lights: LightsResult) -> bool:

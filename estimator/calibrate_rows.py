@@ -88,9 +88,10 @@ def patches(pose: Array, lamp: Index, size: float = PATCH_M) -> Index:
     return numbers
 
 
-@kernel("void(f8[:, ::1], i8[::1], f8[::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1])")
-def expect_rows(lamps: Array, which: Index, rx: Array, poses: Array, floor: float, out: Array, J: Array) -> None:
-    """`estimator.optics.expect` for one lamp and one pose per row; ``out`` (n, 3) and ``J`` (n, 17) are filled."""
+@kernel("void(f8[:, ::1], i8[::1], f8[::1], f8[:, ::1], f8, Tuple((f8[:, ::1], f8[:, ::1])))")
+def expect_rows(lamps: Array, which: Index, rx: Array, poses: Array, floor: float, said: tuple[Array, Array]) -> None:
+    """`estimator.optics.expect` for one lamp and one pose per row; fills ``said``: values (n, 3), Jacobian (n, 17)."""
+    out, J = said
     for i in range(which.shape[0]):
         expect(lamps[which[i]], rx, poses[i], floor, out[i], J[i])
 
@@ -99,7 +100,7 @@ def model(lamps: Array, rx: Array, rows_pose: Array, which: Index, floor: float)
     """What is expected per row: (n, 3) of amplitude, direct part, cos(beta), and (n, 17) Jacobian of ln amplitude."""
     n = len(which)
     out, J = np.zeros((n, 3)), np.zeros((n, COLUMNS))
-    expect_rows(lamps, which, rx, np.ascontiguousarray(rows_pose), floor, out, J)
+    expect_rows(lamps, which, rx, np.ascontiguousarray(rows_pose), floor, (out, J))
     some = out[:, 0] > 0.0
     J[some] /= out[some, 0, None]
     J[~some] = 0.0

@@ -104,6 +104,20 @@ def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: 
         out[i, SPREAD] = spread
 
 
+@kernel("void(f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def spread_out(P: Array, n: int, K: Array, b: Array, c: Array, out: Array) -> None:
+    """``P <- P + sum of K c' - b K'`` over the links that are used, a row at a time: it stays in the cache."""
+    for j in range(n):
+        for i in range(out.shape[0]):
+            if out[i, WHITE] < np.inf:
+                u, v = K[i, j], b[i, j]
+                for k in range(j, n):
+                    P[j, k] += u * c[i, k] - v * K[i, k]
+    for j in range(n):
+        for k in range(j):
+            P[j, k] = P[k, j]
+
+
 @kernel("f8(f8[::1], f8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])")
 def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) -> float:
     """Take links in one after another: Kalman's gain, the covariance in Joseph's form.
@@ -157,14 +171,6 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
                     down += K[i, at[m, w]] * out[m, SLOPES + w]
                 for j in range(n):
                     A[m, j] += K[i, j] * up - b[i, j] * down
-    for j in range(n):  # P + sum of K c' - b K', a row at a time: it stays in the cache
-        for i in range(count):
-            if out[i, WHITE] < np.inf:
-                u, v = K[i, j], b[i, j]
-                for k in range(j, n):
-                    P[j, k] += u * c[i, k] - v * K[i, k]
-    for j in range(n):
-        for k in range(j):
-            P[j, k] = P[k, j]
+    spread_out(P, n, K, b, c, out)
     x[YAW] = (x[YAW] + np.pi) % (2.0 * np.pi) - np.pi
     return likelihood

@@ -172,18 +172,21 @@ def mean_lever(points: Array, eye: Array) -> float:
     return float(np.sqrt(square / max(len(points), 1)))
 
 
+@kernel("f8(f8[::1], f8[:, ::1], f8[::1])")
+def between(u: Array, A: Array, v: Array) -> float:
+    """``u' A v`` of two steps (3,), as the information A (3, 3) weighs them."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += u[i] * A[i, j] * v[j]
+    return total
+
+
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
     " Tuple((f8[:, ::1], f8[::1])))"
 )
-def iterate(
-    points: Array,
-    reference: Reference,
-    T: Array,
-    L1: Array,
-    how: Array,
-    out: tuple[Array, Array],
-) -> int:
+def iterate(points: Array, reference: Reference, T: Array, L1: Array, how: Array, out: tuple[Array, Array]) -> int:
     """Iterate Eq. 13-14 from ``T`` (relative to the axis centre), which is moved in place; the number of iterations.
 
     The robust scale shrinks from twice what the prediction's uncertainty moves a point to a few times the noise, not
@@ -224,11 +227,7 @@ def iterate(
                 b[i] -= k * keep[i, j] * sums[12 + j] + L1[i, j] * (T[j] - T1[j])
         if solve3(A, b, step) == 0.0:
             break
-        length2 = turned = 0.0
-        for i in range(3):
-            for j in range(3):
-                length2 += step[i] * A[i, j] * step[j]
-                turned += step[i] * A[i, j] * before[j]
+        length2, turned = between(step, A, step), between(step, A, before)
         if scale == last and turned < -0.25 * length2:
             damping = max(0.125, 0.5 * damping)
         for i in range(3):

@@ -18,7 +18,7 @@ from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
-from estimator.lights_links import Sight, distrust, judge, relearn, settled, sights, table, view_of
+from estimator.lights_links import Sight, distrust, forget, judge, relearn, settled, sights, table, view_of
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3
@@ -52,8 +52,6 @@ DRIFTED_M = 0.7
 """A place less certain than that is not corrected but looked for anew: the equations are too bent there."""
 ITERATE_M, ITERATE_RAD = 0.03, 0.03
 ITERATIONS = 4
-LEVEL_S = 2.0
-LEVEL_DROP = 0.98
 
 
 def new_lights(
@@ -119,16 +117,15 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
 def reset(lights: Lights) -> None:
     """Forget the place and everything learned about lamps; those that described themselves stay known."""
     lights.tracks, lights.gains, lights.absent = [], {}, {}
-    lights.t_lost, lights.t_odd, lights.lost, lights.level, lights.result = math.inf, math.inf, False, None, None
+    lights.t_lost, lights.t_odd, lights.lost, lights.result = math.inf, math.inf, False, None
 
 
-def update(lights: Lights, epoch: LightEpoch, level: float | None = None) -> LightsResult:
+def update(lights: Lights, epoch: LightEpoch) -> LightsResult:
     """Take an epoch of light in, on time or late (up to a second), and say what is known after it.
 
     Args:
         lights: all of the filter.
         epoch: decoded light. One without a usable block brings no links.
-        level: photocurrent of the DC channel (A), where there is one: light that is taken away shows there too.
     """
     middle = 0.5 * (epoch.t_begin + epoch.t_end)
     if not math.isfinite(middle):
@@ -138,17 +135,17 @@ def update(lights: Lights, epoch: LightEpoch, level: float | None = None) -> Lig
     seen: list[Sight] = []
     gained, gained_by = np.zeros((3, 3)), np.zeros(3)
     if usable:
-        drop = level_dropped(lights, level)
         look_around(lights, epoch)
         single = len(lights.tracks) == 1
         before = (lights.tracks[0].x[:3].copy(), lights.tracks[0].P[:3, :3].copy()) if single else None
-        seen = take_in(lights, epoch, middle, drop)
+        seen = take_in(lights, epoch, middle)
         if before is not None and lights.tracks:
             gained, gained_by = gain(before, lights.tracks[0])
         follow_up(lights, epoch, seen)
     if not lights.tracks:
         seen = sights(lights, epoch, 0.0, 0.0) if usable else []
     lights.t_epoch = max(lights.t_epoch, epoch.t_end)
+    forget(lights)
     best = lights.tracks[0] if lights.tracks else None
     lights.result = describe(lights, [sight.link(best) for sight in seen], epoch)
     if lights.result.fix is not Fix.LOST:
@@ -163,15 +160,6 @@ def result(lights: Lights) -> LightsResult:
     fresh = describe(lights, list(lights.result.links), None)
     old = lights.result
     return replace(fresh, accepted=old.accepted, block=old.block, clock_ppm=old.clock_ppm)
-
-
-def level_dropped(lights: Lights, level: float | None) -> bool:
-    """Whether the DC channel says that light was taken away just now."""
-    if level is None or not math.isfinite(level):
-        return False
-    mean = level if lights.level is None else lights.level
-    lights.level = mean + (level - mean) * min(1.0, 0.05 / LEVEL_S)
-    return level < LEVEL_DROP * mean
 
 
 def look_around(lights: Lights, epoch: LightEpoch) -> None:
@@ -210,7 +198,7 @@ def keep_gains(lights: Lights) -> None:
         lights.gains[lamp_id] = track.x[at : at + 3].copy(), np.minimum(np.diag(track.P)[at : at + 3] + doubt, fresh)
 
 
-def take_in(lights: Lights, epoch: LightEpoch, middle: float, drop: bool) -> list[Sight]:
+def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
     """The epoch's links into every hypothesis; returns how the likeliest one sees them."""
     back = lights_motion.back_to(lights, middle)
     way, dt = lights.course.way - lights.way_epoch, middle - lights.t_epoch
@@ -221,7 +209,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float, drop: bool) -> lis
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
-        likelihood = absorb(lights, track, seen, view_of(lights, back), drop)
+        likelihood = absorb(lights, track, seen, view_of(lights, back))
         track.weight += likelihood if way > 0.0 else 0.0  # standing still, strengths say nothing of the heading
         views.append((track, seen))
     if len(lights.tracks) > 1:
@@ -243,14 +231,14 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
     ekf.fade(track.x, track.P, n, keep, grow)
 
 
-def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, drop: bool) -> float:
+def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array) -> float:
     """One hypothesis takes the links in; iterated while the step is so large that the equations bend."""
     kept, links = table(lights, track, seen)
     if not kept:
         return 0.0
     out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
     ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
-    judge(lights, track, kept, out, drop)
+    judge(lights, track, kept, out)
     x0, P0 = track.x.copy(), track.P.copy()
     likelihood = ekf_links.absorb(track.x, track.P, track.n, x0, links, out)
     around = x0

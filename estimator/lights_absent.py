@@ -25,7 +25,8 @@ def absent(lights: Lights, links: list[Link], pose: Array, fix: Fix) -> list[Lin
     receiver = lights.survey.receiver
     slope = WELL_INSIDE * math.tan(min(receiver.half_fov_rad, 1.3))
     missing = set()
-    for lamp_id, lamp in lights.catalogue.by_id.items():
+    for lamp_id in lights.catalogue.surveyed:
+        lamp = lights.catalogue.by_id[lamp_id]
         if lamp_id in heard or lamp.code in unsure:
             lights.absent.pop(lamp_id, None)
         elif math.hypot(lamp.x - x, lamp.y - y) < slope * (lamp.z - receiver.z):

@@ -50,6 +50,7 @@ class Catalogue:
     Attributes:
         by_id, by_code: the lamps. surveyed: numbers of those that the survey names. rows: by number, for the kernels.
         rims: by number, what each gives at the very edge of view of a level receiver, A.
+        heard: by number, when each that the survey does not name was last heard, longest ago first.
     """
 
     depth: float
@@ -59,6 +60,7 @@ class Catalogue:
     surveyed: set[int] = field(default_factory=set)
     rows: dict[int, Array] = field(default_factory=dict)
     rims: dict[int, float] = field(default_factory=dict)
+    heard: dict[int, float] = field(default_factory=dict)
 
     def add(self, lamp: Lamp) -> None:
         """Take a lamp in; one of the same number is replaced."""
@@ -70,12 +72,25 @@ class Catalogue:
         self.rows[lamp.lamp_id] = np.ascontiguousarray(pack_lamps([lamp], self.depth)[0])
         self.rims[lamp.lamp_id] = rim_amplitude(lamp, self.receiver, self.depth)
 
-    def learn(self, frame: LampFrame, code: int) -> tuple[Lamp, bool]:
+    def touch(self, lamp_id: int, t_mono: float) -> None:
+        """Note that a lamp was heard."""
+        if lamp_id not in self.surveyed:
+            self.heard.pop(lamp_id, None)
+            self.heard[lamp_id] = t_mono
+
+    def drop(self, lamp_id: int) -> None:
+        """Forget a lamp that the survey does not name."""
+        lamp = self.by_id.pop(lamp_id)
+        self.by_code[lamp.code].remove(lamp)
+        del self.rows[lamp_id], self.rims[lamp_id], self.heard[lamp_id]
+
+    def learn(self, frame: LampFrame, code: int, t_mono: float) -> tuple[Lamp, bool]:
         """The lamp that says this of itself, and whether the survey (which wins) knows it otherwise."""
         known = self.by_id.get(frame.lamp_id)
         if known is None or (frame.lamp_id not in self.surveyed and contradicts(frame, code, known)):
             self.add(lamp_of(frame, code))
             known = self.by_id[frame.lamp_id]
+        self.touch(frame.lamp_id, t_mono)
         return known, frame.lamp_id in self.surveyed and contradicts(frame, code, known)
 
     def candidates(self, code: int) -> list[Lamp]:

@@ -44,6 +44,15 @@ FIRST_ERROR = 5.0
 """Variance of a model error at first sight: later, gain and lean have taken up what always is the same in it."""
 STRIKES = 2
 """So often a lamp is learned anew; one that contradicts again stands somewhere else."""
+FADE_M = 100.0
+"""Way with a lamp that fits after which one time that it was learned anew is forgotten: lamps do age."""
+PAROLE_M, PAROLE = 5.0, 2.0
+"""A lamp called moved is used again when it has fitted so far, always within so many sigmas; every time that this is
+done, the next takes twice the way."""
+STRIDE_M = 0.2
+"""Way between two epochs that counts at most: what was driven out of a lamp's sight says nothing of it."""
+FORGET_S, DESCRIBED = 3600.0, 1024
+"""A lamp known by its own word only is forgotten when unheard for so long, or as the longest unheard of so many."""
 
 
 @dataclass(slots=True, eq=False)
@@ -92,11 +101,13 @@ def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]
         sight = Sight(code, amplitude, variance)
         found.append(sight)
         if frame is not None:
-            sight.lamp, sight.contradicted = lights.catalogue.learn(frame, code)
+            sight.lamp, sight.contradicted = lights.catalogue.learn(frame, code, lights.course.t_mono)
             alone = True
         else:
             sight.lamp, alone = nearest(lights, code, x, y)
             alone = alone and not flags & TWIN_FLAG
+            if sight.lamp is not None:
+                lights.catalogue.touch(sight.lamp.lamp_id, lights.course.t_mono)
         if sight.lamp is None:
             continue
         if flags & FAINT_FLAG or amplitude <= lights.settings.faint * math.sqrt(variance):
@@ -198,7 +209,7 @@ def view_of(lights: Lights, back: Array) -> Array:
     return np.concatenate([rx, back, (model.ln, model.floor, model.white, model.edge)])
 
 
-def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, level_drop: bool) -> None:
+def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> None:
     """Decide on every link; what is not to be used gets an infinite noise, what may be an outlier a larger one.
 
     Gating waits until the place is known well; before, a deviation is held against the link only softly, because it
@@ -214,7 +225,7 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, level_dro
             most = (1.0 if row[ekf_links.COS_BETA] < cos_out else TOO_STRONG) * rim_of(lights, track, sight)
             sight.state = REJECTED if gating and sight.amplitude > most else RIM
         elif gating:
-            sight.state = gate(lights, track, sight, level_drop)
+            sight.state = gate(lights, track, sight)
         elif r * r > 4.0 * S:
             out[i, ekf_links.WHITE] += 0.25 * r * r - S
         if sight.state is not ACCEPTED:
@@ -236,17 +247,18 @@ def settled(track: Track) -> bool:
     return bool(P[0, 0] + P[1, 1] < 0.2**2 and P[2, 2] < 0.15**2)
 
 
-def gate(lights: Lights, track: Track, sight: Sight, level_drop: bool) -> LinkState:
+def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:
     """One link's NIS gate, narrower downwards: things in the way only ever take light away."""
     settings, t, way = lights.settings, lights.course.t_mono, lights.course.way
     if sight.lamp is None or sight.residual is None or sight.sigma is None:
         return RIM
     r, sigma = sight.residual, sight.sigma
     watch = track.watches.setdefault(sight.lamp.lamp_id, Watch())
+    step, watch.way_seen = min(way - watch.way_seen, STRIDE_M), way
     if watch.moved:
+        parole(watch, abs(r) < PAROLE * sigma, step)
         return REJECTED
-    low = r < -settings.weak * (0.67 if level_drop else 1.0) * sigma
-    high = r > settings.strong * sigma
+    low, high = r < -settings.weak * sigma, r > settings.strong * sigma
     if low or high:
         watch.t_bad, watch.way_bad = t, way
         if math.isinf(watch.t_run):
@@ -258,7 +270,18 @@ def gate(lights: Lights, track: Track, sight: Sight, level_drop: bool) -> LinkSt
     if t - watch.t_bad < settings.wait_s or way - watch.way_bad < settings.wait_m:
         return OCCLUDED
     watch.t_run = math.inf
+    watch.fitted += step
+    if watch.fitted > FADE_M:
+        watch.fitted, watch.strikes = 0.0, max(watch.strikes - 1, 0)
     return ACCEPTED
+
+
+def parole(watch: Watch, fits: bool, step: float) -> None:
+    """Take back that a lamp was moved when it has fitted for long: nothing else would ever say so."""
+    watch.fitted = watch.fitted + step if fits else 0.0
+    if watch.fitted > PAROLE_M * 2.0 ** min(watch.paroles, 10):
+        watch.moved, watch.fitted, watch.t_run = False, 0.0, math.inf
+        watch.paroles += 1
 
 
 def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
@@ -281,7 +304,8 @@ def distrust(lights: Lights, track: Track) -> None:
         spread = float(track.P[at, at] + track.P[at + 1, at + 1])
         if math.hypot(track.x[at], track.x[at + 1]) < limit + 2.0 * math.sqrt(max(spread, 0.0)):
             continue
-        track.watches.setdefault(lamp_id, Watch()).moved = True
+        watch = track.watches.setdefault(lamp_id, Watch())
+        watch.moved, watch.fitted = True, 0.0
         for j in (at, at + 1):
             ekf.cut(track.P, track.n, j)
             track.x[j], track.P[j, j] = 0.0, lights.settings.model.lean**2
@@ -301,4 +325,22 @@ def relearn(lights: Lights, track: Track) -> None:
             track.P[at, at] = 0.3**2
             watch.t_bad = watch.way_bad = -math.inf
         watch.strikes += 1
-        watch.t_run = math.inf
+        watch.t_run, watch.fitted = math.inf, 0.0
+
+
+def forget(lights: Lights) -> None:
+    """Let go of lamps known by their own word only and long unheard; those in a slot stay."""
+    heard, now = lights.catalogue.heard, lights.course.t_mono
+    oldest = next(iter(heard.values()), now)
+    if now - oldest <= FORGET_S and len(heard) <= DESCRIBED:
+        return
+    slotted = set[int]().union(*(track.slots for track in lights.tracks))
+    free = [lamp_id for lamp_id in heard if lamp_id not in slotted]
+    beyond = len(heard) - DESCRIBED
+    for k, lamp_id in enumerate(free):
+        if k >= beyond and now - heard[lamp_id] <= FORGET_S:
+            break
+        lights.catalogue.drop(lamp_id)
+        lights.gains.pop(lamp_id, None)
+        for track in lights.tracks:
+            track.watches.pop(lamp_id, None)

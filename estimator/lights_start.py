@@ -73,7 +73,9 @@ def seeds(lights: Lights, epoch: LightEpoch) -> list[Lamp]:
     order = [i for i in np.argsort(-epoch.amplitude) if np.isfinite(epoch.amplitude[i])]
     for i in order[:SEEDS]:
         frame, code = epoch.lamps[i], int(epoch.ids[i])
-        lamps = [lights.catalogue.learn(frame, code)[0]] if frame is not None else lights.catalogue.candidates(code)
+        lamps = lights.catalogue.candidates(code)
+        if frame is not None:
+            lamps = [lights.catalogue.learn(frame, code, lights.course.t_mono)[0]]
         out.update({lamp.lamp_id: lamp for lamp in lamps})
     return list(out.values())
 

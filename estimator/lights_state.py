@@ -130,7 +130,8 @@ class Watch:
     Attributes:
         t_bad, way_bad: when it last did. t_run, way_run: when this run of contradictions began, inf if there is none.
         count, total, square: of the residuals in the run. strikes: how often its gain was learned anew for that.
-        moved: it hangs elsewhere than the survey says, and is not used any more.
+        moved: it hangs elsewhere than the survey says, and is not used. paroles: how often that was taken back.
+        fitted: way on which it fitted, m, as far as it still counts. way_seen: when it was last compared.
     """
 
     t_bad: float = -math.inf
@@ -142,6 +143,9 @@ class Watch:
     square: float = 0.0
     strikes: int = 0
     moved: bool = False
+    paroles: int = 0
+    fitted: float = 0.0
+    way_seen: float = -math.inf
 
 
 @dataclass(slots=True, eq=False)
@@ -208,7 +212,6 @@ class Lights:
             they can be, which nothing in the way explains; way_odd: when it last was so.
         absent: by lamp ID, (instant, way) since which it should be received but is not.
         corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
-        level: running mean of the DC channel, A.
         lost: the last start was made necessary by a contradiction.
     """
 
@@ -228,6 +231,5 @@ class Lights:
     absent: dict[int, tuple[float, float]] = field(default_factory=dict)
     corrections: Corrections | None = None
     lean: tuple[float, float] = (0.0, 0.0)
-    level: float | None = None
     lost: bool = False
     result: LightsResult | None = None

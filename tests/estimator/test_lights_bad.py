@@ -49,6 +49,52 @@ def test_a_lamp_that_was_moved_is_rejected_and_does_not_pull_the_pose() -> None:
     assert max(away(result, 0.1 * (k + 1)) for k, result in enumerate(results) if k > 400) < 0.12
 
 
+def test_a_lamp_that_was_moved_and_put_back_is_used_again() -> None:
+    moved = tuple(dataclasses.replace(k, x=k.x + 1.0) if k.lamp_id == 11 else k for k in LAMPS)
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(moved), 100.0)
+    assert filter_.tracks[0].watches[11].moved
+    results = follow(filter_, Room(), 100.0, 100.0)
+    assert LinkState.REJECTED in states_of(results[:200], 11)
+    last = states_of(results[-150:], 11)
+    assert last.count(LinkState.ACCEPTED) > 50
+    assert LinkState.REJECTED not in last
+    assert away(results[-1], 200.0) < 0.06
+
+
+def test_a_lamp_that_stays_moved_gets_ever_fewer_chances() -> None:
+    moved = tuple(dataclasses.replace(k, x=k.x + 0.5) if k.lamp_id == 11 else k for k in LAMPS)
+    filter_ = lf.new_lights(SURVEY)
+    results = follow(filter_, Room(moved), 300.0)
+    heard = states_of(results[1000:], 11)
+    assert heard.count(LinkState.ACCEPTED) < 0.2 * len(heard)
+    assert max(away(result, 0.1 * (k + 1)) for k, result in enumerate(results) if k > 400) < 0.12
+
+
+def near(t: float) -> np.ndarray:
+    """A narrow round drive in the middle of the room: always the same lamps in view."""
+    return circle(t, 1.0, 1.0)
+
+
+def test_a_lamp_that_dims_is_learned_anew_however_often_that_has_happened_before() -> None:
+    """Darker, brighter, and 100 m later darker again: nothing of that is a lamp in another place."""
+
+    def cover(lamp: int, t: float) -> float:
+        return 0.5 if lamp == 11 and (15.0 < t < 45.0 or t > 205.0) else 1.0
+
+    filter_ = lf.new_lights(SURVEY)
+    results = []
+    for _, odometry, epoch in drive(Room(cover=cover), near, 240.0):
+        lf.predict(filter_, odometry)
+        results.append(lf.update(filter_, epoch))
+    assert states_of(results[160:200], 11).count(LinkState.ACCEPTED) == 0
+    assert LinkState.ACCEPTED in states_of(results[400:440], 11)
+    assert LinkState.ACCEPTED in states_of(results[700:720], 11)
+    assert states_of(results[2060:2100], 11).count(LinkState.ACCEPTED) == 0
+    last = [link for link in results[-1].links if link.lamp_id == 11]
+    assert [link.state for link in last] == [LinkState.ACCEPTED]
+
+
 def test_two_lamps_of_one_code_in_view_are_not_used() -> None:
     double = tuple(dataclasses.replace(k, code=5) if k.lamp_id in (6, 7) else k for k in LAMPS)
     filter_ = lf.new_lights(dataclasses.replace(SURVEY, lamps=double))
@@ -84,6 +130,35 @@ def test_without_survey_and_frames_links_are_unsurveyed() -> None:
     result = follow(lf.new_lights(Survey((), RECEIVER)), Room(), 1.0)[-1]
     assert result.fix is Fix.NONE
     assert {link.state for link in result.links} == {LinkState.UNSURVEYED}
+
+
+def test_a_lamp_known_by_its_own_word_only_is_not_missed() -> None:
+    """A wrong frame may name a lamp that there is not."""
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 5.0)
+    epoch = Room().epoch(5.05, circle(5.05))
+    there = LAMPS[int(epoch.ids[2])]
+    ghost = LampFrame(99, there.x + 0.5, there.y, 2.9, 0.05, 70.0)
+    lf.update(filter_, dataclasses.replace(epoch, lamps=(None, None, ghost, *epoch.lamps[3:])))
+    assert 99 in filter_.catalogue.by_id
+    results = follow(filter_, Room(), 30.0, 5.1)
+    assert LinkState.MISSING not in {link.state for result in results for link in result.links}
+
+
+def test_lamps_known_by_their_own_word_only_are_forgotten_when_long_unheard() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    room = Room()
+    for k in range(3000):  # every frame another lamp, none of them ever heard again
+        epoch = room.epoch(0.1 * k, circle(0.0))
+        ghost = LampFrame(1000 + k, 60.0, 60.0, 2.9, 1.5, 70.0)
+        lf.update(filter_, dataclasses.replace(epoch, lamps=(ghost, *epoch.lamps[1:])))
+    assert len(filter_.catalogue.by_id) < 1100 + len(LAMPS)
+    assert sum(len(lamps) for lamps in filter_.catalogue.by_code.values()) == len(filter_.catalogue.by_id)
+    for k in range(10):
+        lf.update(filter_, room.epoch(4300.0 + k, circle(0.0)))
+    slots = set[int]().union(*(track.slots for track in filter_.tracks))
+    assert set(filter_.catalogue.by_id) <= {lamp.lamp_id for lamp in LAMPS} | slots
+    assert {lamp.lamp_id for lamp in LAMPS} <= set(filter_.catalogue.by_id)
 
 
 def test_a_lamp_that_contradicts_the_survey_is_marked_and_the_survey_wins() -> None:
