@@ -18,10 +18,11 @@ def main(args: argparse.Namespace) -> int:
     settings: Config = args.settings
     remarks = []
     if settings.lights.survey:
+        from daemon.photodiode import profile_of
         from daemon.surveyfile import SurveyError, read_survey
 
         try:
-            survey = read_survey(Path(settings.lights.survey))
+            survey = read_survey(Path(settings.lights.survey), profile_of(settings.photodiode))
         except SurveyError as error:
             return cli.fail(f"{error} (`lights.survey` in {args.config} names it)", cli.USAGE)
         remarks.append(f"{settings.lights.survey}: good, {len(survey.lamps)} lamps")

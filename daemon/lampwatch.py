@@ -78,6 +78,7 @@ class LampWatch:
             return
         if lights.block & UNUSABLE:
             self.stalled += BlockFlag.STALLED in lights.block
+            self._pass_on(t_mono)
             return
         received = [link for link in lights.links if link.state not in _UNHEARD]
         states = [link.state for link in received]
@@ -87,7 +88,14 @@ class LampWatch:
             Fault.SURVEY_CONTRADICTED: self._wrong.now(t_mono, _contradicted(lights, states)),
         }
         self._look_at_each(t_mono, lights.links)
-        present = {fault for fault, so in said.items() if so}
+        self._sum_up({fault for fault, so in said.items() if so})
+
+    def _pass_on(self, t_mono: float) -> None:
+        """A block that tells nothing of any lamp; enough of them, and what was said of all lamps holds no longer."""
+        watched = (Fault.NO_LAMPS, self._dark), (Fault.TWIN_LAMPS, self._twin), (Fault.SURVEY_CONTRADICTED, self._wrong)
+        self._sum_up({fault for fault, lasting in watched if lasting.now(t_mono, so=False)})
+
+    def _sum_up(self, present: set[Fault]) -> None:
         lamps = {fault for fault, _ in self.odd.values()} if Fault.SURVEY_CONTRADICTED not in present else set()
         self.faults = frozenset(present | lamps)
 

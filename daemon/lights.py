@@ -1,11 +1,13 @@
 """What the estimator is told of ceiling lights before it starts: the survey, the air interface, the sample clock.
 
-It is read once, kept in a recording's head, and taken from there by a replay: the survey file may have changed since.
+It is read once, kept in a recording, and taken from there by a replay: the survey file may have changed since. All
+of it is in the head of every segment but the residual map, which is large: a file in the recording's folder holds it.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +27,12 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 
 log = logging.getLogger(__name__)
 
-__all__ = ["Lights", "SurveyError", "from_header", "load_lights", "new_state"]
+__all__ = ["Lights", "SurveyError", "from_header", "load_lights", "lost_residuals", "new_state"]
 
 HEADER: Final = "lights"
 """Key of a recording's head."""
+RESIDUALS: Final = "lights.residuals.npz"
+"""File of a recording's folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +51,12 @@ class Lights:
     residuals: bytes = b""
 
     def header(self) -> dict[str, Any]:
-        """What a recording keeps in its head."""
+        """What a recording keeps in the head of every segment."""
         kept = {
             "survey": msgspec.to_builtins(self.survey),
             "profile": self.profile.name,
             "clock_ppm": self.clock_ppm,
-            "residuals": base64.b64encode(self.residuals).decode(),
+            "residuals_sha256": _digest(self.residuals),
         }
         return {HEADER: kept}
 
@@ -65,7 +69,7 @@ def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | No
     """
     path = settings.lights.survey
     profile = profile_of(settings.photodiode)
-    survey = read_survey(Path(path)) if path else Survey(depth=profile.depth)
+    survey = read_survey(Path(path), profile) if path else Survey(depth=profile.depth)
     if not settings.photodiode.fitted:
         return None
     return Lights(survey, profile, clock_ppm, _residuals(Path(path)) if path else b"")
@@ -82,8 +86,10 @@ def _residuals(survey: Path) -> bytes:
         raise SurveyError(f"{path}: cannot be read: {error.strerror}; mend that, or move it away") from error
 
 
-def from_header(header: dict[str, Any]) -> Lights | None:
+def from_header(header: dict[str, Any], folder: Path | None = None) -> Lights | None:
     """What a recording was made with; None where it had no photodiode.
+
+    ``folder`` is where its segments lie; without the residual map in it there is none (:func:`lost_residuals`).
 
     Raises:
         ValueError: it is not of this version.
@@ -93,10 +99,31 @@ def from_header(header: dict[str, Any]) -> Lights | None:
         return None
     try:
         survey = msgspec.convert(kept["survey"], Survey)
-        residuals = base64.b64decode(kept.get("residuals", ""), validate=True)
+        inside = base64.b64decode(kept.get("residuals", ""), validate=True)  # as recordings were written at first
+        residuals = inside or _kept_residuals(folder, kept.get("residuals_sha256", ""))
         return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"], residuals)
     except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
         raise ValueError(f"the recording's lights are not of this version ({error})") from error
+
+
+def lost_residuals(header: dict[str, Any], lights: Lights) -> bool:
+    """Whether a recording was made with a residual map that is not there any more, or not as it was."""
+    return bool(header[HEADER].get("residuals_sha256")) and not lights.residuals
+
+
+def _kept_residuals(folder: Path | None, digest: str) -> bytes:
+    """The residual map in a recording's folder, empty where it is not the one with that digest."""
+    if folder is None or not digest:
+        return b""
+    try:
+        content = (folder / RESIDUALS).read_bytes()
+    except OSError:
+        return b""
+    return content if _digest(content) == digest else b""
+
+
+def _digest(residuals: bytes) -> str:
+    return hashlib.sha256(residuals).hexdigest() if residuals else ""
 
 
 def new_state(lights: Lights | None, settings: Settings | None = None) -> State:

@@ -18,13 +18,14 @@ import numpy as np
 from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.disk import SegmentWriter
-from daemon.lights import Lights
+from daemon.lights import RESIDUALS, Lights
 from daemon.versions import versions
+from daemon.wholefile import write_whole
 from estimator.records import Array, Command, Limits, Order
 from estimator.result import StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
-from hal.errors import HalError
+from hal.errors import DeviceRefused, HalError
 from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
@@ -148,6 +149,17 @@ class Recorder:
         }
         self._clock = clock
         self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header)
+        if lights is not None and lights.residuals:
+            self._keep_residuals(lights.residuals)
+
+    def _keep_residuals(self, residuals: bytes) -> None:
+        """Once beside the segments: they are too large for every head."""
+        try:
+            write_whole(self.disk.folder / RESIDUALS, residuals)
+        except OSError as error:
+            self.disk.close()
+            problem = f"cannot be recorded into: {error.strerror or error}"
+            raise DeviceRefused(str(self.disk.folder), problem, "free space, or name another folder") from error
 
     @property
     def error(self) -> str:

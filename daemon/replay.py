@@ -21,7 +21,7 @@ import msgspec
 from daemon import cli
 from daemon.config import Config, Mount
 from daemon.ledger import Ledger
-from daemon.lights import Lights, SurveyError, from_header, load_lights
+from daemon.lights import Lights, SurveyError, from_header, load_lights, lost_residuals
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused, map_files, tum
 from daemon.sources import Source, open_log, sha256_of
@@ -122,6 +122,8 @@ def config_for(source: Source, config: Config, given: Given) -> Config:
 def lights_for(source: Source, used: Config, given: Given) -> Lights | None:
     """What the estimator is told of lights: as recorded, unless a person has asked for another survey or none.
 
+    The recorded sample clock counts in any case, except for another air interface than the recorded one.
+
     Raises:
         DataInvalid: what was recorded, or the survey asked for, cannot be used.
     """
@@ -129,9 +131,29 @@ def lights_for(source: Source, used: Config, given: Given) -> Lights | None:
         return None
     asked = given.file or any(key.startswith(("lights.", "photodiode.")) for key in given.keys)
     try:
-        return load_lights(used) if asked else from_header(source.header)
+        return load_lights(used, _recorded_clock(source, used)) if asked else _recorded_lights(source)
     except (SurveyError, ValueError) as error:
         raise DataInvalid(str(source.path), str(error), "name a survey with --set lights.survey=FILE") from error
+
+
+def _recorded_lights(source: Source) -> Lights | None:
+    folder = source.files[0].parent
+    lights = from_header(source.header, folder)
+    if lights is not None and lost_residuals(source.header, lights):
+        source.report.notes.append(
+            f"the residual map it was made with is not in {folder} any more, or damaged: replayed without it"
+        )
+    return lights
+
+
+def _recorded_clock(source: Source, used: Config) -> float | None:
+    """The sample clock that the recorded run was told, in ppm; None where it cannot be that of this run."""
+    try:
+        recorded = from_header(source.header)
+    except ValueError:
+        return None
+    same = recorded is not None and recorded.profile.name == used.photodiode.profile
+    return recorded.clock_ppm if recorded is not None and same else None
 
 
 def _laid_over(tree: dict[str, Any], config: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:

@@ -6,10 +6,8 @@ that does not belong to it, is damaged, or is of another version is refused by n
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
-import os
 import struct
 import zipfile
 import zlib
@@ -19,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from daemon.surveyfile import dump
+from daemon.wholefile import write_whole
 from estimator.lamps import Survey
 from estimator.residual import ResidualMap
 
@@ -47,16 +46,9 @@ def write_residuals(path: Path, residuals: ResidualMap, survey: Survey) -> None:
     file = io.BytesIO()
     facts = {"version": np.array([VERSION]), "survey": np.array(digest(survey)), "check": np.array(_check(arrays))}
     np.savez_compressed(file, allow_pickle=False, **arrays, **facts)
-    beside = path.with_name(f".{path.name}.part")
     try:
-        with beside.open("wb") as out:
-            out.write(file.getvalue())
-            out.flush()
-            os.fsync(out.fileno())
-        beside.replace(path)
+        write_whole(path, file.getvalue())
     except OSError as error:
-        with contextlib.suppress(OSError):
-            beside.unlink(missing_ok=True)
         raise ResidualError(f"cannot write {path}: {error.strerror}; free space or name another folder") from error
 
 

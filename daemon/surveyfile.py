@@ -7,10 +7,8 @@ the key and what was expected. The frame is the survey's, which becomes the map 
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import math
-import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -20,6 +18,8 @@ from typing import Annotated, Any, Final
 import msgspec
 from msgspec import Meta
 
+from daemon.wholefile import write_whole
+from estimator.cdma_profile import PROFILES, Profile
 from estimator.lamps import Lamp, Receiver, Survey
 
 Slope = Annotated[float, Meta(ge=-1.0, le=1.0)]
@@ -35,6 +35,15 @@ HEADROOM_M: Final = 0.2
 DECIMALS: Final = 6
 
 
+def last_code(profile: Profile) -> int:
+    """The highest code number of an air interface; the lowest is 0 (`estimator.codes`)."""
+    return profile.length + 1
+
+
+_LAST_CODE: Final = max(map(last_code, PROFILES.values()))
+"""Of any: which of them a file is for is said elsewhere."""
+
+
 class SurveyError(Exception):
     """The survey cannot be used or written; the text says where, what was expected and what to do."""
 
@@ -43,7 +52,7 @@ class LampEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """One lamp as the file has it."""
 
     lamp_id: Annotated[int, Meta(ge=0, le=65535, description="the lamp's number in the building, unique")]
-    code: Annotated[int, Meta(ge=0, le=128, description="number of the CDMA code it sends")]
+    code: Annotated[int, Meta(ge=0, le=_LAST_CODE, description="number of the CDMA code it sends")]
     x: Annotated[Metres, Meta(description="metres, luminous centre")]
     y: Annotated[Metres, Meta(description="metres, luminous centre")]
     z: Annotated[float, Meta(ge=0.5, le=100.0, description="metres above the floor")]
@@ -100,7 +109,10 @@ class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     floor: Annotated[float, Meta(ge=0.0, le=0.5, description="diffuse light, part of a lamp's own at its nadir")] = (
         _SURVEY.floor
     )
-    depth: Annotated[float, Meta(ge=0.002, le=0.95, description="modulation depth of the lamps")] = _SURVEY.depth
+    depth: (
+        Annotated[float, Meta(ge=0.002, le=0.95, description="modulation depth of the lamps; default: the profile's")]
+        | None
+    ) = None
     receiver: ReceiverEntry | None = None
 
     def __post_init__(self) -> None:
@@ -112,10 +124,15 @@ class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         """The receiver, a plain one where the file does not say."""
         return self.receiver or ReceiverEntry()
 
-    def survey(self) -> Survey:
-        """As the estimator takes it; lamps in order of their numbers."""
+    def survey(self, profile: Profile | None) -> Survey:
+        """As the estimator takes it; lamps in order of their numbers, the profile's depth where the file says none."""
         lamps = sorted((entry.lamp() for entry in self.lamp), key=lambda lamp: lamp.lamp_id)
-        return Survey(tuple(lamps), self.eye.receiver(), self.floor, self.depth)
+        return Survey(tuple(lamps), self.eye.receiver(), self.floor, self._depth(profile))
+
+    def _depth(self, profile: Profile | None) -> float:
+        if self.depth is not None:
+            return self.depth
+        return _SURVEY.depth if profile is None else profile.depth
 
 
 def order_of(half_angle_deg: float) -> float:
@@ -128,11 +145,16 @@ def residuals_beside(survey: Path) -> Path:
     return survey.with_suffix(".residuals.npz")
 
 
-def read_survey(path: Path) -> Survey:
+def read_survey(path: Path, profile: Profile | None = None) -> Survey:
     """Read a survey.
 
+    Args:
+        path: of the file.
+        profile: air interface the lamps have to have; None: any, and depth is profile A's where the file says none.
+
     Raises:
-        SurveyError: missing, unreadable, not TOML, an unknown key, a wrong or implausible value, a lamp twice.
+        SurveyError: missing, unreadable, not TOML, an unknown key, a wrong or implausible value, a lamp twice, a code
+            that the profile does not have.
     """
     text = _read(path)
     try:
@@ -142,7 +164,9 @@ def read_survey(path: Path) -> Survey:
     except msgspec.ValidationError as error:
         raise SurveyError(_explain(path, text, str(error))) from None
     _check_lamps(path, text, tree)
-    return tree.survey()
+    if profile is not None:
+        _check_codes(path, text, tree, profile)
+    return tree.survey(profile)
 
 
 def write_survey(
@@ -162,17 +186,9 @@ def write_survey(
     """
     if path.exists() and not force:
         raise SurveyError(f"{path} exists: name another file, or ask for it to be replaced with --force")
-    beside = path.with_name(f".{path.name}.part")
     try:
-        with beside.open("w", encoding="utf-8") as file:
-            file.write(dump(survey, notes, remarks or {}))
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-        _sync_folder(path.parent)
+        write_whole(path, dump(survey, notes, remarks or {}).encode())
     except OSError as error:
-        with contextlib.suppress(OSError):
-            beside.unlink(missing_ok=True)
         raise SurveyError(f"cannot write {path}: {error.strerror}; free space or name another file") from error
 
 
@@ -230,15 +246,6 @@ def _read(path: Path) -> str:
         raise SurveyError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make the new name itself survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def _check_lamps(path: Path, text: str, tree: SurveyTree) -> None:
     """What only shows when all lamps are looked at together; raises `SurveyError`."""
     seen: dict[int, int] = {}
@@ -252,6 +259,16 @@ def _check_lamps(path: Path, text: str, tree: SurveyTree) -> None:
         for other in tree.lamp[:index]:
             if math.dist((entry.x, entry.y, entry.z), (other.x, other.y, other.z)) < NEAREST_M:
                 raise SurveyError(f"{place}: hangs where lamp {other.lamp_id} hangs; correct or delete one of them")
+
+
+def _check_codes(path: Path, text: str, tree: SurveyTree, profile: Profile) -> None:
+    """Whether the profile has the lamps' codes; raises `SurveyError`."""
+    for index, entry in enumerate(tree.lamp):
+        if entry.code > last_code(profile):
+            raise SurveyError(
+                f"{path}{_at(text, index, key='code')}: lamp {entry.lamp_id}: code {entry.code} is none of profile "
+                f"{profile.name}, which has codes 0 to {last_code(profile)}; correct it, or `photodiode.profile`"
+            )
 
 
 def _explain(path: Path, text: str, message: str) -> str:

@@ -52,6 +52,18 @@ def test_a_bad_survey_is_refused_with_its_place(
             assert "Traceback" not in said.err
 
 
+@pytest.mark.parametrize(("code", "profile", "last"), [(129, "A", 128), (65, "B", 64), (513, "D", 512)])
+def test_a_code_that_the_profile_does_not_have_is_refused(
+    tmp_path: Path, code: int, profile: str, last: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, expected in ((last, cli.OK), (code, cli.USAGE)):
+        file = write(tmp_path, SURVEY.replace("code = 17", f"code = {number}"))
+        assert cli.main(["check", str(file), "--set", f"photodiode.profile={profile}"]) == expected
+    said = capsys.readouterr().err
+    assert "lights.toml:4: " in said
+    assert str(last) in said
+
+
 def test_a_survey_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path)
     (tmp_path / "lights.toml").unlink()

@@ -125,6 +125,30 @@ def test_blocks_without_strengths_are_counted_and_say_nothing_of_lamps() -> None
     assert watch.watch.stalled == 400, "darkness is no stall"
 
 
+@pytest.mark.parametrize(
+    ("states", "fault"),
+    [((), Fault.NO_LAMPS), ((TWIN, TWIN), Fault.TWIN_LAMPS), ((UNSURVEYED,) * 3, Fault.SURVEY_CONTRADICTED)],
+)
+@pytest.mark.parametrize("flag", [BlockFlag.SATURATED, BlockFlag.FLAT])
+def test_what_is_said_of_all_lamps_does_not_outlast_the_light(
+    states: tuple[LinkState, ...], fault: Fault, flag: BlockFlag
+) -> None:
+    watch = Watch()
+    watch.see(12.0, ACCEPTED, ACCEPTED, MISSING)
+    watch.see(12.0, *states)
+    assert fault in watch.watch.faults
+
+    def blind(seconds: float) -> frozenset[Fault]:
+        for _ in range(round(seconds / EPOCH_S)):
+            watch.t += EPOCH_S
+            watch.watch.on_step(watch.t, lights((), block=flag), fresh=True)
+        return watch.watch.faults
+
+    assert fault in blind(1.0), "a moment's flash changes nothing"
+    assert blind(3.0) == {Fault.LAMP_DEAD}, "a lamp that was found dead is dead in the dark, too"
+    assert fault not in watch.see(2.0, *states), "it has to last anew"
+
+
 def test_a_step_without_a_block_is_no_epoch() -> None:
     watch = LampWatch()
     for t in range(100):

@@ -7,13 +7,14 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daemon.budget import FixedBudget
-from daemon.config import NO_DEVICE, Config, LidarConfig, ModbusConfig, PhotodiodeConfig
-from daemon.lights import Lights, load_lights
+from daemon.config import NO_DEVICE, Config, LidarConfig, LightsConfig, ModbusConfig, PhotodiodeConfig
+from daemon.lights import Lights, SurveyError, load_lights
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import LightPicture, Snapshot
 from daemon.worker import CycleWorker
@@ -198,6 +199,22 @@ def test_a_lidar_that_goes_leaves_the_pace_to_the_lights_and_takes_it_back(caplo
         assert bench.daemon.cycle.inbox.blocks_dropped == 0
 
     run_daemon(scenario, lidar=True)
+
+
+def test_a_survey_is_read_for_the_configured_profile(tmp_path: Path) -> None:
+    path = tmp_path / "lights.toml"
+
+    def load(code: int, profile: str) -> Lights | None:
+        path.write_text(f"lamp = [ {{ lamp_id = 1, code = {code}, x = 0.0, y = 0.0, z = 2.6 }} ]")
+        photodiode = PhotodiodeConfig(bus=BUS, profile=profile)
+        return load_lights(Config(photodiode=photodiode, lights=LightsConfig(survey=str(path))))
+
+    lights = load(64, "B")
+    assert lights is not None
+    assert lights.survey.depth == PROFILE_B.depth
+    assert load(512, "D") is not None
+    with pytest.raises(SurveyError, match=r"lamp 1: code 65 is none of profile B, which has codes 0 to 64"):
+        load(65, "B")
 
 
 def test_lamps_that_describe_themselves_are_modulated_as_the_profile_says() -> None:

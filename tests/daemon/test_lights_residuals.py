@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import base64
+import errno
+import json
 import logging
+import threading
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
+import daemon.record
+from daemon import disk
 from daemon.config import Config, LightsConfig, PhotodiodeConfig
-from daemon.lights import Lights, from_header, load_lights, new_state
+from daemon.lights import RESIDUALS, Lights, from_header, load_lights, lost_residuals, new_state
+from daemon.record import Recorder
 from daemon.residualfile import write_residuals
 from daemon.surveyfile import SurveyError, residuals_beside, write_survey
 from estimator.cdma_profile import PROFILE_A
 from estimator.lamps import Survey
 from estimator.residual import ResidualMap
+from hal.clock import SystemClock
+from hal.errors import DeviceRefused
+from hal.replay.recording import Kind, open_recording
 from tests.daemon.lightroom import BUS, SURVEY
+from tests.daemon.test_record import wait_for
 
 SHIFT = 0.1
 
@@ -61,12 +71,50 @@ def test_without_a_map_there_are_no_corrections(tmp_path: Path) -> None:
     assert light.filter.corrections is None
 
 
-def test_a_recording_keeps_the_map(tmp_path: Path) -> None:
+def test_a_recording_keeps_the_map_once_and_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(disk, "WRITE_S", 0.005)
     lights = load_lights(with_map(tmp_path))
     assert lights is not None
-    assert from_header(msgspec.json.decode(msgspec.json.encode(lights.header()))) == lights
-    older = {"lights": {key: value for key, value in lights.header()["lights"].items() if key != "residuals"}}
-    assert from_header(older) == replace(lights, residuals=b"")
+    large = replace(lights, residuals=lights.residuals + bytes(200_000))
+    recorder = Recorder(tmp_path / "rec", Config(), SystemClock(), large)
+    recorder.disk._segment_bytes = 1000
+    for number in range(4):
+        recorder.disk.put(Kind.RX, 0, float(number), bytes(2000))
+        wait_for(lambda n=number: recorder.disk.records == n + 1)
+    recorder.close()
+    recording = open_recording(tmp_path / "rec")
+    assert len(recording.segments) == 4
+    assert max(file.stat().st_size for file in recording.segments) < 10_000
+    folder = recording.segments[0].parent
+    header = json.loads(json.dumps(recording.header))
+    assert from_header(header, folder) == large
+    recording.segments[0].unlink()
+    later = open_recording(tmp_path / "rec")
+    assert from_header(later.header, folder) == large, "whole segments may be taken away"
+    for spoil in (lambda file: file.write_bytes(large.residuals[:-1]), Path.unlink):
+        spoil(folder / RESIDUALS)
+        without = from_header(later.header, folder)
+        assert without == replace(large, residuals=b"")
+        assert lost_residuals(later.header, without)
+
+
+def test_a_recording_with_the_map_in_its_head_reads_as_before(tmp_path: Path) -> None:
+    lights = load_lights(with_map(tmp_path))
+    assert lights is not None
+    kept = {key: value for key, value in lights.header()["lights"].items() if key != "residuals_sha256"}
+    older = {"lights": {**kept, "residuals": base64.b64encode(lights.residuals).decode()}}
+    assert from_header(json.loads(json.dumps(older)), tmp_path) == lights
+    assert from_header({"lights": kept}, tmp_path) == replace(lights, residuals=b"")
+
+
+def test_no_room_for_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(daemon.record, "write_whole", full)
+    with pytest.raises(DeviceRefused, match="No space left on device"):
+        Recorder(tmp_path, Config(), SystemClock(), Lights(SURVEY, PROFILE_A, None, b"a map"))
+    assert "lumiloop-disk" not in [thread.name for thread in threading.enumerate()]
 
 
 @pytest.mark.parametrize(

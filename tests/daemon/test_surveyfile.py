@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.surveyfile import SurveyError, dump, order_of, read_survey, write_survey
+from estimator.cdma_profile import PROFILE_A, PROFILE_B, PROFILE_D, Profile
+from estimator.codes import gold_codes
 from estimator.lamps import Lamp, Receiver, Survey
 
 EXAMPLE = Path(__file__).parents[2] / "systemd" / "lights" / "room-of-16.toml"
@@ -42,7 +44,7 @@ def finite(low: float, high: float) -> st.SearchStrategy[float]:
 lamps = st.builds(
     Lamp,
     lamp_id=st.integers(0, 65535),
-    code=st.integers(0, 128),
+    code=st.integers(0, 512),
     x=finite(-500, 500),
     y=finite(-500, 500),
     z=finite(6.5, 20),
@@ -105,7 +107,7 @@ def test_tables_and_half_angle(tmp_path: Path) -> None:
 WRONG = [
     ("x = 1.0\n", "x = nan\n", ":5", ">= -10000.0 - at `$.lamp[0].x` (metres, luminous centre)"),
     ("x = 1.0\n", "x = inf\n", ":5", "<= 10000.0"),
-    ("code = 17\nx = 1.0", "code = 129\nx = 1.0", ":4", "number of the CDMA code"),
+    ("code = 17\nx = 1.0", "code = 513\nx = 1.0", ":4", "number of the CDMA code"),
     ("code = 17\nx = 1.0", "code = -1\nx = 1.0", ":4", "code"),
     ("lamp_id = 4", "lamp_id = 2", ":9", "lamp 2: that `lamp_id` is taken already by line 2"),
     ("lamp_id = 4", 'lamp_id = "4"', ":3", "int"),
@@ -140,6 +142,33 @@ def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, line: str, w
     text = str(error.value)
     assert text.startswith(f"{path}{line}: "), text
     assert words in text
+
+
+PROFILES = (PROFILE_A, PROFILE_B, PROFILE_D)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_codes_are_those_of_the_profile(tmp_path: Path, profile: Profile) -> None:
+    path = tmp_path / "lights.toml"
+    last = len(gold_codes(profile.degree)) - 1
+    path.write_text(GOOD.replace("code = 17", f"code = {last}", 1))
+    assert read_survey(path, profile).lamps[1].code == last
+    path.write_text(GOOD.replace("code = 17", f"code = {last + 1}", 1))
+    with pytest.raises(SurveyError) as error:
+        read_survey(path, profile)
+    words = f":4: lamp 4: code {last + 1} is none of profile {profile.name}, which has codes 0 to {last}; "
+    if profile is PROFILE_D:
+        words = ":4: Expected `int` <= 512"
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_depth_is_the_profiles_unless_the_file_says_one(tmp_path: Path, profile: Profile) -> None:
+    path = tmp_path / "lights.toml"
+    path.write_text(GOOD.replace("depth = 0.3\n", ""))
+    assert read_survey(path, profile).depth == profile.depth
+    path.write_text(GOOD.replace("depth = 0.3\n", "depth = 0.21\n"))
+    assert read_survey(path, profile).depth == 0.21
 
 
 def test_lines_are_found_in_the_written_form(tmp_path: Path) -> None:

@@ -11,12 +11,18 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from daemon import cli
 from daemon.budget import FixedBudget
-from daemon.lights import Lights, from_header
+from daemon.configfile import dump
+from daemon.lights import RESIDUALS, Lights, from_header
 from daemon.main import Daemon
 from daemon.record import Recorder, decode_cycle
+from daemon.replay import Given, lights_for
+from daemon.residualfile import write_residuals
+from daemon.sources import open_log
+from daemon.surveyfile import write_survey
 from estimator.cdma_profile import PROFILE_A
 from estimator.records import Limits
 from hal.clock import run_virtual
@@ -25,6 +31,7 @@ from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
 from hal.replay.report import LogReport
 from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.test_lights import LIDAR, Bench, decoded, settings
+from tests.daemon.test_lights_residuals import even_map
 
 
 class UnevenBudget(FixedBudget):
@@ -152,6 +159,41 @@ def test_another_survey_may_be_asked_for(tmp_path: Path, capsys: pytest.CaptureF
     assert "no such survey" in capsys.readouterr().err
     without = replay(tmp_path / "rec", tmp_path / "out", "--set", "photodiode.bus=")
     assert without["counts"]["poses"]
+
+
+def test_the_recorded_sample_clock_counts_whatever_else_is_asked_for(tmp_path: Path) -> None:
+    bench = record(tmp_path / "rec", calm, lidar=False)
+    write_survey(tmp_path / "lights.toml", SURVEY)
+    (tmp_path / "robot.toml").write_text(dump(settings(False, True)) + "\n")
+    survey = f"lights.survey={tmp_path / 'lights.toml'}"
+    for options in (["--set", survey], ["--config", str(tmp_path / "robot.toml"), "--set", survey]):
+        summary = replay(tmp_path / "rec", tmp_path / "out", *options)
+        assert summary["recorded_run"]["cycles"] == bench.daemon.cycle.cycles
+        assert summary["recorded_run"]["differ"] == 0, summary["recorded_run"]
+
+
+def test_the_sample_clock_of_another_air_interface_is_another(tmp_path: Path) -> None:
+    record(tmp_path / "rec", calm, lidar=False)
+    source = open_log(tmp_path / "rec")
+    for profile, clock in (("A", 12.5), ("B", None)):
+        config = settings(False, True)
+        used = replace(config, photodiode=replace(config.photodiode, profile=profile))
+        lights = lights_for(source, used, Given(True))
+        assert lights is not None
+        assert (lights.profile.name, lights.clock_ppm) == (profile, clock)
+
+
+def test_a_residual_map_that_went_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_residuals(tmp_path / "map.npz", even_map(SURVEY), SURVEY)
+    lights = Lights(SURVEY, PROFILE_A, 12.5, (tmp_path / "map.npz").read_bytes())
+    record(tmp_path / "rec", calm, lidar=False, lights=lights)
+    (kept,) = (tmp_path / "rec").rglob(RESIDUALS)
+    whole = replay(tmp_path / "rec", tmp_path / "out")
+    assert whole["recorded_run"]["differ"] == 0
+    assert "residual map" not in capsys.readouterr().err
+    kept.unlink()
+    replay(tmp_path / "rec", tmp_path / "out")
+    assert f"the residual map it was made with is not in {kept.parent} any more" in capsys.readouterr().err
 
 
 def test_lights_of_another_version_are_refused_by_name() -> None:
