@@ -1,7 +1,8 @@
 """`lumiloop calibrate REC`: what lamps and receiver really are, from a recorded drive, with uncertainties.
 
 Prints residuals before and after and every parameter with its sigma, writes the survey anew with the residual map
-beside it, and a picture. Nothing that is there is overwritten unless ``--force`` says so.
+beside it, and a picture; for wheels and laser mount the configuration anew (`daemon/wheels.py`). Nothing that is there
+is overwritten unless ``--force`` says so.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from daemon import cli
+from daemon.configfile import ConfigError, refuse_overwriting
 from daemon.fitplot import draw_calibration
 from daemon.replay import Given
 from daemon.residualfile import ResidualError, write_residuals
 from daemon.surveyfile import SurveyError, read_survey, residuals_beside, write_survey
 from daemon.teach import Drive, heard, read_drive, rows_for
-from daemon.wheels import report_wheels
+from daemon.wheels import calibrate_wheels
 from estimator.align import Unaligned, align
 from estimator.calibrate import Calibrated, Estimate, TooLittle, calibrate
 from estimator.calibrate_problem import COMMONS, Common, Priors, placed
@@ -30,6 +32,8 @@ from estimator.residual import ResidualMap, learn
 from estimator.survey import Heard, survey
 from hal.errors import HalError
 
+SURVEY_OUT = Path("lights-calibrated.toml")
+CONFIG_OUT = Path("lumiloop-calibrated.toml")
 FRAME = Priors(frame=0.15, frame_yaw=0.05)
 """The alignment found from lamp places is good to this."""
 
@@ -37,25 +41,26 @@ FRAME = Priors(frame=0.15, frame_yaw=0.05)
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
+    wheels = args.odometry or args.lidar_mount
+    args.out = args.out or (CONFIG_OUT if wheels else SURVEY_OUT)
     try:
+        refuse_overwriting(args.out, args.force)  # before the work is done, not after it
         drive = read_drive(args.log, args.settings, Given(args.config is not None, keys))
         if drive.stopped:
             sys.stderr.write(f"lumiloop: {drive.stopped}; the drive up to there is used\n")
-        if args.odometry or args.lidar_mount:
-            sys.stdout.write(report_wheels(drive, args.odometry, args.lidar_mount))
-            return cli.OK
+        if wheels:
+            return calibrate_wheels(drive, args)
         return _lights(args, drive)
-    except (HalError, SurveyError, ResidualError, TooLittle, Unaligned) as error:
+    except (HalError, ConfigError, SurveyError, ResidualError, TooLittle, Unaligned) as error:
         return cli.fail(f"{args.log}: {error}" if isinstance(error, ValueError) else str(error))
 
 
 def _lights(args: argparse.Namespace, drive: Drive) -> int:
-    given = read_survey(args.survey) if args.survey else drive.survey
+    given = read_survey(args.survey, drive.profile) if args.survey else drive.survey
     if not given.lamps:
         raise SurveyError(
             f"{drive.path}: recorded without a survey; name one with --survey, or make one: lumiloop survey"
         )
-    _refuse_overwriting(args.out, args.force)
     strengths = heard(drive)
     start = np.array(args.start) if args.start else found_frame(given, strengths)
     if args.start:
@@ -69,12 +74,6 @@ def _lights(args: argparse.Namespace, drive: Drive) -> int:
     write_residuals(beside, residuals, found.survey)
     sys.stdout.write(f"written: {args.out}, {beside}\n{draw_calibration(found, args.out.with_suffix('.png'))}\n")
     return cli.OK
-
-
-def _refuse_overwriting(out: Path, force: bool) -> None:
-    """Before the work is done, not after it."""
-    if out.exists() and not force:
-        raise SurveyError(f"{out} exists: name another file with --out, or ask for it to be replaced with --force")
 
 
 def found_frame(given: Survey, strengths: Heard) -> Array:

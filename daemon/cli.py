@@ -129,23 +129,22 @@ def _calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="REC", help="recording of a teach drive (lumiloop run --record)")
     parser.add_argument("--survey", type=Path, metavar="FILE", help="survey to start from; default: the recording's")
     parser.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "DEG"), help="where the drive began in it")
-    parser.add_argument("--odometry", action="store_true", help="wheel scale and track instead of lights")
+    parser.add_argument("--odometry", action="store_true", help="wheel scale and track, instead of lights")
     parser.add_argument("--lidar-mount", action="store_true", help="where the lidar sits, instead of lights")
-    _written(parser, "lights-calibrated.toml")
+    other = "with --odometry or --lidar-mount the configuration, lumiloop-calibrated.toml"
+    _written(parser, f"survey to write, default lights-calibrated.toml; {other}")
     parser.set_defaults(body=_later("daemon.calibrate", "main"))
 
 
 def _survey(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="REC", help="recording of a drive under the lamps")
     parser.add_argument("--height", type=float, metavar="M", help="of the lamps above the floor; default: estimated")
-    _written(parser, "lights.toml")
+    _written(parser, "survey to write; default: lights.toml", Path("lights.toml"))
     parser.set_defaults(body=_later("daemon.survey", "main"))
 
 
-def _written(parser: argparse.ArgumentParser, name: str) -> None:
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", default=Path(name), help=f"survey to write; default: {name}"
-    )
+def _written(parser: argparse.ArgumentParser, what: str, default: Path | None = None) -> None:
+    parser.add_argument("--out", type=Path, metavar="FILE", default=default, help=what)
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
     _config_arguments(parser)
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from daemon.config import Config
+from daemon.wholefile import write_whole
 
 if TYPE_CHECKING:
     from msgspec import inspect
@@ -92,6 +93,32 @@ def dump(config: Config) -> str:
     lines: list[str] = []
     _dump_table(msgspec.to_builtins(config), "", lines)
     return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def write(path: Path, config: Config, notes: Sequence[str] = (), force: bool = False) -> None:
+    """Write the whole resolved tree as a file, whole or not at all; `load` reads it back as an equal tree.
+
+    Args:
+        path: where to.
+        config: what.
+        notes: lines of comment at the head.
+        force: replace a file that is there.
+
+    Raises:
+        ConfigError: there is such a file already, or it cannot be written.
+    """
+    refuse_overwriting(path, force)
+    head = "".join(f"# {note}".rstrip() + "\n" for note in notes)
+    try:
+        write_whole(path, f"{head}\n{dump(config)}".lstrip("\n").encode())
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}; free space or name another file") from error
+
+
+def refuse_overwriting(path: Path, force: bool) -> None:
+    """Raises `ConfigError` where there is a file that nobody asked to be replaced."""
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists: name another file with --out, or ask for it to be replaced with --force")
 
 
 def schema() -> str:

@@ -1,4 +1,4 @@
-"""Pictures of a calibration and of a survey by drive; they need matplotlib, which is an extra."""
+"""Pictures of calibrations and of a survey by drive; they need matplotlib, which is an extra."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from estimator.calibrate import Calibrated
+from estimator.calibrate_wheels import WheelFit
 from estimator.survey import Surveyed
 
 _MISSING: Final = "no picture: matplotlib is not installed (pip install 'lumiloop[plot]')"
@@ -45,6 +46,27 @@ def draw_survey(result: Surveyed, path: Path) -> str:
         axes.errorbar(lamp.x, lamp.y, xerr=sigma[0], yerr=sigma[1], fmt="o", color="C1", markersize=4)
         axes.annotate(f"{lamp.lamp_id} ({lamp.code})", (lamp.x, lamp.y), fontsize=7)
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="lamps: number (code)")
+    return _save(canvas, path)
+
+
+def draw_wheels(fit: WheelFit, path: Path) -> str:
+    """Wheels against laser, step by step, before and after; returns what to tell the user."""
+    canvas = _canvas((9.0, 6.0))
+    if canvas is None:
+        return _MISSING
+    grid = canvas.subplots(2, 2, sharex=True, sharey="row")
+    for n, (title, off) in enumerate((("before", fit.off_before), ("after", fit.off_after))):
+        way, turn = grid[0, n], grid[1, n]
+        way.plot(1e3 * off[:, 0], ".", markersize=3, label="ahead")
+        way.plot(1e3 * off[:, 1], ".", markersize=3, label="to the left")
+        turn.plot(np.degrees(off[:, 2]), ".", markersize=3, color="C2")
+        way.set(title=title)
+        turn.set(xlabel="step of the drive")
+        for axes in (way, turn):
+            axes.axhline(0.0, color="k", linewidth=0.5)
+    grid[0, 0].set_ylabel("wheels less laser, mm")
+    grid[1, 0].set_ylabel("wheels less laser, deg")
+    grid[0, 0].legend()
     return _save(canvas, path)
 
 

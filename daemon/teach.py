@@ -23,6 +23,7 @@ from daemon.sources import Source, open_log
 from estimator import cdma
 from estimator.calibrate_rows import Rows
 from estimator.cdma_epoch import UNUSABLE, LightEpoch
+from estimator.cdma_profile import Profile
 from estimator.lamps import Survey
 from estimator.records import Array
 from estimator.survey import Heard
@@ -44,7 +45,8 @@ class Drive:
         path: of the recording. poses: T_map_base by laser, with stamps. survey: as it was when recorded.
         epochs: decoded, with stamps of their middles on the same clock.
         readings: of the wheels, (n, 4) stamp, x, y, yaw.
-        mount: (x, y, yaw) of the laser on the robot, as it was when recorded.
+        config: the recording's, or the one that was asked for.
+        profile: air interface of the light, None without a photodiode.
         stopped: why reading ended early, empty otherwise.
     """
 
@@ -53,8 +55,15 @@ class Drive:
     survey: Survey
     epochs: list[tuple[float, LightEpoch]] = field(default_factory=list)
     readings: Array = field(default_factory=lambda: np.zeros((0, 4)))
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    config: Config = field(default_factory=Config)
+    profile: Profile | None = None
     stopped: str = ""
+
+    @property
+    def mount(self) -> Array:
+        """(3,) x, y, yaw of the laser on the robot, as the poses were computed with; m and rad."""
+        mount = self.config.lidar.mount
+        return np.array((mount.x, mount.y, np.radians(mount.yaw)))
 
 
 def read_drive(path: Path, settings: Config, given: Given) -> Drive:
@@ -66,9 +75,8 @@ def read_drive(path: Path, settings: Config, given: Given) -> Drive:
     source = open_log(path)
     used = config_for(source, settings, given)
     lights = lights_for(source, used, given)
-    mount = used.lidar.mount
     drive = Drive(path, Trajectory(np.zeros(0), np.zeros((0, 3))), Survey() if lights is None else lights.survey)
-    drive.mount = (mount.x, mount.y, float(np.radians(mount.yaw)))
+    drive.config, drive.profile = used, None if lights is None else lights.profile
     rerun, readings = Rerun(source, used), []
     bridge = None if lights is None else SampleBridge(lights.profile)
     decoder = None if lights is None else cdma.new_decoder(lights.profile, lights.clock_ppm)

@@ -42,6 +42,7 @@ class WheelFit:
     Attributes:
         value, sigma: (6,) by :class:`Wheel`. told: (6,) whether the drive says more than was known.
         before, after: RMS of steps, (m, rad) each. steps: how many.
+        off_before, off_after: (k, 3) wheels less laser of each step, x, y in m and yaw in rad, as the laser sees them.
     """
 
     value: Array
@@ -50,6 +51,8 @@ class WheelFit:
     before: tuple[float, float]
     after: tuple[float, float]
     steps: int
+    off_before: Array
+    off_after: Array
 
 
 def fit_wheels(odometry: Array, laser: Array, mount: Array) -> WheelFit:
@@ -82,9 +85,9 @@ def fit_wheels(odometry: Array, laser: Array, mount: Array) -> WheelFit:
         weight = 1.0 / np.maximum(spread, (1e-4, 1e-4, 1e-4))
     J = np.asarray(found.jac, dtype=np.float64)
     sigma = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    off = _residuals(begin, W, L), _residuals(found.x, W, L)
     return WheelFit(
-        np.asarray(found.x), sigma, tuple((sigma < TOLD * prior).tolist()),
-        _rms(_residuals(begin, W, L)), _rms(_residuals(found.x, W, L)), len(W),
+        np.asarray(found.x), sigma, tuple((sigma < TOLD * prior).tolist()), _rms(off[0]), _rms(off[1]), len(W), *off
     )  # fmt: skip
 
 

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 import daemon.calibrate
 import daemon.survey
 from daemon import cli
+from daemon.config import Config, LidarConfig, Mount
+from daemon.configfile import load
 from daemon.residualfile import ResidualError, read_residuals, write_residuals
 from daemon.results import Trajectory
 from daemon.surveyfile import read_survey, residuals_beside, write_survey
 from daemon.teach import Drive, heard, poses_at
 from estimator.cdma_epoch import BlockFlag, LightEpoch
+from estimator.cdma_profile import PROFILE_B
 from estimator.optics import expected
 from estimator.residual import ResidualMap
+from estimator.se2 import between, compose
 from hal.errors import DataInvalid
 from tests.estimator.teach import drive as way
 from tests.estimator.teach import nominal, real
+from tests.estimator.test_calibrate_wheels import TRUE
+from tests.estimator.test_calibrate_wheels import drive as wheels_and_laser
 
 T0 = 1.7e9
 
@@ -96,11 +104,72 @@ def test_survey_writes_lamps_with_uncertainties(
     assert cli.main(["survey", "teach", "--out", str(out)]) == cli.FAILED
 
 
-def test_wheels_are_reported(played: Drive, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["calibrate", "teach", "--odometry", "--lidar-mount"]) == cli.OK
+@pytest.fixture
+def driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Drive:
+    """Wheels that say too little, and a laser that sits elsewhere than its recording's configuration says."""
+    wheels, laser = wheels_and_laser(1)
+    configured = Mount(x=0.28, y=0.0, yaw=0.0, inverted=True)
+    t, (x, y, yaw) = T0 + 0.05 * np.arange(len(wheels)), (configured.x, configured.y, 0.0)
+    poses = np.array([compose(seen, between(np.array((x, y, yaw)), np.zeros(3))) for seen in laser])
+    drive = Drive(Path("teach"), Trajectory(t, poses), nominal(2))
+    drive.readings = np.column_stack((t, wheels))
+    drive.config = Config(name="r7", lidar=LidarConfig(device="/dev/ttyACM3", mount=configured))
+    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: drive)
+    monkeypatch.chdir(tmp_path)
+    return drive
+
+
+def test_the_mount_is_written_as_a_configuration_with_a_picture(
+    driven: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["calibrate", "teach", "--lidar-mount"]) == cli.OK
     said = capsys.readouterr().out
-    assert "scale         1.0204" in said
-    assert "mount = { x =" in said
+    out = tmp_path / "lumiloop-calibrated.toml"
+    written = load(out)
+    mount = written.lidar.mount
+    assert (mount.x, mount.y) == pytest.approx(TRUE[3:5], abs=0.01)
+    assert mount.yaw == pytest.approx(np.degrees(TRUE[5]), abs=0.3)
+    assert mount.inverted
+    before = driven.config
+    assert msgspec.structs.replace(written, lidar=before.lidar) == before
+    assert msgspec.structs.replace(written.lidar, mount=before.lidar.mount) == before.lidar
+    pasted = tomllib.loads(said[said.index("[lidar.mount]") : said.index("written:")])["lidar"]["mount"]
+    assert pasted == {"x": mount.x, "y": mount.y, "yaw": mount.yaw}
+    assert "scale" not in out.read_text()
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    assert cli.main(["check", str(out)]) == cli.OK
+
+
+def test_what_the_wheels_told_is_at_the_head_of_the_configuration(
+    driven: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "robot.toml"
+    assert cli.main(["calibrate", "teach", "--odometry", "--out", str(out)]) == cli.OK
+    said = capsys.readouterr().out
+    assert "mount" not in said
+    head = [line for line in out.read_text().splitlines() if line.startswith("#")]
+    for name, true in zip(("scale", "turn", "drift"), (TRUE[0], TRUE[1], np.degrees(TRUE[2])), strict=True):
+        (told,) = (line for line in head if line.startswith(f"# {name} "))
+        value, sigma = told.removeprefix(f"# {name}").removesuffix(" deg/m").split("+-")
+        assert float(value) == pytest.approx(true, abs=5.0 * float(sigma) + 1e-4)
+        assert told[2:] in said
+    assert load(out) == driven.config, "nothing but the remarks"
+
+
+def test_a_configuration_is_not_overwritten_unasked(
+    driven: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "robot.toml"
+    out.write_text("name = 'mine'\n")
+    words = ["calibrate", "teach", "--lidar-mount", "--out", str(out)]
+    assert cli.main(words) == cli.FAILED
+    assert "--force" in capsys.readouterr().err
+    assert out.read_text() == "name = 'mine'\n"
+    assert [file.name for file in tmp_path.iterdir()] == ["robot.toml"]
+    assert cli.main([*words, "--force"]) == cli.OK
+    assert load(out).name == "r7"
+    assert cli.main([*words[:-1], str(tmp_path / "nowhere" / "robot.toml")]) == cli.FAILED
+    assert "cannot write" in capsys.readouterr().err
 
 
 def test_what_is_missing_is_said(
@@ -120,6 +189,17 @@ def test_what_is_missing_is_said(
     monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
     assert cli.main(["calibrate", "teach", "--odometry"]) == cli.FAILED
     assert "no odometry in it" in capsys.readouterr().err
+
+
+def test_a_survey_for_another_air_interface_is_refused(
+    played: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = Drive(played.path, played.poses, played.survey, played.epochs, profile=PROFILE_B)
+    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: other)
+    path = tmp_path / "lights.toml"
+    path.write_text("lamp = [ { lamp_id = 7, code = 65, x = 0.0, y = 0.0, z = 2.6 } ]")
+    assert cli.main(["calibrate", "teach", "--survey", str(path), "--out", str(tmp_path / "x.toml")]) == cli.FAILED
+    assert "lamp 7: code 65 is none of profile B, which has codes 0 to 64" in capsys.readouterr().err
 
 
 def test_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

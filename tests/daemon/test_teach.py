@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from daemon import cli
+from daemon.configfile import load
 from daemon.surveyfile import read_survey
 from tests.daemon.teachrun import record
+from tools.sim.harness_light import BUS
 
 
 @pytest.mark.slow
@@ -35,4 +37,6 @@ def test_a_recorded_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     said = capsys.readouterr().out
     assert "not told by this drive" in said
     assert len(read_survey(better).lamps) == len(placed)
-    assert cli.main(["calibrate", str(tmp_path / "teach"), "--odometry", "--lidar-mount"]) == cli.OK
+    wheels = ["--out", str(tmp_path / "robot.toml")]
+    assert cli.main(["calibrate", str(tmp_path / "teach"), "--odometry", "--lidar-mount", *wheels]) == cli.OK
+    assert load(tmp_path / "robot.toml").photodiode.bus == BUS

@@ -10,11 +10,13 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from daemon import cli
 from daemon.budget import FixedBudget
+from daemon.config import Config, Mount
 from daemon.configfile import dump
 from daemon.lights import RESIDUALS, Lights, from_header
 from daemon.main import Daemon
@@ -23,6 +25,7 @@ from daemon.replay import Given, lights_for
 from daemon.residualfile import write_residuals
 from daemon.sources import open_log
 from daemon.surveyfile import write_survey
+from daemon.teach import read_drive
 from estimator.cdma_profile import PROFILE_A
 from estimator.records import Limits
 from hal.clock import run_virtual
@@ -181,6 +184,14 @@ def test_the_sample_clock_of_another_air_interface_is_another(tmp_path: Path) ->
         lights = lights_for(source, used, Given(True))
         assert lights is not None
         assert (lights.profile.name, lights.clock_ppm) == (profile, clock)
+
+
+def test_a_drive_knows_its_configuration_and_its_air_interface(tmp_path: Path) -> None:
+    record(tmp_path, calm, lidar=True)
+    drive = read_drive(tmp_path, Config(), Given())
+    assert (drive.config, drive.profile) == (settings(True, True), PROFILE_A)
+    turned = replace(settings(True, True), lidar=replace(drive.config.lidar, mount=Mount(x=0.2, yaw=90.0)))
+    assert read_drive(tmp_path, turned, Given(keys=("lidar.mount",))).mount == pytest.approx((0.2, 0.0, np.pi / 2))
 
 
 def test_a_residual_map_that_went_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
