@@ -42,6 +42,13 @@ SURPRISE_S = 1.0
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 """What stamps and lever arms make of a moving robot."""
 
+FAR_M, FAR_RAD = 1.5, 0.5
+"""While the laser has held the pose without a break, light that disagrees by less than this is told, not followed: the
+laser does not lose so little, and light that reflects in an unusual place can be off by as much."""
+ROW_M, ACROSS_M = 0.5, 1.0
+"""Lamps that stand less than the former off a line tell the distance from that line only by how weak they are all
+together, which is what is known least: the latter is then allowed for, across the line."""
+
 SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
@@ -61,7 +68,8 @@ class Absolute:
     """The tie of the odom frame to the survey's frame.
 
     Attributes:
-        placed: light has told where the map lies. proved: it was sure of that, or a person said so.
+        placed: light has told where the map lies. proved: it was sure of that, or a person said so. broken: the laser
+            has let go of the pose since, or begun its map anew.
         P, X: see above, both 3x3, odom-aligned axes.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
@@ -73,6 +81,7 @@ class Absolute:
 
     placed: bool = False
     proved: bool = False
+    broken: bool = False
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
     gap: float | None = None
@@ -108,6 +117,7 @@ def on_match(state: State, T_before: Array, P_before: Array, inflated: float) ->
     tie, moving = state.absolute, state.fused
     if tie is None:
         return
+    tie.broken |= blind(state)
     tie.t_match = moving.t_mono
     if not tie.placed:
         return
@@ -132,18 +142,19 @@ def on_lights(state: State, lights: LightsResult) -> None:
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    lights = doubted(tie, lights)
+    lights = across_the_row(state, doubted(tie, lights))
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     R = se2.rotation(state.T_map_odom[2])
     P = R @ tie.P @ R.T
     off = lights.T_map_base - se2.compose(state.T_map_odom, T_odom_base)
     off[2] = se2.wrap(off[2])
     tie.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if tie.placed else None
-    if not tie.placed or _contradicted(state, lights) or _surer(tie, lights):
+    if not tie.placed or _contradicted(state, lights, off) or _surer(tie, lights):
         follow(state, lights, T_odom_base)
     elif lights.fix is Fix.GOOD and tie.odd_since is None:
         gain(state, lights, T_odom_base, off)
-    tie.proved = tie.proved or (lights.fix is Fix.GOOD and tie.odd_since is None)
+    if lights.fix is Fix.GOOD and tie.odd_since is None:
+        tie.proved, tie.broken = True, False
 
 
 def on_order(state: State, command: Command) -> None:
@@ -159,6 +170,7 @@ def on_order(state: State, command: Command) -> None:
         R = se2.rotation(state.T_map_odom[2])
         tie.P, tie.X = R.T @ SAID @ R, np.zeros((3, 3))
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0
+        tie.broken = False
 
 
 def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
@@ -220,6 +232,23 @@ def doubted(tie: Absolute, lights: LightsResult) -> LightsResult:
     return replace(lights, covariance=P * most * most[:, None], gained=lights.gained / factor)
 
 
+def across_the_row(state: State, lights: LightsResult) -> LightsResult:
+    """The lights' result, trusted less across the row where all lamps in use stand in one."""
+    assert state.light is not None
+    lamps = state.light.filter.catalogue.by_id
+    at = np.array([(lamps[k].x, lamps[k].y) for k in lights.accepted if k in lamps]).reshape(-1, 2)
+    if not len(at):
+        return lights
+    values, vectors = np.linalg.eigh(np.cov(at.T, bias=True) if len(at) > 1 else np.zeros((2, 2)))
+    more = np.zeros((3, 3))
+    for k in range(2):  # one lamp is a row both ways
+        n = vectors[:, k]
+        more[:2, :2] += ACROSS_M**2 * math.exp(-max(float(values[k]), 0.0) / ROW_M**2) * np.outer(n, n)
+    P = lights.covariance + more
+    keep = invert3(P) @ lights.covariance
+    return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T))
+
+
 def blind(state: State) -> bool:
     """Whether the laser has not told anything lately."""
     assert state.absolute is not None
@@ -239,10 +268,11 @@ def pose_at(state: State, t_mono: float) -> Array:
     return after[1] if t_mono < after[0] else state.fused.T_odom_base
 
 
-def _contradicted(state: State, lights: LightsResult) -> bool:
-    """Whether light has disagreed with the pose for long enough to be believed.
+def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
+    """Whether light has disagreed with the pose for long enough, and by enough, to be believed.
 
-    Light that is still looking for its place says nothing against a pose that was proved and that the laser holds.
+    Light that is still looking for its place, or that is off by less than the laser could have lost, says nothing
+    against a pose that was proved and that the laser has held since.
     """
     tie = state.absolute
     assert tie is not None
@@ -250,7 +280,9 @@ def _contradicted(state: State, lights: LightsResult) -> bool:
         tie.odd_since = None
         return False
     tie.odd_since = lights.t_mono if tie.odd_since is None else tie.odd_since
-    believed = lights.fix is Fix.GOOD or not tie.proved or blind(state)
+    held = tie.proved and not tie.broken and not blind(state)
+    far = math.hypot(off[0], off[1]) > FAR_M or abs(off[2]) > FAR_RAD
+    believed = not held or (far and lights.fix is Fix.GOOD)
     return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
 
 

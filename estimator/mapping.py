@@ -74,6 +74,8 @@ def update_map(state: State, scan: Scan, points: ScanPoints) -> None:
     """Merge the newest keyframe into the local map, or begin a new one where the old one is lost."""
     newest = state.keyframes[state.anchor]
     lost = state.local is None or state.failures >= PATIENCE
+    if lost and state.absolute is not None:
+        state.absolute.broken = True
     local = localmap.empty(newest.T_odom_keyframe[:2]) if lost or state.local is None else state.local
     state.local = localmap.update(local, newest, lines_of(points), state.settings.map, noise_of(state, scan))
     state.failures = 0
