@@ -45,9 +45,10 @@ TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 FAR_M, FAR_RAD = 1.5, 0.5
 """While the laser has held the pose without a break, light that disagrees by less than this is told, not followed: the
 laser does not lose so little, and light that reflects in an unusual place can be off by as much."""
-ROW_M, ACROSS_M = 0.5, 1.0
-"""Lamps that stand less than the former off a line tell the distance from that line only by how weak they are all
-together, which is what is known least: the latter is then allowed for, across the line."""
+ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2
+"""Lamps that stand less than the first off a line tell the distance from that line only by how weak they are all
+together, which is what is known least: the second is then allowed for across the line, and the third for the heading,
+which is told by how that distance changes."""
 
 SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
@@ -242,8 +243,9 @@ def across_the_row(state: State, lights: LightsResult) -> LightsResult:
     values, vectors = np.linalg.eigh(np.cov(at.T, bias=True) if len(at) > 1 else np.zeros((2, 2)))
     more = np.zeros((3, 3))
     for k in range(2):  # one lamp is a row both ways
-        n = vectors[:, k]
-        more[:2, :2] += ACROSS_M**2 * math.exp(-max(float(values[k]), 0.0) / ROW_M**2) * np.outer(n, n)
+        n, part = vectors[:, k], math.exp(-max(float(values[k]), 0.0) / ROW_M**2)
+        more[:2, :2] += ACROSS_M**2 * part * np.outer(n, n)
+        more[2, 2] = max(float(more[2, 2]), ACROSS_RAD**2 * part)
     P = lights.covariance + more
     keep = invert3(P) @ lights.covariance
     return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T))

@@ -98,7 +98,7 @@ def _groups(heard: Heard, reach: float) -> tuple[list[tuple[int, int, Rows]], tu
     least = WEAKEST * float(np.median(peaks)) if peaks else 0.0
     groups: list[tuple[int, int, Rows]] = []
     left_out = []
-    named = set(heard.lamp_id[heard.lamp_id >= 0].tolist())
+    named, taken = set(heard.lamp_id[heard.lamp_id >= 0].tolist()), set[int]()
     free = iter(k for k in range(1, 65536) if k not in named)
     for code in codes.tolist():
         mine = np.flatnonzero(heard.rows.lamp == code)
@@ -107,6 +107,9 @@ def _groups(heard: Heard, reach: float) -> tuple[list[tuple[int, int, Rows]], tu
             said = heard.lamp_id[mine[part]]
             said = said[said >= 0]
             name = int(np.bincount(said).argmax()) if len(said) else next(free)
+            if name in taken:
+                continue  # the same lamp by its own word: what is left of its light by way of walls
+            taken.add(name)
             groups.append((name, code, thinned(heard.rows.chosen(mine[part]))))
         if not parts:
             left_out.append(code)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import pytest
 from estimator import absolute, se2
 from estimator.pipeline import State, keyframe_poses, step
 from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
-from estimator.result import SURPRISE, Fix
+from estimator.result import SURPRISE, Fix, LightsResult
 from tests.estimator.lit import Log, Truth, lit_state, play, scans, together
 from tools.sim.buildings import building
 from tools.sim.ceiling import ceiling_of
@@ -51,9 +52,15 @@ def longest_step(log: Log) -> float:
 
 
 @pytest.fixture(scope="module")
-def in_room() -> Log:
+def driven() -> tuple[State, Log]:
     run = room(1, 45.0)
-    return play(lit_state(run), everything(run), run.truth)
+    state = lit_state(run)
+    return state, play(state, everything(run), run.truth)
+
+
+@pytest.fixture
+def in_room(driven: tuple[State, Log]) -> Log:
+    return driven[1]
 
 
 def test_light_places_the_map_in_the_survey_and_the_laser_steadies_it(in_room: Log) -> None:
@@ -244,3 +251,41 @@ def test_reset_forgets_where_the_map_lies() -> None:
     result = step(state, [Command(3.0, Order.RESET)], UNLIMITED)
     assert not result.placed
     assert result.gap is None
+
+
+def lights_at(T: Array, accepted: frozenset[int], state: State) -> LightsResult:
+    """Sure of a place, by these lamps."""
+    P = np.diag((0.05**2, 0.05**2, 0.02**2))
+    now = state.fused.t_mono
+    nothing = np.zeros((3, 3))
+    return LightsResult(now, Fix.GOOD, T, P, (), accepted, nothing, np.zeros(3), t_pose=now)
+
+
+def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> None:
+    """Lamps 1 to 4 hang along x: y and heading are doubted, x is not; with lamp 16 as well nothing is."""
+    state, T = driven[0], driven[1].results[-1].T_map_odom
+    lamps = state.light.filter.catalogue.by_id  # type: ignore[union-attr]  # lit
+    assert len({round(lamps[k].y, 2) for k in (1, 2, 3, 4)}) == 1
+    row = absolute.across_the_row(state, lights_at(T, frozenset((1, 2, 3, 4)), state))
+    assert np.sqrt(np.diag(row.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
+    grid = absolute.across_the_row(state, lights_at(T, frozenset((1, 4, 13, 16)), state))
+    assert np.sqrt(np.diag(grid.covariance)) == pytest.approx((0.05, 0.05, 0.02), abs=0.005)
+
+
+@pytest.mark.parametrize(("away", "broken", "followed"), [(0.9, False, False), (2.5, False, True), (0.9, True, True)])
+def test_only_what_the_laser_could_have_lost_is_taken_from_light(
+    driven: tuple[State, Log], away: float, broken: bool, followed: bool
+) -> None:
+    state = copy.deepcopy(driven[0])
+    tie = state.absolute
+    assert tie is not None
+    assert tie.proved
+    tie.broken = broken
+    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    told = T + np.array((away, 0.0, 0.0))
+    for _ in range(30):
+        state.fused.t_mono += 0.05
+        tie.t_match = state.fused.t_mono
+        absolute.on_lights(state, lights_at(told, frozenset((1, 4, 13, 16)), state))
+    now = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    assert np.hypot(*(now - told)[:2]) < 0.05 if followed else np.hypot(*(now - T)[:2]) < 0.05

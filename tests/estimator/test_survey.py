@@ -64,6 +64,24 @@ def test_what_a_lamp_said_it_is_becomes_its_number() -> None:
     assert len({lamp.lamp_id for lamp in found.found.survey.lamps}) == 4
 
 
+def test_a_lamp_has_one_place_by_its_own_word() -> None:
+    """Light of it that is heard far away came by way of walls; it makes no second lamp of the same number."""
+    here = Survey((Lamp(1, 5, 1.25, 1.25, 2.9), Lamp(2, 5, 20.0, 1.25, 2.9, power_w=0.3), Lamp(3, 9, 3.75, 1.25, 2.9)))
+    t = 0.1 * np.arange(3000)
+    parts = []
+    for x0 in (0.0, 17.0):
+        pose = np.column_stack((x0 + 3 + 3 * np.sin(0.2 * t), 1.25 + 1.2 * np.sin(0.13 * t), 0.3 * t))
+        parts.append(received(here, t, pose, 3))
+    rows = joined(parts)
+    codes = np.array([lamp.code for lamp in here.lamps])
+    rows = replace(rows, lamp=codes[rows.lamp]).chosen(rows.amplitude > 2e-8)
+    found = survey(Heard(rows, np.where(rows.lamp == 5, 77, -1)), here.receiver, here.depth, 2.9)
+    lamps = found.found.survey.lamps
+    assert sorted(lamp.code for lamp in lamps) == [5, 9]
+    (named,) = (lamp for lamp in lamps if lamp.lamp_id == 77)
+    assert (named.x, named.y) == pytest.approx((1.25, 1.25), abs=0.15)
+
+
 def test_seldom_heard_codes_are_named_and_left_out() -> None:
     truth = real(nominal(2), 6)
     h = heard(truth, 7)
