@@ -27,7 +27,7 @@ from hal.i2c_server import BusServer
 from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged
 from tests.daemon.test_process import ROOT, Running, running
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.system]
 
 SCL_ERROR = 2.0e-3
 

@@ -144,6 +144,7 @@ def _is_silent(link: Path) -> bool:
         os.close(port)
 
 
+@pytest.mark.system
 def test_no_lidar_and_a_taken_port_are_said_and_waited_for(tmp_path: Path) -> None:
     link = tmp_path / "lidar"
     with socket.socket() as taken:
@@ -179,6 +180,7 @@ def test_a_wrong_configuration_is_refused_at_once(tmp_path: Path) -> None:
     assert "robot.toml:2: unknown key `modbus.prot`; did you mean `modbus.port`?" in done.stderr
 
 
+@pytest.mark.system
 def test_a_recording_is_made_beside(tmp_path: Path) -> None:
     link, folder = tmp_path / "lidar", tmp_path / "drive"
     with fake_lidar(link), running(link, "--record", str(folder)) as daemon:

@@ -34,7 +34,7 @@ def storm(seed: int, words: set[str], orders: int = 30) -> str:
 
 
 @pytest.mark.parametrize("model", [UTM_30LX, UST_10LX], ids=["UTM", "UST"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_driver_in_a_storm(seed: int, model: LidarModel) -> None:
     orders = storm(seed, set(LIDAR) - UNSEEN - TOGETHER - {"baud"})
     story = play(Run(model, orders, before_s=2.0, fault_s=STORM_S, after_s=15.0))

@@ -140,6 +140,7 @@ def test_the_driver_over_a_socket(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.realtime
+@pytest.mark.system
 def test_the_driver_survives_its_server(tmp_path: Path) -> None:
     async def main() -> None:
         clock = SystemClock()

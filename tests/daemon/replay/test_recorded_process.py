@@ -14,6 +14,7 @@ from tests.daemon.test_process import fake_lidar, running
 
 
 @pytest.mark.realtime
+@pytest.mark.system
 def test_a_killed_run_is_repeated_to_the_last_bit(tmp_path: Path) -> None:
     """Measured budgets, a worker thread, a real tty: nothing of that may matter to the replay."""
     link, folder = tmp_path / "lidar", tmp_path / "recordings"

@@ -126,7 +126,13 @@ def judge(bench: Bench, scan: RawScan, late: float) -> None:
 
 @pytest.mark.parametrize(
     ("case", "model"),
-    [(case, model) for case in CASES for model in case.models],
+    [
+        pytest.param(case, model, marks=pytest.mark.slow)
+        if case.order == "piece = 1" and model is not case.models[0]
+        else (case, model)
+        for case in CASES
+        for model in case.models
+    ],
     ids=[
         f"{case.word} {case.order} {model.modl.partition('(')[0].partition('[')[0]}".replace("\n", " ")
         for case in CASES

@@ -87,7 +87,7 @@ def test_stamps_are_right_to_a_fraction_of_the_millisecond(ppm: float, period_s:
         assert clock.period_s == pytest.approx(period_s, rel=1e-3)
 
 
-@pytest.mark.parametrize("ppm", [-1000, 1000])
+@pytest.mark.parametrize("ppm", [-1000, pytest.param(1000, marks=pytest.mark.slow)])
 def test_three_wraps(ppm: float) -> None:
     """14 hours: every tenth revolution of a 10 Hz sensor."""
     s = sensor(ppm=ppm, period_s=1.002, seconds=3.1 * TICK_MODULUS / 1e3, start_ms=TICK_MODULUS - 100_000)
