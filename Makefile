@@ -35,9 +35,16 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff check --quiet .
 	$(BIN)/mypy
 
+# Kernels without their compiler run beside the main run, on the second core; what they print comes after it.
 test: check  ## everything quick (no root, <= 12 minutes)
-	$(BIN)/python -m coverage run -m pytest -q -m "not system and not slow" $(ARGS)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m "not jit and not slow" tests/estimator
+	@mkdir -p out; rm -f .coverage .coverage.plain
+	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run --data-file=.coverage.plain -m pytest -q -p no:cacheprovider \
+		-m "not jit and not slow" tests/estimator > out/plain.txt 2>&1 & plain=$$!; \
+	$(BIN)/python -m coverage run -m pytest -q -m "not system and not slow" $(ARGS); compiled=$$?; \
+	wait $$plain; interpreted=$$?; echo "kernels without compiler:"; \
+	if [ $$interpreted = 0 ]; then tail -n 1 out/plain.txt; else cat out/plain.txt; fi; \
+	exit $$(( compiled || interpreted ))
+	@$(BIN)/python -m coverage combine -q -a .coverage.plain
 	$(BIN)/python -m tools.floors
 
 test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)

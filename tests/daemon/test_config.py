@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon import configfile
@@ -200,6 +200,7 @@ configs = st.builds(
 
 
 @given(config=configs)
+@settings(max_examples=40, deadline=None)
 def test_what_is_printed_reads_back_equal(config: Config, tmp_path_factory: pytest.TempPathFactory) -> None:
     file = tmp_path_factory.mktemp("printed") / "printed.toml"
     file.write_text(configfile.dump(config))

@@ -71,6 +71,7 @@ def test_the_installed_configuration_changes_no_default() -> None:
     assert configfile.load(installed) == Config()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
 def test_every_example_starts(file: Path) -> None:
     settings = here(file)

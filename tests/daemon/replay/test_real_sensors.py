@@ -182,6 +182,7 @@ def largest_difference(played: Played, log: list[Array]) -> tuple[float, float]:
     return float(np.hypot(off[:, 0], off[:, 1]).max()), float(turn.max())
 
 
+@pytest.mark.system
 def test_urg_over_a_memory_port(rover: convert.Scans, tmp_path: Path) -> None:
     played = through_memory(rover, URG_04LX_UG01, ROVER)
     bit_identical(played, rover, 20, 5600)
