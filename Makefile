@@ -39,7 +39,7 @@ check: venv  ## formatting, lint, strict types
 test: check  ## everything quick (no root, <= 12 minutes)
 	@mkdir -p out; rm -f .coverage .coverage.plain
 	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run --data-file=.coverage.plain -m pytest -q -p no:cacheprovider \
-		-m "not jit and not slow" tests/estimator > out/plain.txt 2>&1 & plain=$$!; \
+		-m "not jit and not slow" tests/estimator > out/plain.txt 2>&1 & plain=$$!; trap "kill $$plain" INT TERM; \
 	$(BIN)/python -m coverage run -m pytest -q -m "not system and not slow" $(ARGS); compiled=$$?; \
 	wait $$plain; interpreted=$$?; echo "kernels without compiler:"; \
 	if [ $$interpreted = 0 ]; then tail -n 1 out/plain.txt; else cat out/plain.txt; fi; \
