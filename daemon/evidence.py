@@ -44,7 +44,6 @@ class Observer:
         self._t_scan: float | None = None
         self._t_odometry = t_mono
         self._P_complete: Array | None = None
-        self._seated = False
         self._mapped = False
         self._unreachable = False
         self._t_shown = [t_mono] * 3
@@ -164,14 +163,12 @@ class Observer:
         Not the covariance itself: that of a pose in the map grows with the way from the start, while the place in the
         surroundings is as good as ever. What grows between two complete matches is drift where odometry bridged it.
         Without odometry it is a guess, and a guess stays one when later scans fit a map that was laid upon it: then
-        the uncertainty is only gone when the estimate itself has become certain again. Where light has just told how
-        the map lies in the survey, the covariance is that of another frame, and growth begins anew.
+        the uncertainty is only gone when the estimate itself has become certain again.
         """
         if result is None:
             return 0.0, 0.0
         P = result.covariance
-        seated, self._seated = self._seated, result.placed
-        if self._P_complete is None or ordered or not self._mapped or seated is not result.placed:
+        if self._P_complete is None or ordered or not self._mapped:
             self._P_complete = P
         sigma_m, sigma_rad = _growth(P, self._P_complete)
         complete = match is not None and match.good and all(match.known)

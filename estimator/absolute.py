@@ -150,7 +150,10 @@ def on_lights(state: State, lights: LightsResult) -> None:
     off = lights.T_map_base - se2.compose(state.T_map_odom, T_odom_base)
     off[2] = se2.wrap(off[2])
     tie.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if tie.placed else None
-    if not tie.placed or _contradicted(state, lights, off) or _surer(tie, lights):
+    if not tie.placed:
+        follow(state, lights, T_odom_base)
+        tie.gap = 0.0
+    elif _contradicted(state, lights, off) or _surer(tie, lights):
         follow(state, lights, T_odom_base)
     elif lights.fix is Fix.GOOD and tie.odd_since is None:
         gain(state, lights, T_odom_base, off)
