@@ -32,6 +32,12 @@ INLIERS, PAIRS, WEIGHTS, SQUARES, SETTLED, LENGTH2, DAMPING = range(15, 22)
 
 SUMS = 22
 
+AT_X, AT_Y, AT_YAW, SCALE, GATE, STRIDE, FITTED, PAIRED, WEIGHED, SQUARED, STEP2, DAMPED, SOUGHT = range(13)
+"""Columns of the trace, one row an iteration: the pose it began at (relative to the axis centre), robust scale, gate,
+every how many points it took; inliers, pairs, weights and squares as in its sums; squared length of its step in its own
+deviations and damping (0 if it made none); how many points were looked up because they had left their safe radius."""
+
+TRACE = 13
 
 Reference = tuple[Array, Ints, Array, Array]
 """Rows, start and rays of the axis, and per row normal x, y, variance of the normal's direction, weight."""
@@ -42,14 +48,15 @@ squared, it may move until another row can be nearest."""
 
 
 @kernel(
-    "void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, i8,"
+    "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, i8,"
     " Tuple((i8[::1], i8[::1], f8[:, ::1])))"
 )
-def pair_up(points: Array, reference: Reference, T: Array, gate2: float, stride: int, memory: Memory) -> None:
+def pair_up(points: Array, reference: Reference, T: Array, gate2: float, stride: int, memory: Memory) -> int:
     """Step 1 of Sect. 4.2: the nearest row within the gate for every ``stride``-th point at pose ``T``.
 
-    A point that has not left its safe radius keeps its row without being looked up.
+    A point that has not left its safe radius keeps its row without being looked up; returns how many were.
     """
+    sought = 0
     rows, start, rays, _ = reference
     partner, found, safe = memory
     c, s = np.cos(T[2]), np.sin(T[2])
@@ -65,6 +72,8 @@ def pair_up(points: Array, reference: Reference, T: Array, gate2: float, stride:
         partner[i] = found[i] = row
         safe[i, 0], safe[i, 1] = px, py
         safe[i, 2] = 0.25 * (np.sqrt(e2) - np.sqrt(d2)) ** 2
+        sought += 1
+    return sought
 
 
 @kernel("void(f8[:, ::1], Tuple((f8[:, ::1], f8[:, ::1], i8[::1])), f8[::1], Tuple((f8, f8, f8)), i8, f8[::1])")
@@ -184,19 +193,21 @@ def between(u: Array, A: Array, v: Array) -> float:
 
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
-    " Tuple((f8[:, ::1], f8[::1])))"
+    " Tuple((f8[:, ::1], f8[::1], f8[:, ::1])))"
 )
-def iterate(points: Array, reference: Reference, T: Array, L1: Array, how: Array, out: tuple[Array, Array]) -> int:
+def iterate(
+    points: Array, reference: Reference, T: Array, L1: Array, how: Array, out: tuple[Array, Array, Array]
+) -> int:
     """Iterate Eq. 13-14 from ``T`` (relative to the axis centre), which is moved in place; the number of iterations.
 
     The robust scale shrinks from twice what the prediction's uncertainty moves a point to a few times the noise, not
     faster than the steps do; until then every fourth point will do. A step that turns back on the one before is halved:
     pairs may alternate between two sets.
     ``how``: lidar in the base frame (x, y), iteration cap, gate, last scale, noise, least step in its own deviations,
-    stride while coarse. ``out``: the laser's information (3, 3), and the sums of the last pass with SETTLED, LENGTH2
-    (squared length of the last step in its own deviations) and DAMPING.
+    stride while coarse. ``out``: the laser's information (3, 3); the sums of the last pass with SETTLED, LENGTH2
+    (squared length of the last step in its own deviations) and DAMPING; the trace (cap, TRACE), a row an iteration.
     """
-    H, sums = out
+    H, sums, trace = out
     T1 = T.copy()
     A = np.empty((3, 3))
     b = np.empty(3)
@@ -211,14 +222,18 @@ def iterate(points: Array, reference: Reference, T: Array, L1: Array, how: Array
     count = 0
     sums[SETTLED] = 0.0
     while count < how[2] and sums[SETTLED] == 0.0:
+        row = trace[count]
         count += 1
         stride = int(how[7]) if scale > 2.0 * last else 1
         k = stride / (how[5] * how[5])
         gate = min(how[3], max(6.0 * scale, 0.1))
-        pair_up(points, reference, T, gate * gate, stride, memory)
+        row[AT_X], row[AT_Y], row[AT_YAW], row[SCALE], row[GATE], row[STRIDE] = T[0], T[1], T[2], scale, gate, stride
+        row[SOUGHT] = pair_up(points, reference, T, gate * gate, stride, memory)
         sum_up(points, (reference[0], reference[3], memory[0]), T, (how[0], how[1], scale), stride, sums)
         sums[INLIERS] *= stride
         sums[PAIRS] *= stride
+        row[FITTED : SQUARED + 1] = sums[INLIERS : SQUARES + 1]
+        row[STEP2] = row[DAMPED] = 0.0
         trusted(sums, k, H, keep)
         for i in range(3):
             b[i] = 0.0
@@ -234,6 +249,7 @@ def iterate(points: Array, reference: Reference, T: Array, L1: Array, how: Array
             T[i] += damping * step[i]
             before[i] = step[i]
         sums[LENGTH2], sums[DAMPING] = length2, damping
+        row[STEP2], row[DAMPED] = length2, damping
         sums[SETTLED] = 1.0 if length2 < how[6] * how[6] and scale == last else 0.0
         moved = np.sqrt(step[0] * step[0] + step[1] * step[1]) + lever * abs(step[2])
         scale = max(last, min(scale, max(0.25 * scale, SHRINK * moved)))

@@ -82,13 +82,19 @@ class Prior:
 
 @dataclass(slots=True, eq=False)
 class Attempt:
-    """Outcome of one run of iterations from one start."""
+    """Outcome of one run of iterations from one start.
+
+    Attributes:
+        T: pose. H: information of the laser. sums: of the last pass. points: queries.
+        trace: (iterations, icp.TRACE), what each iteration saw and did; poses relative to the axis centre.
+    """
 
     T: Array
     H: Array
     sums: Array
     iterations: int
     points: int
+    trace: Array
 
     @property
     def share(self) -> float:
@@ -109,15 +115,15 @@ def match(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSe
 
 def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> Attempt:
     """Iterate from a prediction."""
-    H, sums = np.zeros((3, 3)), np.zeros(icp.SUMS)
+    H, sums, trace = np.zeros((3, 3)), np.zeros(icp.SUMS), np.empty((cap, icp.TRACE))
     axis, noise = local.axis, view.noise_m
     coarse = settings.coarse if len(view.points) > settings.dense else 1
     tail = (cap, settings.gate_m, settings.scale * noise, noise, settings.settled, coarse)
     how = np.array((view.T_base_lidar[0], view.T_base_lidar[1], *tail))
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = prior.T - centre
-    n = icp.iterate(view.points, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums))
-    return Attempt(T + centre, H, sums, n, len(view.points))
+    n = icp.iterate(view.points, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums, trace))
+    return Attempt(T + centre, H, sums, n, len(view.points), trace[:n])
 
 
 def second_opinion(first: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> Attempt:

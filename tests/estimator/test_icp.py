@@ -111,6 +111,26 @@ def test_a_small_match_finds_its_place() -> None:
     np.testing.assert_array_equal(again.T, result.T_odom_base)
 
 
+def test_the_trace_tells_every_iteration() -> None:
+    """From each row the pairs and sums of its iteration can be made again."""
+    local, view, T = small_pair()
+    start = prior_at(T + np.array((*local.axis.centre, 0.0)), 0.2, 0.1)
+    found = attempt(view, local, start, 30, SETTINGS)
+    trace = found.trace
+    assert trace.shape == (found.iterations, icp.TRACE)
+    np.testing.assert_array_equal(trace[0, :3], T)
+    np.testing.assert_allclose(trace[-1, icp.STEP2], found.sums[icp.LENGTH2])
+    assert trace[0, icp.SOUGHT] == len(view.points) > trace[-1, icp.SOUGHT]
+    assert (np.diff(trace[:, icp.SCALE]) <= 0.0).all()
+    assert (trace[:, icp.STRIDE] == 1.0).all()
+    for row in trace:
+        memory, sums = empty_memory(len(view.points)), np.zeros(icp.SUMS)
+        icp.pair_up(view.points, reference_of(local), row[:3].copy(), row[icp.GATE] ** 2, 1, memory)
+        how = (0.0, 0.0, row[icp.SCALE])
+        icp.sum_up(view.points, (local.axis.rows, local.lines, memory[0]), row[:3].copy(), how, 1, sums)
+        np.testing.assert_allclose(row[icp.FITTED : icp.SQUARED + 1], sums[icp.INLIERS : icp.SQUARES + 1], rtol=1e-9)
+
+
 def errors(
     scene: Scene, bearing: Array, metres: float, degrees: float, trials: int
 ) -> tuple[Array, list[Attempt], list[Array]]:
