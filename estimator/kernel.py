@@ -7,7 +7,9 @@ Every hot function is written as a plain Python function and decorated with :fun
 * NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
 * ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
 * cached on disk under a directory named by a hash of *all* kernel sources and of the compiler's versions. numba's own
-  key does not cover callees in other files, so an edited callee would leave a stale caller behind.
+  key does not cover callees in other files, so an edited callee would leave a stale caller behind, nor the flags that
+  come from the environment: a run with ``NUMBA_BOUNDSCHECK=1`` (every index is checked, `IndexError`) or
+  ``NUMBA_CPU_NAME=generic`` (no instructions beyond the architecture's first) has a directory of its own.
 
 This is the only module of the room that touches the file system; it does so once, when first imported.
 """
@@ -40,6 +42,8 @@ finally:
     if _hide:
         del sys.modules[_BLAS]
 
+_numba_config: Any = config  # untyped upstream; read by numba each time a function is decorated
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -49,15 +53,28 @@ KEPT: Final = 4
 KEPT_S: Final = 7 * 86400.0
 """And all that were used more recently than this: their programs may be running."""
 
+SHAPING: Final = (
+    "BOUNDSCHECK",
+    "CPU_NAME",
+    "CPU_FEATURES",
+    "ENABLE_AVX",
+    "OPT",
+    "LOOP_VECTORIZE",
+    "SLP_VECTORIZE",
+    "DEBUGINFO_DEFAULT",
+)
+"""numba's settings (environment variables, without their prefix ``NUMBA_``) that shape the machine code."""
+
 
 def source_key() -> str:
-    """Hash of every source file of this room and of the versions that turn it into machine code."""
+    """Hash of every source file of this room and of the versions and settings that turn it into machine code."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
     versions = (sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__)
     digest.update(repr(versions).encode())
+    digest.update(repr([str(getattr(_numba_config, name, None)) for name in SHAPING]).encode())
     return digest.hexdigest()[:16]
 
 
@@ -115,7 +132,6 @@ def _choose_cache() -> Path:
 CACHE_DIR: Final = _choose_cache()
 """Where compiled kernels of exactly these sources live."""
 
-_numba_config: Any = config  # untyped upstream; read by numba each time a function is decorated
 _numba_config.CACHE_DIR = str(CACHE_DIR)
 
 

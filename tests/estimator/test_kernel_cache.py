@@ -1,4 +1,4 @@
-"""Compiled kernels of earlier versions are removed, those of versions that may be running are not."""
+"""Kernels are kept by what shaped them; those of earlier versions are removed, those that may be running are not."""
 
 from __future__ import annotations
 
@@ -57,3 +57,21 @@ def test_what_cannot_be_removed_stays(root: Path, monkeypatch: pytest.MonkeyPatc
     (root / old[-1].name).symlink_to(root / "elsewhere")  # rmtree refuses a link
     kernel._choose_cache()
     assert (root / "elsewhere").exists()
+
+
+@pytest.mark.parametrize(("name", "value"), [("BOUNDSCHECK", 1), ("CPU_NAME", "generic"), ("OPT", 0)])
+def test_other_machine_code_has_another_directory(
+    root: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: object
+) -> None:
+    ours = kernel._choose_cache()
+    monkeypatch.setattr(kernel._numba_config, name, value)
+    other = kernel._choose_cache()
+    assert other != ours
+    monkeypatch.undo()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(root))
+    assert kernel._choose_cache() == ours
+
+
+def test_every_setting_that_is_looked_at_exists() -> None:
+    """A name that numba has renamed would no longer tell the two apart."""
+    assert [name for name in kernel.SHAPING if not hasattr(kernel._numba_config, name)] == []
