@@ -80,6 +80,10 @@ class Prior:
     L: Array
 
 
+Asked = tuple[View, LocalMap, Prior, int, MatchSettings]
+"""What :func:`match` is asked with; whoever keeps it can have the match told again, iteration by iteration."""
+
+
 @dataclass(slots=True, eq=False)
 class Attempt:
     """Outcome of one run of iterations from one start.
@@ -87,6 +91,7 @@ class Attempt:
     Attributes:
         T: pose. H: information of the laser. sums: of the last pass. points: queries.
         trace: (iterations, icp.TRACE), what each iteration saw and did; poses relative to the axis centre.
+        view, prior: what was matched, and from where.
     """
 
     T: Array
@@ -95,6 +100,8 @@ class Attempt:
     iterations: int
     points: int
     trace: Array
+    view: View
+    prior: Prior
 
     @property
     def share(self) -> float:
@@ -102,14 +109,21 @@ class Attempt:
         return float(self.sums[icp.INLIERS]) / max(self.points, 1)
 
 
-def match(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> MatchResult:
-    """Match a scan from its prediction in at most ``cap`` iterations, a second opinion included."""
+def match(
+    view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings, tried: list[Attempt] | None = None
+) -> MatchResult:
+    """Match a scan from its prediction in at most ``cap`` iterations, a second opinion included.
+
+    Every attempt is added to ``tried``, if one asks: the first, the trials of the second opinion, its last.
+    """
+    tried = [] if tried is None else tried
     first = attempt(view, local, prior, min(cap, FIRST), settings)
+    tried.append(first)
     result = verdict(first, view, local, prior, settings)
     left = cap - first.iterations
     if left < SECOND or (result.ok and first.share >= settings.doubt_share):
         return result
-    second = second_opinion(first, view, local, prior, settings)
+    second = second_opinion(local, prior, settings, tried)
     return replace(verdict(second, view, local, prior, settings), iterations=min(cap, second.iterations))
 
 
@@ -123,25 +137,31 @@ def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: Match
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = prior.T - centre
     n = icp.iterate(view.points, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums, trace))
-    return Attempt(T + centre, H, sums, n, len(view.points), trace[:n])
+    return Attempt(T + centre, H, sums, n, len(view.points), trace[:n], view, prior)
 
 
-def second_opinion(first: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> Attempt:
+def second_opinion(local: LocalMap, prior: Prior, settings: MatchSettings, tried: list[Attempt]) -> Attempt:
     """Doubt the prediction: look about it for the place and heading that fit best, on a few points; finish that one.
+
+    ``tried`` ends with the first attempt, and gets the others.
 
     Iterations are counted by the points they took, so that what is said of the cost stays true.
     """
+    first = tried[-1]
+    view = first.view
     L = np.diag(np.minimum(np.diag(prior.L), (settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2)))
     few = replace(view, points=np.ascontiguousarray(view.points[:: max(1, len(view.points) // 180)]))
     best, share, work = first, first.share + 0.05, 0
     for k in range(-settings.fan, settings.fan + 1):
         start = Prior(prior.T + np.array((0.0, 0.0, k * settings.fan_rad)), L)
         trial = attempt(few, local, start, 12, settings)
+        tried.append(trial)
         work += trial.iterations * len(few.points)
         if trial.share > share:
             best, share = trial, trial.share
     if best is not first:
         best = attempt(view, local, Prior(best.T, L), SECOND, settings)
+        tried.append(best)
         work += best.iterations * best.points
     better = best if best.share > first.share else first
     return replace(better, iterations=first.iterations + work // max(1, first.points))

@@ -14,7 +14,7 @@ from estimator.grid import Grid
 from estimator.keyframe import unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
-from estimator.matching import Prior, View
+from estimator.matching import Asked, Prior, View
 from estimator.records import Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
@@ -97,14 +97,20 @@ def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> 
     """Eq. 12-14: nearest neighbours on the distance axis, point-to-line, the prediction weighted in."""
     state.since_keyframe += 1
     T_pred, count = state.fused.T_odom_base, len(points.xy)
+    asked: Asked | None = None
     if state.local is None:
-        return matching.no_match(T_pred, count, Reason.NO_MAP)
-    if count < state.settings.matching.min_points:
-        return matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
-    beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-    view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan))
-    prior = Prior(T_pred, invert3(state.fused.P))
-    return matching.match(view, state.local, prior, limits.icp_iterations, state.settings.matching)
+        result = matching.no_match(T_pred, count, Reason.NO_MAP)
+    elif count < state.settings.matching.min_points:
+        result = matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
+    else:
+        beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
+        view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan))
+        prior = Prior(T_pred, invert3(state.fused.P))
+        asked = (view, state.local, prior, limits.icp_iterations, state.settings.matching)
+        result = matching.match(*asked)
+    if state.journal is not None:
+        state.journal(scan, points, asked, result)
+    return result
 
 
 def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -11,15 +12,21 @@ import numpy as np
 from estimator import se2
 from estimator.keyframe import Keyframe
 from estimator.localmap import LocalMap, MapSettings
-from estimator.matching import MatchSettings
+from estimator.matching import Asked, MatchSettings
 from estimator.motion import Motion, MotionNoise
-from estimator.records import Array
+from estimator.records import Array, Scan
+from estimator.result import MatchResult
+from estimator.scanpoints import ScanPoints
 
 if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.absolute import Absolute
     from estimator.light import Light, LightsSetup
 
 Place = tuple[int, int, int]
+
+Journal = Callable[[Scan, ScanPoints, Asked | None, MatchResult], None]
+"""Takes a scan, its points, what the matcher was asked with (None where it was not asked) and what came of it. It may
+keep all of them: none is changed later. It must not change anything."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +69,7 @@ class State:
         next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
         t_scan, T_odom_scan: instant and pose of the latest scan.
+        journal: is told of every match before it is fused, None: nobody asks.
     """
 
     settings: Settings
@@ -84,6 +92,7 @@ class State:
     noise_m: float = 0.0
     t_scan: float = -math.inf
     T_odom_scan: Array = field(default_factory=se2.identity)
+    journal: Journal | None = None
 
 
 def new_state(settings: Settings | None = None, lights: LightsSetup | None = None) -> State:
