@@ -46,6 +46,8 @@ class Light:
         learned = None if setup.residuals is None else Learned(setup.residuals, setup.survey.receiver)
         self.filter = lights.new_lights(setup.survey, corrections=learned)
         self.result = lights.result(self.filter)
+        self._decoded = self._decoded_before = False
+        self._spared = 0
 
     def predict(self, record: Record) -> None:
         """Move the `lights` filter with the robot; it never hears of the laser."""
@@ -54,13 +56,24 @@ class Light:
 
     def take(self, record: SampleBlock | LightEpoch) -> LightsResult:
         """Decode a block, if it is one, and take the epoch into the filter."""
+        self._decoded = isinstance(record, SampleBlock)
         epoch = cdma.decode(self.decoder, record) if isinstance(record, SampleBlock) else record
         self.result = lights.update(self.filter, epoch)
         return self.result
 
     def look_on(self, codes: int) -> None:
-        """Go on looking for lamps that are not followed yet, as far as this cycle can afford."""
-        cdma.search(self.decoder, codes)
+        """Go on looking for lamps that are not followed yet, as far as this cycle can afford.
+
+        Where only every other cycle brings a block, the one that has decoded it leaves the search, and the effort that
+        it was allowed, to the next: a lamp is found before the next block all the same, and no cycle does both.
+        """
+        busy = self._decoded and not self._decoded_before and len(self.decoder.tracks.slots) > 0
+        self._decoded_before, self._decoded = self._decoded, False
+        if busy:
+            self._spared = codes
+            return
+        spared, self._spared = self._spared, 0
+        cdma.search(self.decoder, codes + spared)
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
         """Somebody says where the robot is."""

@@ -8,10 +8,11 @@ import sys
 import numpy as np
 import pytest
 
+from estimator import cdma
 from estimator.cdma_epoch import BlockFlag, LightEpoch
 from estimator.light import LightsSetup
 from estimator.pipeline import new_state, step
-from estimator.records import UNLIMITED, Limits
+from estimator.records import UNLIMITED, Imu, Limits
 from estimator.result import LinkState
 from tests.estimator.cdma_scene import SAMPLES, ceiling, currents, sampled
 
@@ -64,3 +65,35 @@ def test_blocks_are_decoded_and_the_search_keeps_to_its_cap(codes: int) -> None:
 def test_a_stored_clock_that_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match="clock_ppm"):
         new_state(lights=LightsSetup(clock_ppm=5e4))
+
+
+@pytest.mark.jit
+def test_where_blocks_come_every_other_cycle_the_search_is_done_in_the_one_between(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, state, t = ceiling(1, currents(4.6, 5.3)[:6]), new_state(lights=LightsSetup(clock_ppm=0.0)), 1.0
+    efforts: list[int] = []
+    search = cdma.search
+
+    def watched(decoder: cdma.Decoder, codes: int) -> None:
+        efforts.append(codes)
+        search(decoder, codes)
+
+    monkeypatch.setattr(cdma, "search", watched)
+    for _ in range(12):
+        block = scene.block(t, SAMPLES, ())
+        t = block.t1 + 2e-4
+        lights = step(state, [sampled(block)], UNLIMITED).lights
+        with_block, efforts = len(efforts), []
+        step(state, [Imu(t - 2e-4, t, 0.0)], UNLIMITED)
+        between, efforts = list(efforts), []
+    assert lights is not None
+    assert {link.code for link in lights.links} == {lamp.code for lamp in scene.lamps}
+    assert with_block == 0, "lamps are followed: the cycle has enough to do"
+    assert between == [2 * UNLIMITED.codes], "and nothing of the effort is lost"
+    for _ in range(3):  # now every cycle brings a block: there is none in between
+        efforts.clear()
+        block = scene.block(t, SAMPLES, ())
+        t = block.t1 + 2e-4
+        step(state, [sampled(block)], UNLIMITED)
+    assert efforts == [UNLIMITED.codes]

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.lamps import Survey
 from hal.adc import Blemish, RawSamples
@@ -118,11 +117,3 @@ class EndlessDrive:
         seq, self._blocks = self._blocks, self._blocks + 1
         t0, t1 = t_begin - float(early), float(t[-1]) + 1.0 / SAMPLE_RATE + float(late)
         return RawSamples(seq, t0, t1, t0, SAMPLE_RATE, words, BITS, Blemish.NONE, float(early + late))
-
-
-def beams(drive: EndlessDrive) -> int:
-    """Of one scan."""
-    return int(drive.geometry.amax - drive.geometry.amin + 1)
-
-
-Words = npt.NDArray[np.int32]

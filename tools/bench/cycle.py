@@ -26,7 +26,6 @@ from typing import Final
 import numpy as np
 
 from daemon.config import (
-    NO_DEVICE,
     Config,
     LidarConfig,
     ModbusConfig,
@@ -195,8 +194,9 @@ def instrument(stages: Stages, daemon: Daemon) -> None:
     """Wrap what the stages are made of."""
     cycle = daemon.cycle
     for owner, attribute, stage in (
-        (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"), (cycle, "_publish", "publish"),
-        (Painter, "paint", "judge"), (cdma, "decode", "decode"), (cdma, "search", "search"),
+        (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"),
+        (cycle, "_publish", "publish"), (Painter, "paint", "judge"),
+        (cdma, "decode", "decode"), (cdma, "search", "search"),
         (lights, "update", "lights"), (lights, "predict", "lights"), (absolute, "on_lights", "lights"),
         (pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match"), (pipeline, "fuse", "fuse"),
         (pipeline, "predict", "fuse"), (pipeline, "keyframe_due", "map"), (pipeline, "lay_keyframe", "map"),
