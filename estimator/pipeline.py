@@ -7,13 +7,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, grid, matching, motion, se2
+from estimator import absolute, grid, matchers, matching, motion, se2
 from estimator.commands import obey
 from estimator.fusion import covariance, fuse, noise_of
 from estimator.grid import Grid
 from estimator.keyframe import unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
+from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
 from estimator.records import Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
 from estimator.result import MatchResult, Reason, StepResult
@@ -107,10 +108,20 @@ def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> 
         view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan))
         prior = Prior(T_pred, invert3(state.fused.P))
         asked = (view, state.local, prior, limits.icp_iterations, state.settings.matching)
-        result = matching.match(*asked)
+        if state.settings.matcher is Matcher.LINE:
+            result = matching.match(*asked)
+        else:
+            result, asked = matchers.match(asked, light_first(state, prior), state.settings), None
     if state.journal is not None:
         state.journal(scan, points, asked, result)
     return result
+
+
+def light_first(state: State, prior: Prior) -> First:
+    """T1 of Eq. 14 for the paper's matcher: from light, or the prediction where light tells nothing good."""
+    assert state.local is not None
+    lights = None if state.light is None else state.light.result
+    return first_of(prior, state.local.newest, absolute.virtual(state), lights)
 
 
 def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult:

@@ -12,6 +12,7 @@ import numpy as np
 from estimator import se2
 from estimator.keyframe import Keyframe
 from estimator.localmap import LocalMap, MapSettings
+from estimator.matchers import Matcher, Weight, load
 from estimator.matching import Asked, MatchSettings
 from estimator.motion import Motion, MotionNoise
 from estimator.records import Array, Scan
@@ -40,6 +41,7 @@ class Settings:
             the beams still fit the map.
         keep: keyframes kept per half metre square and eighth of a turn.
         history: keep the pose of keyframes whose scan has been let go; for replay, which needs them once at the end.
+        matcher: the default one, or one to compare it with. weight: of Eq. 15, where the matcher is the paper's.
     """
 
     far_m: float = 80.0
@@ -49,6 +51,8 @@ class Settings:
     keyframe_share: float = 0.7
     keep: int = 2
     history: bool = False
+    matcher: Matcher = Matcher.LINE
+    weight: Weight = Weight.INFORMATION
     map: MapSettings = field(default_factory=MapSettings)
     matching: MatchSettings = field(default_factory=MatchSettings)
     noise: MotionNoise = field(default_factory=MotionNoise)
@@ -106,6 +110,7 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
         ValueError: a stored sample clock outside the profile's range.
     """
     state = State(settings or Settings())
+    load(state.settings)
     if lights is not None:
         from estimator.absolute import Absolute
         from estimator.light import Light
