@@ -107,7 +107,7 @@ class SimulatedScene:
         self.t_go: float | None = None
         self._t_first: float | None = None
         self._crowd = Crowd(self.building.people if scenario.people else ())
-        self._scanner = Scanner(self.building.world, _sweep(self.model), self.optics, scenario.seed)
+        self._scanner = Scanner(self.building.world, sweep_of(self.model), self.optics, scenario.seed)
         self._odometer = Odometer(self.drive, self.building.world, scenario.wheels, scenario.seed)
         self.light: SceneLight | None = None
         if scenario.lights is not None:
@@ -189,7 +189,8 @@ def compose(poses: Array, offset: tuple[float, float, float]) -> Array:
     return np.column_stack([poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, poses[:, 2] + yaw])
 
 
-def _sweep(model: LidarModel) -> Sweep:
+def sweep_of(model: LidarModel) -> Sweep:
+    """Bearings and times of all steps of a model."""
     steps = np.arange(model.amin, model.amax + 1)
     per_step = model.true_period_s / model.ares
     bearing = np.asarray((steps - model.afrt) * (2 * np.pi / model.ares), dtype=np.float64)
