@@ -21,8 +21,12 @@ class Scene:
 
     def ranges(self, T: Array, bearing: Array, longest: float = 30.0) -> Array:
         """True distance along each bearing from pose ``T`` (x, y, yaw); ``inf`` beyond ``longest``."""
+        return self.surfaces(T, bearing, longest)[0]
+
+    def surfaces(self, T: Array, bearing: Array, longest: float = 30.0) -> tuple[Array, Array]:
+        """The same with the unit normals (n, 2) of what was met, either way round; NaN where nothing was."""
         d = np.column_stack((np.cos(bearing + T[2]), np.sin(bearing + T[2])))
-        best = np.full(len(bearing), np.inf)
+        best, normal = np.full(len(bearing), np.inf), np.full((len(bearing), 2), np.nan)
         a, e = self.walls[:, :2] - T[:2], self.walls[:, 2:] - self.walls[:, :2]
         det = d[:, 0, None] * -e[:, 1] + d[:, 1, None] * e[:, 0]
         det = np.where(np.abs(det) < 1e-12, np.nan, det)
@@ -30,14 +34,19 @@ class Scene:
         u = (d[:, 0, None] * a[:, 1] - d[:, 1, None] * a[:, 0]) / det
         r = np.where((r > 0.0) & (u >= 0.0) & (u <= 1.0), r, np.inf)
         if r.shape[1]:
+            wall = r.argmin(axis=1)
             best = np.minimum(best, r.min(axis=1))
+            across = np.column_stack((-e[:, 1], e[:, 0])) / np.hypot(e[:, 0], e[:, 1])[:, None]
+            normal = np.where(np.isfinite(best)[:, None], across[wall], normal)
         for x, y, radius in self.columns:
             cx, cy = x - T[0], y - T[1]
             along = d[:, 0] * cx + d[:, 1] * cy
             inside = radius**2 - (cx**2 + cy**2 - along**2)
             near = along - np.sqrt(np.maximum(inside, 0.0))
-            best = np.where((inside > 0.0) & (near > 0.0), np.minimum(best, near), best)
-        return np.where(best > longest, np.inf, best)
+            first = (inside > 0.0) & (near > 0.0) & (near < best)
+            best = np.where(first, near, best)
+            normal = np.where(first[:, None], (near[:, None] * d - (cx, cy)) / radius, normal)
+        return np.where(best > longest, np.inf, best), np.where((best > longest)[:, None], np.nan, normal)
 
     def clear(self, T: Array, margin: float = 0.35) -> bool:
         """Whether nothing stands within ``margin`` of the pose."""
