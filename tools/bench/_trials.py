@@ -24,6 +24,7 @@ from estimator.scanpoints import oriented, points_of
 from tools.bench._bound import bound
 from tools.bench._scenes import Scene, bearings
 
+Flags = npt.NDArray[np.bool_]
 Matcher = Callable[[View, LocalMap, Prior], MatchResult]
 
 STILL: Final = np.zeros(3)
@@ -58,20 +59,23 @@ class Case:
 
 @dataclass(eq=False)
 class Trials:
-    """Outcomes, one row a trial.
+    """Outcomes of n trials.
 
     Attributes:
-        error: pose minus truth (n, 3), world axes. information: as reported (n, 3, 3). ok: whether it is a result.
-        known: axes said to be known (n, 3). iterations: used. least: bound on the covariance (n, 3, 3).
+        error: pose minus truth (n, 3), world axes. results: what the matcher said.
+        least: bound on the covariance (n, 3, 3). truths: where the second scan was taken (n, 3).
     """
 
     error: Array
-    information: Array
-    ok: npt.NDArray[np.bool_]
-    known: Array
-    iterations: npt.NDArray[np.int64]
-    least: Array = field(repr=False)
-    truths: Array = field(repr=False)
+    results: list[MatchResult]
+    least: Array
+    truths: Array
+    ok: Flags = field(init=False)
+    information: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.ok = np.array([result.ok for result in self.results])
+        self.information = np.array([result.information for result in self.results])
 
     @property
     def metres(self) -> Array:
@@ -84,9 +88,15 @@ class Trials:
         return np.degrees(np.abs(self.error[:, 2]))
 
     @property
-    def close(self) -> npt.NDArray[np.bool_]:
+    def close(self) -> Flags:
         """Which came within 2 cm and 0.5 deg, and say so."""
         return self.ok & (self.metres <= CLOSE_M) & (self.degrees <= CLOSE_DEG)
+
+    @property
+    def possible(self) -> Flags:
+        """Where the bound allows success: a quarter of the limits, so that noise alone fails one in ten thousand."""
+        least = np.linalg.eigvalsh(self.least[:, :2, :2])[:, 1]
+        return (least < (0.25 * CLOSE_M) ** 2) & (self.least[:, 2, 2] < np.radians(0.25 * CLOSE_DEG) ** 2)
 
     @property
     def distance2(self) -> Array:
@@ -95,8 +105,8 @@ class Trials:
 
     @property
     def success(self) -> float:
-        """Share of the trials that came close."""
-        return float(self.close.mean())
+        """Share that came close of the trials in which that is possible."""
+        return float(self.close[self.possible].mean())
 
     @property
     def confident_wrong(self) -> int:
@@ -126,22 +136,27 @@ def root_mean(squares: Array) -> float:
 
 def run(case: Case, count: int, seed: int = 11, matcher: Matcher = ours) -> Trials:
     """So many matches, each in its own place with its own noise; the same ones for every matcher."""
-    rng, bearing = np.random.default_rng(seed), bearings(case.beams, case.fov)
-    rows: list[tuple[Array, Array, bool, Array, int]] = []
-    least, truths = [], []
-    L = np.diag((case.prior[0] ** -2, case.prior[0] ** -2, case.prior[1] ** -2))
-    for _ in range(count):
-        T, T_new = place_both(case.scene, rng, case.off)
-        local = mapped(case, T, bearing, rng)
-        view = view_of(scan_at(case.scene, T_new, bearing, rng, case.sigma))
-        result = matcher(view, local, Prior(T, L))
+    said: list[MatchResult] = []
+    errors, least, truths = [], [], []
+    for number in range(count):
+        view, local, prior, T_new = given(case, seed, number)
+        result = matcher(view, local, prior)
         error = result.T_odom_base - T_new
         error[2] = se2.wrap(error[2])
-        rows.append((error, result.information, result.ok, result.known_axes, result.iterations))
-        least.append(bound(case.scene, T, T_new, bearing, case.sigma, case.scans))
+        said.append(result)
+        errors.append(error)
+        least.append(bound(case.scene, prior.T, T_new, bearings(case.beams, case.fov), case.sigma, case.scans))
         truths.append(T_new)
-    error, information, ok, known, iterations = (np.array(column) for column in zip(*rows, strict=True))
-    return Trials(error, information, ok, known, iterations, np.array(least), np.array(truths))
+    return Trials(np.array(errors), said, np.array(least), np.array(truths))
+
+
+def given(case: Case, seed: int, number: int) -> tuple[View, LocalMap, Prior, Array]:
+    """What the matcher is given in this trial, and the true pose."""
+    rng, bearing = np.random.default_rng((seed, number)), bearings(case.beams, case.fov)
+    T, T_new = place_both(case.scene, rng, case.off)
+    local = mapped(case, T, bearing, rng)
+    L = np.diag((case.prior[0] ** -2, case.prior[0] ** -2, case.prior[1] ** -2))
+    return view_of(scan_at(case.scene, T_new, bearing, rng, case.sigma)), local, Prior(T, L), T_new
 
 
 def place_both(scene: Scene, rng: np.random.Generator, off: tuple[float, float]) -> tuple[Array, Array]:
