@@ -8,8 +8,9 @@ from estimator.kernel import kernel
 from estimator.records import Array
 from estimator.scanpoints import ScanPoints
 
-REACH_M = 0.12
-"""Neighbours this near are used: long enough for a direction out of range noise, short enough for furniture."""
+REACH_M, REACH_SIGMAS = 0.12, 8.0
+"""Neighbours this near are used, or within so many times the noise: long enough for a direction out of range noise,
+short enough for furniture. A window that noise itself cuts short picks the points that lie wrong in the same way."""
 
 FEW, GAP_M = 2, 0.5
 """Where beams are sparser than that, so many neighbours on either side, if they are no farther away than this."""
@@ -21,20 +22,20 @@ FLAT = 0.03
 """Largest share of a line's variance across it, unless range noise explains it."""
 
 
-@kernel("Tuple((i8, i8))(f8[:, ::1], i8)")
-def neighbours(xy: Array, i: int) -> tuple[int, int]:
+@kernel("Tuple((i8, i8))(f8[:, ::1], i8, f8)")
+def neighbours(xy: Array, i: int, reach: float) -> tuple[int, int]:
     """Range [low, high) of the points around point ``i``, in scan order, that may lie on its surface."""
     n = len(xy)
     x, y = xy[i, 0], xy[i, 1]
     low, high = i, i + 1
     while low > 0:
         d2 = (xy[low - 1, 0] - x) ** 2 + (xy[low - 1, 1] - y) ** 2
-        if d2 > REACH_M * REACH_M and (i - low >= FEW or d2 > GAP_M * GAP_M):
+        if d2 > reach * reach and (i - low >= FEW or d2 > GAP_M * GAP_M):
             break
         low -= 1
     while high < n:
         d2 = (xy[high, 0] - x) ** 2 + (xy[high, 1] - y) ** 2
-        if d2 > REACH_M * REACH_M and (high - i > FEW or d2 > GAP_M * GAP_M):
+        if d2 > reach * reach and (high - i > FEW or d2 > GAP_M * GAP_M):
             break
         high += 1
     return low, high
@@ -111,9 +112,9 @@ def fit_lines(xy: Array, eye: Array, sigma: float, lines: Array) -> int:
     A row of ``lines`` is the point moved onto its surface (x, y), the normal towards the ``eye`` (x, y), the variance
     of the normal's direction in rad^2, and the extent of the unbroken run it belongs to in m.
     """
-    found = 0
+    found, reach = 0, max(REACH_M, REACH_SIGMAS * sigma)
     for i in range(len(xy)):
-        low, high = neighbours(xy, i)
+        low, high = neighbours(xy, i, reach)
         count = float(high - low)
         if count < 3.0:
             continue

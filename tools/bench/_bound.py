@@ -42,5 +42,5 @@ def seen_from(scene: Scene, T: Array, points: Array, bearing: Array) -> Array:
 
 
 def bound(scene: Scene, T: Array, T_new: Array, bearing: Array, sigma: float, scans: float) -> Array:
-    """Least covariance (3, 3) of a match at ``T_new`` with what ``scans`` scans from ``T`` show: (1 + 1 / scans) / I."""
+    """Least covariance (3, 3) of a match at ``T_new`` with ``scans`` scans from about ``T``: (1 + 1 / scans) / I."""
     return (1.0 + 1.0 / scans) * np.linalg.inv(information(scene, T_new, bearing, sigma, T) + 1e-6 * np.eye(3))
