@@ -42,91 +42,140 @@ TRACE = 13
 Reference = tuple[Array, Ints, Array, Array]
 """Rows, start and rays of the axis, and per row normal x, y, variance of the normal's direction, weight."""
 
-Memory = tuple[Ints, Ints, Array]
+PX, PY, EX, EY, TX, TY = range(6)
+"""Rows of the queries (6, n): place, unit vector towards the lidar, tangent, all in the base frame."""
+
+NX, NY, OFFSET, SLOPE, WEIGHT = range(5)
+"""Rows of the partners' lines (5, n): normal, its product with a place on the line, variance of the normal's direction,
+weight (0: no partner)."""
+
+Memory = tuple[Ints, Ints, Array, Array]
 """Per query: its partner (a row, or -1); the row found when last sought; where the query was then (x, y) and how far,
-squared, it may move until another row can be nearest."""
+squared, it may move until another row can be nearest; the partners' lines (5, n)."""
+
+
+def memory_of(queries: int) -> Memory:
+    """Memory of queries that have never been sought."""
+    return np.full(queries, -1), np.full(queries, -1), np.zeros((queries, 3)), np.zeros((5, queries))
+
+
+def paired(points: Array, reference: Reference, row: Array) -> Ints:
+    """Row of the axis that each of the points (n, 4) was paired with in the iteration of a trace's row, or -1."""
+    coarse = int(row[STRIDE])
+    body, memory = np.empty((6, len(points))), memory_of(len(points))
+    lay_out(points, 0.0, 0.0, coarse, body)
+    pair_up(body, reference, row[:3].copy(), row[GATE] ** 2, -(-len(points) // coarse), memory)
+    out = np.full(len(points), -1)
+    out[::coarse] = memory[0][: -(-len(points) // coarse)]
+    return out
+
+
+@kernel("f8(f8[:, ::1], f8, f8, i8, f8[:, ::1])")
+def lay_out(points: Array, ex: float, ey: float, coarse: int, body: Array) -> float:
+    """Points (n, 4) as columns, every ``coarse``-th of them first, seen from the lidar at (ex, ey).
+
+    Returns their root mean square distance from it: metres that they move per radian.
+    """
+    n, at, square = len(points), 0, 0.0
+    for first in range(coarse):
+        for i in range(first, n, coarse):
+            x, y = points[i, 0], points[i, 1]
+            dx, dy = ex - x, ey - y
+            r2 = dx * dx + dy * dy
+            inverse = 1.0 / np.sqrt(r2) if r2 > 0.0 else 0.0
+            body[PX, at], body[PY, at], body[EX, at], body[EY, at] = x, y, dx * inverse, dy * inverse
+            body[TX, at], body[TY, at] = points[i, 2], points[i, 3]
+            square += r2
+            at += 1
+    return float(np.sqrt(square / max(n, 1)))
+
+
+@kernel("void(f8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])")
+def hold(rows: Array, lines: Array, row: int, i: int, held: Array) -> None:
+    """Write the line of a row (-1: none) where the sums of query ``i`` look for it."""
+    if row < 0:
+        held[WEIGHT, i] = 0.0
+        return
+    nx, ny = lines[row, 0], lines[row, 1]
+    held[NX, i], held[NY, i] = nx, ny
+    held[OFFSET, i] = nx * rows[row, 0] + ny * rows[row, 1]
+    held[SLOPE, i], held[WEIGHT, i] = lines[row, 2], lines[row, 3]
 
 
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, i8,"
-    " Tuple((i8[::1], i8[::1], f8[:, ::1])))"
+    " Tuple((i8[::1], i8[::1], f8[:, ::1], f8[:, ::1])))"
 )
-def pair_up(points: Array, reference: Reference, T: Array, gate2: float, stride: int, memory: Memory) -> int:
-    """Step 1 of Sect. 4.2: the nearest row within the gate for every ``stride``-th point at pose ``T``.
+def pair_up(body: Array, reference: Reference, T: Array, gate2: float, count: int, memory: Memory) -> int:
+    """Step 1 of Sect. 4.2: the nearest row within the gate for the first ``count`` queries at pose ``T``.
 
-    A point that has not left its safe radius keeps its row without being looked up; returns how many were.
+    A query that has not left its safe radius keeps its row without being looked up; returns how many were.
     """
+    rows, start, rays, lines = reference
+    partner, found, safe, held = memory
+    c, s, x, y = np.cos(T[2]), np.sin(T[2]), T[0], T[1]
     sought = 0
-    rows, start, rays, _ = reference
-    partner, found, safe = memory
-    c, s = np.cos(T[2]), np.sin(T[2])
-    for i in range(0, len(points), stride):
-        px = c * points[i, 0] - s * points[i, 1] + T[0]
-        py = s * points[i, 0] + c * points[i, 1] + T[1]
+    for i in range(count):
+        px = c * body[PX, i] - s * body[PY, i] + x
+        py = s * body[PX, i] + c * body[PY, i] + y
         row = found[i]
         if row >= 0 and (px - safe[i, 0]) ** 2 + (py - safe[i, 1]) ** 2 < safe[i, 2]:
             d2 = (px - rows[row, 0]) ** 2 + (py - rows[row, 1]) ** 2
-            partner[i] = row if d2 < gate2 else -1
-            continue
-        row, d2, e2 = nearest(rows, start, rays, px, py, gate2)
-        partner[i] = found[i] = row
-        safe[i, 0], safe[i, 1] = px, py
-        safe[i, 2] = 0.25 * (np.sqrt(e2) - np.sqrt(d2)) ** 2
-        sought += 1
+            if d2 >= gate2:
+                row = -1
+        else:
+            row, d2, e2 = nearest(rows, start, rays, px, py, gate2)
+            found[i] = row
+            safe[i, 0], safe[i, 1] = px, py
+            safe[i, 2] = 0.25 * (np.sqrt(e2) - np.sqrt(d2)) ** 2
+            sought += 1
+        if row != partner[i]:
+            partner[i] = row
+            hold(rows, lines, row, i, held)
     return sought
 
 
-@kernel("void(f8[:, ::1], Tuple((f8[:, ::1], f8[:, ::1], i8[::1])), f8[::1], Tuple((f8, f8, f8)), i8, f8[::1])")
-def sum_up(
-    points: Array,
-    pairs: tuple[Array, Array, Ints],
-    T: Array,
-    how: tuple[float, float, float],
-    stride: int,
-    sums: Array,
-) -> None:
-    """Step 2 of Sect. 4.2: the normal equations of point-to-line over the pairs.
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1], f8, i8, f8[::1])")
+def sum_up(body: Array, held: Array, T: Array, scale: float, queries: int, sums: Array) -> None:
+    """Step 2 of Sect. 4.2: the normal equations of point-to-line over the pairs of the first queries.
 
-    ``points``: x, y and tangent (n, 4). ``pairs``: rows, lines and each point's partner. ``how``: lidar in the base
-    frame (x, y), robust scale. ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient,
+    A pair does not count where the point would be seen from behind the surface (the other side of a thin wall), or lies
+    askew to it (the other wall of a corner).
+    ``scale``: robust scale, m. ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient,
     inliers, pairs, robust weights and squares (m^2, scaled to what they would be as range noise).
+
+    Written without branches, over columns, so that the compiler may take several pairs at a time.
     """
-    rows, lines, partner = pairs
-    c, s = np.cos(T[2]), np.sin(T[2])
-    ex, ey = c * how[0] - s * how[1] + T[0], s * how[0] + c * how[1] + T[1]
-    k = 1.0 / (how[2] * how[2])
+    px, py, ex, ey, tx, ty = body[PX], body[PY], body[EX], body[EY], body[TX], body[TY]
+    nx, ny, offset, slope, weight = held[NX], held[NY], held[OFFSET], held[SLOPE], held[WEIGHT]
+    c, s, x, y = np.cos(T[2]), np.sin(T[2]), T[0], T[1]
+    k = 1.0 / (scale * scale)
     h00 = h01 = h02 = h11 = h12 = h22 = 0.0
     n00 = n01 = n02 = n11 = n12 = n22 = 0.0
     g0 = g1 = g2 = inliers = count = weights = squares = 0.0
-    for i in range(0, len(points), stride):
-        row = partner[i]
-        if row < 0:
-            continue
-        ux, uy = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
-        px, py = ux + T[0], uy + T[1]
-        nx, ny, tx, ty = lines[row, 0], lines[row, 1], points[i, 2], points[i, 3]
-        facing = nx * (ex - px) + ny * (ey - py)
-        if facing <= 0.0:
-            continue  # seen from behind: the other side of a thin wall
-        if abs(nx * (c * tx - s * ty) + ny * (s * tx + c * ty)) > ASKEW:
-            continue  # the other wall of a corner
-        cos2 = facing * facing / ((ex - px) ** 2 + (ey - py) ** 2)
-        p = 1.0 / (GRAZE + (1.0 - GRAZE) * cos2)  # precision in units of the range noise
-        e = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
-        w = 1.0 / (1.0 + p * k * e * e)
-        count += 1.0
+    for i in range(queries):
+        u, v = nx[i], ny[i]
+        bx, by = c * u + s * v, c * v - s * u  # the normal in the base frame
+        cosine = bx * ex[i] + by * ey[i]
+        use = (weight[i] > 0.0) & (cosine > 0.0) & (abs(bx * tx[i] + by * ty[i]) <= ASKEW)
+        one = 1.0 if use else 0.0
+        along, turn = bx * px[i] + by * py[i], by * px[i] - bx * py[i]
+        e = along + u * x + v * y - offset[i]
+        q = GRAZE + (1.0 - GRAZE) * cosine * cosine  # variance of e in units of the range noise's: 1 / precision
+        z = one / (q + k * e * e)
+        w = z * q
+        count += one
         inliers += 1.0 if w > 0.2 else 0.0
         weights += w
-        p *= lines[row, 3]
-        squares += w * p * e * e
-        w *= p
-        turn, along = ny * ux - nx * uy, nx * ux + ny * uy
-        h00, h01, h02 = h00 + w * nx * nx, h01 + w * nx * ny, h02 + w * nx * turn
-        h11, h12, h22 = h11 + w * ny * ny, h12 + w * ny * turn, h22 + w * turn * turn
-        v = w * lines[row, 2]
-        n00, n01, n02 = n00 + v * ny * ny, n01 - v * nx * ny, n02 - v * ny * along
-        n11, n12, n22 = n11 + v * nx * nx, n12 + v * nx * along, n22 + v * along * along
-        g0, g1, g2 = g0 + w * nx * e, g1 + w * ny * e, g2 + w * turn * e
+        z *= weight[i]
+        ze = z * e
+        squares += ze * e
+        h00, h01, h02 = h00 + z * u * u, h01 + z * u * v, h02 + z * u * turn
+        h11, h12, h22 = h11 + z * v * v, h12 + z * v * turn, h22 + z * turn * turn
+        g0, g1, g2 = g0 + ze * u, g1 + ze * v, g2 + ze * turn
+        z *= slope[i]
+        n00, n01, n02 = n00 + z * v * v, n01 - z * u * v, n02 - z * v * along
+        n11, n12, n22 = n11 + z * u * u, n12 + z * u * along, n22 + z * along * along
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = h00, h01, h02, h11, h12, h22
     sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = n00, n01, n02, n11, n12, n22
     sums[12], sums[13], sums[14] = g0, g1, g2
@@ -172,15 +221,6 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
             H[i, j] = keep[i, 0] * M[0, j] + keep[i, 1] * M[1, j] + keep[i, 2] * M[2, j]
 
 
-@kernel("f8(f8[:, ::1], f8[::1])")
-def mean_lever(points: Array, eye: Array) -> float:
-    """Root mean square distance of the points from the lidar: metres that they move per radian."""
-    square = 0.0
-    for i in range(len(points)):
-        square += (points[i, 0] - eye[0]) ** 2 + (points[i, 1] - eye[1]) ** 2
-    return float(np.sqrt(square / max(len(points), 1)))
-
-
 @kernel("f8(f8[::1], f8[:, ::1], f8[::1])")
 def between(u: Array, A: Array, v: Array) -> float:
     """``u' A v`` of two steps (3,), as the information A (3, 3) weighs them."""
@@ -201,35 +241,30 @@ def iterate(
     """Iterate Eq. 13-14 from ``T`` (relative to the axis centre), which is moved in place; the number of iterations.
 
     The robust scale shrinks from twice what the prediction's uncertainty moves a point to a few times the noise, not
-    faster than the steps do; until then every fourth point will do. A step that turns back on the one before is halved:
-    pairs may alternate between two sets.
+    faster than the steps do; until an iteration has been made near the last scale every fourth point will do. A step
+    that turns back on the one before is halved: pairs may alternate between two sets.
     ``how``: lidar in the base frame (x, y), iteration cap, gate, last scale, noise, least step in its own deviations,
     stride while coarse. ``out``: the laser's information (3, 3); the sums of the last pass with SETTLED, LENGTH2
     (squared length of the last step in its own deviations) and DAMPING; the trace (cap, TRACE), a row an iteration.
     """
     H, sums, trace = out
-    T1 = T.copy()
-    A = np.empty((3, 3))
-    b = np.empty(3)
-    step = np.empty(3)
-    before = np.zeros(3)
-    keep = np.empty((3, 3))
-    last, lever = how[4], mean_lever(points, how[:2])
+    n, coarse = len(points), int(how[7])
+    T1, before = T.copy(), np.zeros(3)
+    A, keep, b, step = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    body, memory = np.empty((6, n)), (np.full(n, -1), np.full(n, -1), np.empty((n, 3)), np.zeros((5, n)))
+    lever = lay_out(points, how[0], how[1], coarse, body)
+    last = how[4]
     spread = np.sqrt(1.0 / L1[0, 0] + 1.0 / L1[1, 1] + lever * lever / L1[2, 2])
-    scale = min(max(last, 2.0 * spread), 0.5 * how[3])
-    memory = (np.full(len(points), -1), np.full(len(points), -1), np.zeros((len(points), 3)))
-    damping = 1.0
-    count = 0
+    scale, stride, damping, count = min(max(last, 2.0 * spread), 0.5 * how[3]), coarse, 1.0, 0
     sums[SETTLED] = 0.0
     while count < how[2] and sums[SETTLED] == 0.0:
         row = trace[count]
         count += 1
-        stride = int(how[7]) if scale > 2.0 * last else 1
-        k = stride / (how[5] * how[5])
+        few, k = (n + stride - 1) // stride, stride / (how[5] * how[5])
         gate = min(how[3], max(6.0 * scale, 0.1))
         row[AT_X], row[AT_Y], row[AT_YAW], row[SCALE], row[GATE], row[STRIDE] = T[0], T[1], T[2], scale, gate, stride
-        row[SOUGHT] = pair_up(points, reference, T, gate * gate, stride, memory)
-        sum_up(points, (reference[0], reference[3], memory[0]), T, (how[0], how[1], scale), stride, sums)
+        row[SOUGHT] = pair_up(body, reference, T, gate * gate, few, memory)
+        sum_up(body, memory[3], T, scale, few, sums)
         sums[INLIERS] *= stride
         sums[PAIRS] *= stride
         row[FITTED : SQUARED + 1] = sums[INLIERS : SQUARES + 1]
@@ -250,7 +285,9 @@ def iterate(
             before[i] = step[i]
         sums[LENGTH2], sums[DAMPING] = length2, damping
         row[STEP2], row[DAMPED] = length2, damping
-        sums[SETTLED] = 1.0 if length2 < how[6] * how[6] and scale == last else 0.0
+        sums[SETTLED] = 1.0 if length2 < how[6] * how[6] and scale == last and stride == 1 else 0.0
+        if scale <= 2.0 * last:
+            stride = 1
         moved = np.sqrt(step[0] * step[0] + step[1] * step[1]) + lever * abs(step[2])
         scale = max(last, min(scale, max(0.25 * scale, SHRINK * moved)))
     return count

@@ -42,7 +42,7 @@ class MatchSettings:
 
     gate_m: float = 0.5
     scale: float = 2.5
-    settled: float = 0.2
+    settled: float = 0.3
     min_points: int = 10
     tracking: tuple[tuple[float, float], ...] = ((0.35, 0.35),)
     searching: tuple[tuple[float, float], ...] = ((0.6, 0.1), (0.5, 0.02))

@@ -36,32 +36,59 @@ def reference_of(local: LocalMap) -> tuple[Array, np.ndarray, Array, Array]:
     return axis.rows, axis.start, axis.rays, local.lines
 
 
-def empty_memory(n: int) -> tuple[np.ndarray, np.ndarray, Array]:
-    return np.full(n, -1), np.full(n, -1), np.zeros((n, 3))
+def columns_of(view: View) -> Array:
+    body = np.empty((6, len(view.points)))
+    icp.lay_out(view.points, 0.0, 0.0, 1, body)
+    return body
+
+
+def test_points_are_laid_out_coarse_ones_first() -> None:
+    _, view, _ = small_pair()
+    eye, n = np.array((0.3, -0.2)), len(view.points)
+    body = np.empty((6, n))
+    lever = icp.lay_out(view.points, eye[0], eye[1], 4, body)
+    order = np.concatenate([np.arange(k, n, 4) for k in range(4)])
+    away = eye - view.points[:, :2]
+    distance = np.hypot(*away.T)
+    assert lever == pytest.approx(np.sqrt((distance**2).mean()))
+    expected = np.column_stack((view.points[:, :2], away / distance[:, None], view.points[:, 2:]))
+    np.testing.assert_allclose(body.T, expected[order], rtol=1e-12)
+    icp.lay_out(view.points[:1], view.points[0, 0], view.points[0, 1], 1, body)
+    np.testing.assert_array_equal(body[2:4, 0], 0.0)  # a point on the lidar itself faces nothing
 
 
 def test_pairs_within_their_safe_radius_are_those_a_new_search_finds() -> None:
+    """And the lines that are held for the sums are those of the pairs."""
     local, view, T = small_pair()
-    memory, rng = empty_memory(len(view.points)), np.random.default_rng(0)
+    body, n = columns_of(view), len(view.points)
+    memory, rng = icp.memory_of(n), np.random.default_rng(0)
     kept = 0
     for _ in range(8):
         T = T + rng.normal(0.0, 1.0, 3) * (0.002, 0.002, 0.0005)
         before = memory[2].copy()
-        icp.pair_up(view.points, reference_of(local), T, 0.15**2, 1, memory)
-        kept += int((memory[2] == before).all(axis=1).sum())
-        fresh = empty_memory(len(view.points))
-        icp.pair_up(view.points, reference_of(local), T, 0.15**2, 1, fresh)
+        sought = icp.pair_up(body, reference_of(local), T, 0.15**2, n, memory)
+        assert sought == n - (memory[2] == before).all(axis=1).sum()
+        kept += n - sought
+        fresh = icp.memory_of(n)
+        assert icp.pair_up(body, reference_of(local), T, 0.15**2, n, fresh) == n
         np.testing.assert_array_equal(memory[0], fresh[0])
-    assert kept > 2 * len(view.points)
+        row, held = memory[0], memory[3]
+        np.testing.assert_array_equal(held[icp.WEIGHT], np.where(row < 0, 0.0, local.lines[row, 3]))
+        anchors = (local.lines[row, :2] * local.axis.rows[row, :2]).sum(axis=1)
+        np.testing.assert_allclose(held[icp.OFFSET, row >= 0], anchors[row >= 0])
+        np.testing.assert_array_equal(held[:2, row >= 0], local.lines[row, :2].T[:, row >= 0])
+    assert kept > 2 * n
 
 
 def test_sums_are_the_normal_equations() -> None:
     """Against the definition: gradient and information of the robust cost, by finite differences of the residuals."""
     local, view, T = small_pair()
-    memory, sums, scale = empty_memory(len(view.points)), np.zeros(21), 0.03
-    icp.pair_up(view.points, reference_of(local), T, 0.25, 1, memory)
-    icp.sum_up(view.points, (local.axis.rows, local.lines, memory[0]), T, (0.0, 0.0, scale), 1, sums)
-    H, g, used = np.zeros((3, 3)), np.zeros(3), 0
+    body, memory = columns_of(view), icp.memory_of(len(view.points))
+    sums, scale = np.zeros(icp.SUMS), 0.03
+    icp.pair_up(body, reference_of(local), T, 0.25, len(view.points), memory)
+    icp.sum_up(body, memory[3], T, scale, len(view.points), sums)
+    H, g, used, squares = np.zeros((3, 3)), np.zeros(3), 0, 0.0
+    noise, weights, inliers = np.zeros((3, 3)), 0.0, 0
     for point, row in zip(view.points, memory[0], strict=True):
         if row < 0:
             continue
@@ -77,11 +104,18 @@ def test_sums_are_the_normal_equations() -> None:
         step = 1e-6
         J = np.array([(residual(T + d) - residual(T - d)) / (2 * step) for d in step * np.eye(3)])
         p = 1.0 / (icp.GRAZE + (1.0 - icp.GRAZE) * (n @ to_eye) ** 2 / (to_eye @ to_eye))
-        w = p * local.lines[row, 3] / (1.0 + p * (residual(T) / scale) ** 2)
+        robust = 1.0 / (1.0 + p * (residual(T) / scale) ** 2)
+        w = p * local.lines[row, 3] * robust
         H, g, used = H + w * np.outer(J, J), g + w * J * residual(T), used + 1
+        across = np.array((-n[1], n[0], float(n @ (se2.rotation(T[2])[:2, :2] @ point[:2]))))
+        noise += w * local.lines[row, 2] * np.outer(across, across)
+        squares, weights, inliers = squares + w * residual(T) ** 2, weights + robust, inliers + (robust > 0.2)
     assert used == sums[icp.PAIRS] > 50
+    assert inliers == sums[icp.INLIERS]
     np.testing.assert_allclose(sums[:6], H[np.triu_indices(3)], rtol=1e-6)
+    np.testing.assert_allclose(sums[6:12], noise[np.triu_indices(3)], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(sums[12:15], g, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(sums[icp.WEIGHTS : icp.SQUARES + 1], (weights, squares), rtol=1e-9)
 
 
 def test_noise_alone_is_no_information() -> None:
@@ -108,7 +142,7 @@ def test_a_small_match_finds_its_place() -> None:
     assert result.inliers > 0.8 * result.queries
     np.testing.assert_array_equal(result.known_axes, 1.0)
     again = attempt(view, local, prior_at(T_wrong, 0.2, 0.1), 30, SETTINGS)
-    np.testing.assert_array_equal(again.T, result.T_odom_base)
+    np.testing.assert_array_equal((*again.T[:2], se2.wrap(again.T[2])), result.T_odom_base)
 
 
 def test_the_trace_tells_every_iteration() -> None:
@@ -123,12 +157,35 @@ def test_the_trace_tells_every_iteration() -> None:
     assert trace[0, icp.SOUGHT] == len(view.points) > trace[-1, icp.SOUGHT]
     assert (np.diff(trace[:, icp.SCALE]) <= 0.0).all()
     assert (trace[:, icp.STRIDE] == 1.0).all()
+    assert_traced(local, view, trace)
+
+
+def assert_traced(local: LocalMap, view: View, trace: Array) -> None:
+    body = columns_of(view)
     for row in trace:
-        memory, sums = empty_memory(len(view.points)), np.zeros(icp.SUMS)
-        icp.pair_up(view.points, reference_of(local), row[:3].copy(), row[icp.GATE] ** 2, 1, memory)
-        how = (0.0, 0.0, row[icp.SCALE])
-        icp.sum_up(view.points, (local.axis.rows, local.lines, memory[0]), row[:3].copy(), how, 1, sums)
-        np.testing.assert_allclose(row[icp.FITTED : icp.SQUARED + 1], sums[icp.INLIERS : icp.SQUARES + 1], rtol=1e-9)
+        n, sums, stride = len(view.points), np.zeros(icp.SUMS), int(row[icp.STRIDE])
+        used = np.ascontiguousarray(body[:, ::stride])
+        partner, memory = icp.paired(view.points, reference_of(local), row), icp.memory_of(n)
+        sought = icp.pair_up(used, reference_of(local), row[:3].copy(), row[icp.GATE] ** 2, used.shape[1], memory)
+        assert sought == used.shape[1] >= row[icp.SOUGHT]
+        np.testing.assert_array_equal(partner[::stride], memory[0][: used.shape[1]])
+        assert (np.delete(partner, np.s_[::stride]) == -1).all()
+        icp.sum_up(used, memory[3], row[:3].copy(), row[icp.SCALE], used.shape[1], sums)
+        told = row[icp.FITTED : icp.SQUARED + 1] / (stride, stride, 1.0, 1.0)
+        np.testing.assert_allclose(told, sums[icp.INLIERS : icp.SQUARES + 1], rtol=1e-9)
+
+
+@pytest.mark.jit
+def test_few_points_do_while_the_pose_is_far_off() -> None:
+    local, view, T, T_new = pair_of(office(), WIDE, 0.1, 3.0, np.random.default_rng(2))
+    found = attempt(view, local, prior_at(T, 0.1, 0.1), 30, SETTINGS)
+    strides = found.trace[:, icp.STRIDE]
+    assert strides[0] == SETTINGS.coarse
+    assert strides[-1] == 1.0
+    assert (np.diff(strides) <= 0.0).all()
+    assert found.trace[:, icp.SOUGHT].sum() < 3.5 * len(view.points)
+    assert_traced(local, view, found.trace)
+    assert np.abs(found.T - T_new)[:2].max() < 0.005
 
 
 def errors(
