@@ -221,6 +221,15 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
             H[i, j] = keep[i, 0] * M[0, j] + keep[i, 1] * M[1, j] + keep[i, 2] * M[2, j]
 
 
+@kernel("f8(f8[:, ::1], f8[::1])")
+def mean_lever(points: Array, eye: Array) -> float:
+    """Root mean square distance of the points from the lidar: metres that they move per radian."""
+    square = 0.0
+    for i in range(len(points)):
+        square += (points[i, 0] - eye[0]) ** 2 + (points[i, 1] - eye[1]) ** 2
+    return float(np.sqrt(square / max(len(points), 1)))
+
+
 @kernel("f8(f8[::1], f8[:, ::1], f8[::1])")
 def between(u: Array, A: Array, v: Array) -> float:
     """``u' A v`` of two steps (3,), as the information A (3, 3) weighs them."""
