@@ -103,6 +103,15 @@ def sector_of(x: float, y: float, sectors: int) -> int:
     return max(0, min(sectors - 1, int(turn_of(x, y) * 0.25 * sectors)))
 
 
+@kernel("f8(f8[:, ::1], i8, f8, f8, f8)")
+def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float:
+    """Squared distance of a query from the ray ``s``: beyond a right angle its nearest point is the centre."""
+    if rays[s, 0] * qx + rays[s, 1] * qy <= 0.0:
+        return r2
+    cross: float = rays[s, 0] * qy - rays[s, 1] * qx
+    return cross * cross
+
+
 @kernel("void(f8[:, ::1], i8[::1], i8, i8)")
 def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
     """Shell's sort of rows [lo, hi) by distance."""
