@@ -19,6 +19,9 @@ VAGUE = np.diag((4.0, 4.0, 33.0))
 FIRST, SECOND = 30, 20
 """Most iterations of a first attempt, and of the one that finishes a second opinion."""
 
+FEW = 3.0
+"""Points that a direction must be seen with before it can speak against a place."""
+
 SURE = 0.8
 """Share of fitting beams beyond which a good prediction needs no further evidence."""
 
@@ -45,7 +48,8 @@ class MatchSettings:
     settled: float = 0.3
     min_points: int = 10
     tracking: tuple[tuple[float, float], ...] = ((0.35, 0.35),)
-    searching: tuple[tuple[float, float], ...] = ((0.6, 0.1), (0.5, 0.02))
+    searching: tuple[tuple[float, float], ...] = ((0.6, 0.03), (0.5, 0.01))
+    held: float = 0.5
     wide_m: float = 0.15
     wide_rad: float = 0.1
     doubt_share: float = 0.6
@@ -209,10 +213,37 @@ def plausible(
     ways = settings.searching if wide or surprise else settings.tracking
     if best.share < ways[-1][0]:
         return False
-    if best.share > SURE and not wide:
+    if best.share > SURE and ways is settings.tracking:
         return True
     against = contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m)
-    return any(best.share >= share and against <= most for share, most in ways)
+    if not any(best.share >= share and against <= most for share, most in ways):
+        return False
+    return ways is settings.tracking or held(best, local, settings) >= settings.held
+
+
+def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
+    """Share of the surfaces seen that fit the map, in the direction where it is smallest of those that count as known.
+
+    A scan that is shifted along a wall fits it as well as ever, with most of its points; what shows the error are the
+    few that lie across. Directions in which hardly anything is seen count as fitting.
+    """
+    known = np.flatnonzero(known_axes(best.H)[:2])
+    if len(known) == 0:
+        return 1.0
+    axis, points = local.axis, best.view.points
+    row, scale = np.zeros(icp.TRACE), settings.scale * best.view.noise_m
+    row[:3] = T = best.T - np.array((axis.centre[0], axis.centre[1], 0.0))
+    row[icp.GATE], row[icp.STRIDE] = max(6.0 * scale, 0.1), 1.0
+    partner = icp.paired(points, (axis.rows, axis.start, axis.rays, local.lines), row)
+    R = se2.rotation(T[2])[:2, :2]
+    normal, tangent = local.lines[partner, :2], points[:, 2:] @ R.T
+    off = (normal * (se2.apply(T, points[:, :2]) - axis.rows[partner, :2])).sum(axis=1)
+    askew = np.abs((normal * tangent).sum(axis=1))
+    fits = (partner >= 0) & (np.abs(off) < 2.0 * scale) & (askew < icp.ASKEW)
+    across = np.column_stack((-tangent[:, 1], tangent[:, 0]))[:, known]
+    few = FEW * np.eye(len(known))
+    seen, fitting = across.T @ across + few, across[fits].T @ across[fits] + few
+    return float(np.linalg.eigvals(np.linalg.solve(seen, fitting)).real.min())
 
 
 def known_axes(H: Array) -> Array:
