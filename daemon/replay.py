@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -28,6 +28,9 @@ from daemon.sources import Source, open_log, sha256_of
 from daemon.versions import versions
 from estimator.grid import Grid
 from hal.errors import DataInvalid, HalError
+
+if TYPE_CHECKING:  # loaded only where somebody asks for matches
+    from daemon.matchjournal import MatchJournal
 
 PROGRESS_S: Final = 1.0
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
@@ -51,21 +54,32 @@ class Outcome:
     source: Source
     config: Config
     rerun: Rerun
+    journal: MatchJournal | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     stopped: str = ""
 
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
-    return command(args, _write_all)
+    if args.journal is None and args.journal_at is None:
+        return command(args, _write_all)
+    from daemon import matchjournal
+
+    try:
+        wanted = matchjournal.choice_of(args.journal, args.journal_at)
+    except matchjournal.BadChoice as error:
+        return cli.fail(str(error), cli.USAGE)
+    return command(args, _write_all, matchjournal.MatchJournal(wanted))
 
 
-def command(args: argparse.Namespace, write: Callable[[Folder, Outcome], None]) -> int:
+def command(
+    args: argparse.Namespace, write: Callable[[Folder, Outcome], None], journal: MatchJournal | None = None
+) -> int:
     """Replay ``args.log``, let ``write`` put results into ``args.out``, and say how it went; returns the exit code."""
     try:
         folder = Folder(args.out)
         keys = tuple(override.partition("=")[0].strip() for override in args.set)
-        outcome = replay(args.log, args.settings, Given(args.config is not None, keys))
+        outcome = replay(args.log, args.settings, Given(args.config is not None, keys), journal)
         write(folder, outcome)
     except (HalError, OutputRefused) as error:
         return cli.fail(str(error))
@@ -74,13 +88,14 @@ def command(args: argparse.Namespace, write: Callable[[Folder, Outcome], None]) 
     return _verdict(outcome)
 
 
-def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN) -> Outcome:
+def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: MatchJournal | None = None) -> Outcome:
     """Run a log through the pipeline.
 
     Args:
         path: the log.
         config: resolved configuration.
         given: what of it a person has asked for; what nobody asked for is taken from a log that knows it.
+        journal: which matches are kept to be looked at.
 
     Raises:
         HalError: the log cannot be opened; what goes wrong later ends the run and is said in `Outcome.stopped`.
@@ -89,7 +104,7 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN) -> Outcome:
     _say(f"replay: reading {path}")
     source = open_log(path)
     used = config_for(source, config, given)
-    outcome = Outcome(source, used, Rerun(source, used, lights_for(source, used, given)))
+    outcome = Outcome(source, used, Rerun(source, used, lights_for(source, used, given), journal), journal)
     outcome.seconds["read"] = time.perf_counter() - begun
     begun = time.perf_counter()
     try:
@@ -196,6 +211,8 @@ def _verdict(outcome: Outcome) -> int:
         sys.stderr.write("\r\x1b[K")
     for sentence in source.report.sentences():
         sys.stderr.write(f"replay: {source.path}: {sentence}\n")
+    for sentence in () if outcome.journal is None else outcome.journal.sentences():
+        sys.stderr.write(f"replay: {sentence}\n")
     if not len(rerun.ledger):
         sources = "a scan or light" if rerun.blocks else "a scan"
         return cli.fail(f"{source.path}: {source.kind} without {sources} that gave a pose")
@@ -222,6 +239,8 @@ def _write_all(folder: Folder, outcome: Outcome) -> None:
     ]
     try:
         folder.write_each(files)
+        if outcome.journal is not None:
+            folder.write_each(outcome.journal.files())
     finally:
         outcome.seconds["write"] = time.perf_counter() - begun
         folder.write("timing.json", _json(timing(outcome)))

@@ -6,7 +6,7 @@ import math
 import time
 from array import array
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from hal.adc import AdcStatus, RawSamples
 from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
+
+if TYPE_CHECKING:  # loaded only where somebody asks for matches
+    from daemon.matchjournal import MatchJournal
 
 RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
 """Metres per cell of an exported map: the finest that the map's extent allows."""
@@ -89,7 +92,9 @@ class Timing:
 class Rerun:
     """One log through one fresh daemon cycle: feed it every event, then ask for the results."""
 
-    def __init__(self, source: Source, config: Config, lights: Lights | None = None) -> None:
+    def __init__(
+        self, source: Source, config: Config, lights: Lights | None = None, journal: MatchJournal | None = None
+    ) -> None:
         self.ledger = Ledger()
         self.comparison = Comparison()
         self.timing = Timing()
@@ -99,6 +104,9 @@ class Rerun:
         self._source = source
         self._clock = ReplayClock()
         self._state = new_state(lights, pipeline.Settings(history=True))
+        self._journal = journal
+        if journal is not None:
+            journal.attach(self._state)
         self._caps = ReplayBudget()
         self._answers: dict[int, tuple[int, ...]] = {}
         self._latest: tuple[float, float] = (0.0, 0.0)
@@ -220,6 +228,8 @@ class Rerun:
         return self._kept.pop()
 
     def _step(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
+        if self._journal is not None:
+            self._journal.begins(self.t_first)
         if any(getattr(record, "order", None) is Order.RESET for record in records):
             self.ledger.settle(pipeline.keyframe_poses(self._state))
         begun = time.perf_counter()

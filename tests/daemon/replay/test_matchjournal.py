@@ -1,0 +1,183 @@
+"""`lumiloop replay --journal`: matches as files, of foreign logs and of our own recordings, and wrong choices."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon import cli, matchjournal, matchplot
+from daemon.matchjournal import MOST, MOST_FAILED, BadChoice, Choice, MatchJournal, choice_of
+from estimator import matching
+from estimator.result import Reason
+from tests.daemon.replay.room import Drive, carmen, drive, read_tum
+from tests.daemon.replay.test_recorded_lights import calm, record
+from tests.daemon.replay.test_replay import RESULTS
+
+SCANS = 40
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = drive(SCANS)
+    ranges = run.ranges.copy()
+    ranges[20:25] = 81.9  # nothing returns: five scans without a point
+    return carmen(tmp_path_factory.mktemp("log") / "room.log", Drive(run.truth, run.odometry, ranges, run.stamps))
+
+
+@pytest.fixture(scope="module")
+def out(log: Path) -> Path:
+    folder = log.parent / "out"
+    arguments = ["--journal", "1,12", "--journal-at", "3.05"]
+    assert cli.main(["replay", str(log), "--out", str(folder), *arguments]) == cli.OK
+    return folder
+
+
+def written(folder: Path, number: int) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / f"match-{number}.json").read_text())
+    return content
+
+
+def test_the_matches_asked_for_are_written_and_no_others(out: Path) -> None:
+    names = {f"match-{n}.{kind}" for n in (1, 12, 32) for kind in ("json", "png")}  # 3.1 s is scan 32
+    assert {file.name for file in out.iterdir()} == RESULTS | names
+
+
+def test_a_match_is_all_there(out: Path) -> None:
+    match = written(out, 12)
+    assert (match["format"], match["version"]) == ("lumiloop-match", 1)
+    assert match["seconds"] == pytest.approx(1.1, abs=1e-6)
+    assert match["result"]["ok"]
+    (first,) = match["attempts"]
+    assert first["what"] == "first"
+    assert first["found"] == pytest.approx(match["result"]["T_odom_base"], abs=1e-12)
+    assert first["T_odom_base"] == match["asked"]["T_odom_base"]
+    assert len(first["iterations"]) == match["result"]["iterations"]
+    elements = np.array(match["asked"]["map"]["elements"])
+    x, y, nx, ny = (match["asked"]["map"]["columns"].index(name) for name in ("x", "y", "normal_x", "normal_y"))
+    for one in first["iterations"]:
+        pair = one["pair"]
+        point, element = np.array(first["points"])[pair["point"]], elements[pair["element"]]
+        px, py, yaw = one["T_odom_base"]
+        at_x = px + math.cos(yaw) * point[:, 0] - math.sin(yaw) * point[:, 1]
+        at_y = py + math.sin(yaw) * point[:, 0] + math.cos(yaw) * point[:, 1]
+        residual = element[:, nx] * (at_x - element[:, x]) + element[:, ny] * (at_y - element[:, y])
+        np.testing.assert_allclose(residual, pair["residual_m"], atol=3e-5)  # the files are rounded to micrometres
+        assert len(pair["point"]) * one["every"] == one["pairs"]
+        assert sum(pair["fits"]) * one["every"] == one["inliers"]
+        assert one["inliers"] <= one["pairs"] <= len(first["points"])
+
+
+def test_the_number_is_the_line_of_the_trajectory(out: Path) -> None:
+    stamps, poses = read_tum(out / "online.tum")
+    for number in (12, 32):
+        match = written(out, number)
+        assert stamps[number - 1] - stamps[0] == pytest.approx(match["seconds"], abs=1e-5)
+        np.testing.assert_allclose(poses[number - 1, :2], match["result"]["T_odom_base"][:2], atol=1e-5)
+
+
+def test_the_first_scan_has_nothing_to_match(out: Path) -> None:
+    match = written(out, 1)
+    assert (match["result"]["reason"], match["asked"], match["attempts"]) == ("NO_MAP", None, [])
+    assert len(match["points"]) > 100
+    assert match["light"] is None
+
+
+def test_pictures_are_pictures(out: Path) -> None:
+    from PIL import Image
+
+    for number in (1, 12):
+        with Image.open(out / f"match-{number}.png") as image:
+            assert min(image.size) > 800
+            assert len(image.convert("RGB").getcolors(1 << 24) or []) > 30
+
+
+def test_a_journal_changes_no_result_and_is_the_same_twice(log: Path, out: Path, tmp_path: Path) -> None:
+    assert cli.main(["replay", str(log), "--out", str(tmp_path / "plain")]) == cli.OK
+    for name in RESULTS - {"timing.json"}:
+        assert (tmp_path / "plain" / name).read_bytes() == (out / name).read_bytes(), name
+    assert cli.main(["replay", str(log), "--out", str(tmp_path / "again"), "--journal", "12"]) == cli.OK
+    for kind in ("json", "png"):
+        assert (tmp_path / "again" / f"match-12.{kind}").read_bytes() == (out / f"match-12.{kind}").read_bytes()
+
+
+def test_what_failed_is_written_with_its_reason(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(log), "--out", str(tmp_path), "--journal", "failed"]) == cli.OK
+    assert "5 matches were no result" in capsys.readouterr().err
+    numbers = sorted(int(file.stem.split("-")[1]) for file in tmp_path.glob("match-*.json"))
+    assert numbers == [21, 22, 23, 24, 25]
+    assert {written(tmp_path, number)["result"]["reason"] for number in numbers} == {"TOO_FEW_POINTS"}
+
+
+def test_failures_are_bounded(capsys: pytest.CaptureFixture[str]) -> None:
+    kept = MatchJournal(Choice(failed=True))
+    kept.begins(0.0)
+    failed = matching.no_match(np.zeros(3), 0, Reason.REJECTED)
+    wanted = [kept.wants(float(k), failed) for k in range(MOST_FAILED + 5)]
+    assert sum(wanted) == MOST_FAILED
+    assert kept.sentences() == [
+        f"{MOST_FAILED + 5} matches were no result; the first {MOST_FAILED} of them are in the journal"
+    ]
+
+
+def test_numbers_and_times_that_the_log_has_not_are_said(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--journal", "2,900", "--journal-at", "77"]
+    assert cli.main(["replay", str(log), "--out", str(tmp_path), *arguments]) == cli.OK
+    said = capsys.readouterr().err
+    assert f"no match 900: the log has {SCANS}" in said
+    assert "no match at or after 77 s" in said
+    assert (tmp_path / "match-2.json").exists()
+
+
+@pytest.mark.parametrize("words", ["0", "-1", "x", "1,,2", "1.5", "faild", "", ",".join(["1"] * (MOST + 1))])
+def test_a_wrong_choice_is_wrong_usage(
+    words: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["replay", str(log), "--out", str(tmp_path / "none"), f"--journal={words}"]
+    assert cli.main(arguments) == cli.USAGE
+    assert "--journal" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("seconds", [-1.0, math.nan, math.inf])
+def test_a_time_must_be_one(seconds: float) -> None:
+    with pytest.raises(BadChoice):
+        choice_of(None, seconds)
+
+
+def test_without_matplotlib_the_data_is_written_and_the_pictures_are_missed(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(matchplot, "find_spec", lambda name: None)
+    assert cli.main(["replay", str(log), "--out", str(tmp_path), "--journal", "3"]) == cli.OK
+    assert "no pictures of matches: matplotlib is not installed" in capsys.readouterr().err
+    assert {file.name for file in tmp_path.glob("match*")} == {"match-3.json"}
+
+
+def test_a_recording_with_lights_tells_what_light_said(tmp_path: Path) -> None:
+    bench = record(tmp_path / "rec", calm, lidar=True)
+    arguments = ["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out"), "--journal", "2"]
+    assert cli.main(arguments) == cli.OK
+    assert bench.daemon.cycle.cycles > 10
+    match = written(tmp_path / "out", 2)
+    assert match["light"]["fix"] in {"NONE", "STARTING", "GOOD", "HELD", "AMBIGUOUS"}
+    assert match["asked"]["most_iterations"] in (3, 7, 50)  # the recorded caps
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["recorded_run"]["differ"] == 0
+
+
+def test_a_document_of_lamps_is_complete() -> None:
+    from estimator.journal import LightPoint, LightSaid
+    from estimator.result import Fix
+
+    here, there = np.array((1.0, 2.0)), np.array((1.1, 2.0))
+    lamps = (LightPoint(7, 70, there, here, here - there, 0.1), LightPoint(8, 80, None, here, None, None))
+    content = matchjournal._light(LightSaid(Fix.GOOD, np.zeros(3), 4, np.zeros(3), lamps))
+    assert json.loads(json.dumps(content))["lamps"][0]["residual_xy"] == pytest.approx([-0.1, 0.0])
+    assert content["lamps"][1]["keyframe_xy"] is None
