@@ -12,6 +12,10 @@ REACH_M, REACH_SIGMAS = 0.12, 8.0
 """Neighbours this near are used, or within so many times the noise: long enough for a direction out of range noise,
 short enough for furniture. A window that noise itself cuts short picks the points that lie wrong in the same way."""
 
+SPACING_M, OFF_M = 0.018, 0.06
+"""Along a surface a line is taken every so often: a thirteenth of what it is fitted to. What lies farther off the last
+line is another surface."""
+
 FEW, GAP_M = 2, 0.5
 """Where beams are sparser than that, so many neighbours on either side, if they are no farther away than this."""
 
@@ -41,33 +45,45 @@ def neighbours(xy: Array, i: int, reach: float) -> tuple[int, int]:
     return low, high
 
 
-@kernel("Tuple((f8, f8, f8, f8))(f8[:, ::1], i8, i8, i8)")
-def line_through(xy: Array, i: int, low: int, high: int) -> tuple[float, float, float, float]:
-    """Total-least-squares line of the points [low, high): normal (x, y), variance across it and along it."""
-    x, y = xy[i, 0], xy[i, 1]
+@kernel("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])")
+def add_up(xy: Array, eye: Array, sums: Array, columns: Array) -> None:
+    """Running sums of x, y, xx, xy, yy relative to the ``eye``: row i of ``sums`` (n + 1, 5) is over i points.
+
+    The points (n, 2) are also written as ``columns`` (2, n).
+
+    A surface 80 m away loses 3e-10 m^2 of its variance to rounding, a thousandth of what a tenth of a millimetre makes.
+    """
     sx = sy = sxx = sxy = syy = 0.0
-    for j in range(low, high):
-        dx, dy = xy[j, 0] - x, xy[j, 1] - y
-        sx += dx
-        sy += dy
-        sxx += dx * dx
-        sxy += dx * dy
-        syy += dy * dy
-    n = float(high - low)
-    mx, my = sx / n, sy / n
-    cxx, cxy, cyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    for i in range(len(xy)):
+        sums[i, 0], sums[i, 1], sums[i, 2], sums[i, 3], sums[i, 4] = sx, sy, sxx, sxy, syy
+        columns[0, i], columns[1, i] = xy[i, 0], xy[i, 1]
+        x, y = xy[i, 0] - eye[0], xy[i, 1] - eye[1]
+        sx, sy, sxx, sxy, syy = sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
+    n = len(xy)
+    sums[n, 0], sums[n, 1], sums[n, 2], sums[n, 3], sums[n, 4] = sx, sy, sxx, sxy, syy
+
+
+@kernel("Tuple((f8, f8, f8, f8))(f8[:, ::1], i8, i8)")
+def line_through(sums: Array, low: int, high: int) -> tuple[float, float, float, float]:
+    """Total-least-squares line of the points [low, high): normal (x, y), variance across it and along it."""
+    part = 1.0 / (high - low)
+    mx, my = (sums[high, 0] - sums[low, 0]) * part, (sums[high, 1] - sums[low, 1]) * part
+    cxx = (sums[high, 2] - sums[low, 2]) * part - mx * mx
+    cxy = (sums[high, 3] - sums[low, 3]) * part - mx * my
+    cyy = (sums[high, 4] - sums[low, 4]) * part - my * my
     half = 0.5 * (cxx - cyy)
     root = np.sqrt(half * half + cxy * cxy)
     mean = 0.5 * (cxx + cyy)
     tx, ty = (half + root, cxy) if half >= 0.0 else (cxy, root - half)
-    length = np.sqrt(tx * tx + ty * ty)
-    if length == 0.0:
+    length2 = tx * tx + ty * ty
+    if length2 == 0.0:
         return 0.0, 0.0, mean, mean
-    return -ty / length, tx / length, max(0.0, mean - root), mean + root
+    inverse = 1.0 / np.sqrt(length2)
+    return -ty * inverse, tx * inverse, max(0.0, mean - root), mean + root
 
 
 @kernel("f8(f8[:, ::1], i8, i8, Tuple((f8, f8, f8, f8)))")
-def offset_on_line(xy: Array, low: int, high: int, at: tuple[float, float, float, float]) -> float:
+def offset_on_line(columns: Array, low: int, high: int, at: tuple[float, float, float, float]) -> float:
     """Offset along the normal, at the point ``at`` (x, y, normal), of a parabola through the points [low, high).
 
     A parabola and not a line: a line through points of a column would lie inside it.
@@ -75,8 +91,9 @@ def offset_on_line(xy: Array, low: int, high: int, at: tuple[float, float, float
     x, y, nx, ny = at
     m1 = m2 = m3 = m4 = v0 = v1 = v2 = 0.0
     n = float(high - low)
-    for j in range(low, high):
-        dx, dy = xy[j, 0] - x, xy[j, 1] - y
+    xs, ys = columns[0, low:high], columns[1, low:high]
+    for j in range(len(xs)):
+        dx, dy = xs[j] - x, ys[j] - y
         u, v = ny * dx - nx * dy, nx * dx + ny * dy
         uu = u * u
         m1 += u
@@ -86,11 +103,12 @@ def offset_on_line(xy: Array, low: int, high: int, at: tuple[float, float, float
         v0 += v
         v1 += v * u
         v2 += v * uu
-    det = n * (m2 * m4 - m3 * m3) - m1 * (m1 * m4 - m2 * m3) + m2 * (m1 * m3 - m2 * m2)
+    a, b, c = m2 * m4 - m3 * m3, m1 * m4 - m2 * m3, m1 * m3 - m2 * m2
+    det = n * a - m1 * b + m2 * c
     if n < 5.0 or not det > 1e-9 * n * m2 * m4:
         det = n * m2 - m1 * m1
         return (v0 * m2 - v1 * m1) / det if det > 0.0 else v0 / n
-    return (v0 * (m2 * m4 - m3 * m3) - m1 * (v1 * m4 - m3 * v2) + m2 * (v1 * m3 - m2 * v2)) / det
+    return (v0 * a - v1 * b + v2 * c) / det
 
 
 @kernel("void(f8[:, ::1], i8)")
@@ -113,23 +131,27 @@ def fit_lines(xy: Array, eye: Array, sigma: float, lines: Array) -> int:
     of the normal's direction in rad^2, and the extent of the unbroken run it belongs to in m.
     """
     found, reach = 0, max(REACH_M, REACH_SIGMAS * sigma)
+    sums, columns = np.empty((len(xy) + 1, 5)), np.empty((2, len(xy)))
+    add_up(xy, eye, sums, columns)
+    last_x = last_y = np.inf
+    nx = ny = 0.0
     for i in range(len(xy)):
+        x, y = xy[i, 0], xy[i, 1]
+        dx, dy = x - last_x, y - last_y
+        if abs(nx * dy - ny * dx) < SPACING_M and abs(nx * dx + ny * dy) < OFF_M:
+            continue
         low, high = neighbours(xy, i, reach)
         count = float(high - low)
         if count < 3.0:
             continue
-        nx, ny, across, along = line_through(xy, i, low, high)
+        ax, ay, across, along = line_through(sums, low, high)
         direction = max(sigma * sigma, across) / (count * along) if along > 0.0 else 1.0
         if not direction < STEEPEST or (across > FLAT * along and across > 9.0 * sigma * sigma):
             continue
-        x, y = xy[i, 0], xy[i, 1]
-        if nx * (eye[0] - x) + ny * (eye[1] - y) < 0.0:
-            nx, ny = -nx, -ny
-        shift = offset_on_line(xy, low, high, (x, y, nx, ny))
-        lines[found, 0] = x + shift * nx
-        lines[found, 1] = y + shift * ny
-        lines[found, 2] = nx
-        lines[found, 3] = ny
+        nx, ny = (-ax, -ay) if ax * (eye[0] - x) + ay * (eye[1] - y) < 0.0 else (ax, ay)
+        shift = offset_on_line(columns, low, high, (x, y, nx, ny))
+        last_x, last_y = x + shift * nx, y + shift * ny
+        lines[found, 0], lines[found, 1], lines[found, 2], lines[found, 3] = last_x, last_y, nx, ny
         lines[found, 4] = direction
         found += 1
     measure_runs(lines, found)

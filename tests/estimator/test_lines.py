@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.lines import REACH_M, lines_of, neighbours
+from estimator.lines import REACH_M, SPACING_M, add_up, line_through, lines_of, neighbours, offset_on_line
 from estimator.records import Array
 from estimator.scanpoints import ScanPoints
 from tests.estimator.world import points_in, scan_in
@@ -43,6 +43,43 @@ def test_runs_are_measured_end_to_end() -> None:
     np.testing.assert_allclose(lines_of(points(xy))[:, 5], 0.2)
 
 
+@pytest.mark.parametrize("away", [0.5, 8.0, 80.0])
+def test_a_line_and_its_parabola_are_those_of_the_definition(away: float) -> None:
+    """Running sums lose nothing that matters: normal and variances as by eigenvectors, offset as by least squares."""
+    rng, eye = np.random.default_rng(1), np.array((3.0, -2.0))
+    u = np.linspace(-0.12, 0.12, 200)
+    xy = np.column_stack((u, 0.5 * u**2)) + rng.normal(0.0, 0.003, (200, 2))
+    c, s = np.cos(0.7), np.sin(0.7)
+    xy = np.ascontiguousarray(xy @ np.array(((c, s), (-s, c))) + eye + away * np.array((0.6, 0.8)))
+    sums, columns, here = np.empty((201, 5)), np.empty((2, 200)), xy[100]
+    add_up(xy, eye, sums, columns)
+    np.testing.assert_array_equal(columns, xy.T)
+    for low, high in ((60, 140), (95, 104), (99, 102)):
+        nx, ny, across, along = line_through(sums, low, high)
+        w, V = np.linalg.eigh(np.cov(xy[low:high].T, bias=True))
+        np.testing.assert_allclose((across, along), w, rtol=1e-9, atol=1e-3 * 0.0001**2 * away**2)
+        assert abs(V[:, 0] @ (nx, ny)) == pytest.approx(1.0, abs=1e-9)
+        local = (xy[low:high] - here) @ np.array(((ny, nx), (-nx, ny)))
+        degree = 2 if high - low >= 5 else 1
+        expected = np.polynomial.polynomial.polyfit(local[:, 0], local[:, 1], degree)[0]
+        found = offset_on_line(columns, low, high, (here[0], here[1], nx, ny))
+        assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_dense_points_make_no_more_lines_than_a_surface_needs() -> None:
+    """Two millimetres apart: a line every 1.8 cm, and a step in the wall begins a new one at once."""
+    lines = lines_of(points(wall(501, 0.002)))
+    gaps = np.hypot(*np.diff(lines[:, :2], axis=0).T)
+    assert ((gaps > SPACING_M - 1e-9) & (gaps < SPACING_M + 0.0021)).all()
+    step = np.vstack((wall(101, 0.002), wall(101, 0.002) + np.array((0.202, 0.3))))
+    found = lines_of(points(step))
+    for y in (2.0, 2.3):
+        x = found[np.abs(found[:, 1] - y) < 0.01, 0]
+        wanted = (-0.1, 0.1) if y == 2.0 else (0.102, 0.302)
+        assert abs(x.min() - wanted[0]) < 2.0 * SPACING_M
+        assert abs(x.max() - wanted[1]) < 2.0 * SPACING_M
+
+
 def test_what_is_no_line_is_left_out() -> None:
     assert len(lines_of(points(np.empty((0, 2))))) == 0
     assert len(lines_of(points(np.full((30, 2), 1.0)))) == 0
@@ -67,7 +104,8 @@ def test_noise_does_not_cut_the_surroundings_short() -> None:
     rng = np.random.default_rng(4)
     share = []
     for _ in range(40):
-        lines = lines_of(points(wall(401, 0.004, rng.normal(0.0, 0.03, 401)), sigma=0.03))[60:-60]
+        lines = lines_of(points(wall(401, 0.004, rng.normal(0.0, 0.03, 401)), sigma=0.03))
+        lines = lines[np.abs(lines[:, 0]) < 0.56]
         share.append(np.mean(lines[:, 2] ** 2 / lines[:, 4]))
     assert 0.5 < np.mean(share) < 1.2
 
