@@ -20,6 +20,7 @@ from estimator.records import Array
 
 Bytes = npt.NDArray[np.uint8]
 Nodes = npt.NDArray[np.int32]
+Ints = npt.NDArray[np.int64]
 
 Node = tuple[np.int32, np.int32, np.int32, np.int32]
 """Level, column, row, heading."""
@@ -191,29 +192,27 @@ def near_hit(found: Array, hits: int, node: Node, headings: int, how: Array) -> 
     return False
 
 
-@kernel("Tuple((i8, i8, b1))(u1[:, :, ::1], i4[:, :, ::1], f8[::1], f8[:, ::1])")
-def branch(pyramid: Bytes, turned: Nodes, how: Array, found: Array) -> tuple[int, int, bool]:
+@kernel("Tuple((i8, i8, b1))(u1[:, :, ::1], i4[:, :, ::1], i8[::1], f8[::1], f8[:, ::1])")
+def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -> tuple[int, int, bool]:
     """Best-first search: number of hits, nodes opened, whether it is complete.
 
-    ``turned``: (headings, points, 2) cells of the scan at each heading. ``how``: least score, cap on nodes, cells and
+    ``turned``: (headings, points, 2) cells of the scan at each heading. ``box``: first and last column, first and last
+    row in which the sensor may stand, and 1 if the headings go all round. ``how``: least score, cap on nodes, cells and
     headings within which two hits are one. ``found``: rows of column, row, heading, score.
     """
-    rows, columns = pyramid.shape[1], pyramid.shape[2]
     headings, top = len(turned), pyramid.shape[0] - 1
     step = 1 << top
-    across, up = (columns + step - 1) // step, (rows + step - 1) // step
-    capacity = headings * across * up + 1024
+    around = headings if box[4] else 1 << 60
+    capacity = headings * ((box[1] - box[0]) // step + 1) * ((box[3] - box[2]) // step + 1) + 1024
     keys, nodes = np.empty(capacity), np.empty((capacity, 4), np.int32)
     count = opened = hits = 0
     for h in range(headings):
-        for c in range(across):
-            for r in range(up):
-                score = score_at(pyramid, turned[h], top, c * step, r * step)
+        for c in range(box[0], box[1] + 1, step):
+            for r in range(box[2], box[3] + 1, step):
+                score = score_at(pyramid, turned[h], top, c, r)
                 opened += 1
                 if score >= how[0]:
-                    push(
-                        keys, nodes, count, score, (np.int32(top), np.int32(c * step), np.int32(r * step), np.int32(h))
-                    )
+                    push(keys, nodes, count, score, (np.int32(top), np.int32(c), np.int32(r), np.int32(h)))
                     count += 1
     while count > 0 and hits < len(found):
         if opened > how[1]:
@@ -221,7 +220,7 @@ def branch(pyramid: Bytes, turned: Nodes, how: Array, found: Array) -> tuple[int
         score, level, column, row, h = keys[0], nodes[0, 0], nodes[0, 1], nodes[0, 2], nodes[0, 3]
         pop(keys, nodes, count)
         count -= 1
-        if near_hit(found, hits, (level, column, row, h), headings, how):
+        if near_hit(found, hits, (level, column, row, h), around, how):
             continue
         if level == 0:
             found[hits, 0], found[hits, 1], found[hits, 2], found[hits, 3] = column, row, h, score
@@ -233,7 +232,7 @@ def branch(pyramid: Bytes, turned: Nodes, how: Array, found: Array) -> tuple[int
         half = 1 << (level - 1)
         for part in range(4):
             c, r = column + half * (part & 1), row + half * (part >> 1)
-            if c >= columns or r >= rows:
+            if c > box[1] or r > box[3]:
                 continue
             opened += 1
             score = score_at(pyramid, turned[h], level - 1, c, r)
@@ -241,6 +240,15 @@ def branch(pyramid: Bytes, turned: Nodes, how: Array, found: Array) -> tuple[int
                 push(keys, nodes, count, score, (np.int32(level - 1), np.int32(c), np.int32(r), np.int32(h)))
                 count += 1
     return hits, opened, True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Around:
+    """Where to search, if not everywhere: the sensor within ``reach_m`` (each axis) and ``reach_rad`` of a pose."""
+
+    T_map_lidar: Array
+    reach_m: float
+    reach_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,6 +259,7 @@ class SearchSettings:
         least: score below which no place is worth having. hits: most to return. nodes: most to open.
         apart_m, apart_rad: hits nearer than this in both are one.
         points: of the scan at most. heading_rad: step of the headings; 0: what moves the farthest point by a cell.
+        around: where; everywhere and at every heading if None.
     """
 
     least: float = 0.4
@@ -260,10 +269,11 @@ class SearchSettings:
     apart_rad: float = 0.3
     points: int = 120
     heading_rad: float = 0.0
+    around: Around | None = None
 
 
 def search(field: Field, points: Array, settings: SearchSettings = SearchSettings()) -> Search:
-    """All over the field and at every heading: where a scan's points (n, 2), seen from the sensor, fit best.
+    """Where in the field a scan's points (n, 2), seen from the sensor, fit best.
 
     Raises:
         ValueError: no points.
@@ -274,19 +284,37 @@ def search(field: Field, points: Array, settings: SearchSettings = SearchSetting
     far = float(np.hypot(few[:, 0], few[:, 1]).max())
     step = settings.heading_rad or max(0.005, field.resolution / max(far, field.resolution))
     count = int(np.ceil(2.0 * np.pi / step))
-    yaw = 2.0 * np.pi / count * np.arange(count)
+    step = 2.0 * np.pi / count
+    box = np.array((0, field.pyramid.shape[2] - 1, 0, field.pyramid.shape[1] - 1, 1))
+    yaw = np.asarray(step * np.arange(count), np.float64)
+    if settings.around is not None:
+        box, yaw = _boxed(field, settings.around, step)
+    if box[1] < box[0] or box[3] < box[2]:
+        return Search((), 0, True)
     c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
     turned = np.stack((c * few[:, 0] - s * few[:, 1], s * few[:, 0] + c * few[:, 1]), axis=2)
     # the sensor stands in the middle of its cell
     cells = np.floor(turned / field.resolution + 0.5).astype(np.int32)
-    apart = (settings.apart_m / field.resolution, settings.apart_rad / (2.0 * np.pi / count))
     found = np.empty((settings.hits, 4))
+    apart = (settings.apart_m / field.resolution, settings.apart_rad / step)
     how = np.array((settings.least, float(settings.nodes), *apart))
-    hits, nodes, complete = branch(field.pyramid, np.ascontiguousarray(cells), how, found)
-    return Search(tuple(_hit(field, row, count) for row in found[:hits]), int(nodes), bool(complete))
+    hits, nodes, complete = branch(field.pyramid, np.ascontiguousarray(cells), box, how, found)
+    return Search(tuple(_hit(field, row, yaw) for row in found[:hits]), int(nodes), bool(complete))
 
 
-def _hit(field: Field, row: Array, headings: int) -> Hit:
+def _boxed(field: Field, around: Around, step: float) -> tuple[Ints, Array]:
+    """Cells in which the sensor may stand, and headings it may have."""
+    x, y, heading = around.T_map_lidar.tolist()
+    low = np.floor((np.array((x, y)) - around.reach_m - field.origin) / field.resolution).astype(np.int64)
+    high = np.floor((np.array((x, y)) + around.reach_m - field.origin) / field.resolution).astype(np.int64)
+    rows, columns = field.pyramid.shape[1:]
+    box = (max(0, int(low[0])), min(columns - 1, int(high[0])), max(0, int(low[1])), min(rows - 1, int(high[1])))
+    k = int(np.ceil(around.reach_rad / step))
+    whole = (2 * k + 1) * step >= 2.0 * np.pi
+    turns = np.arange(int(np.ceil(2.0 * np.pi / step))) if whole else np.arange(-k, k + 1)
+    return np.array((*box, int(whole))), heading + step * turns
+
+
+def _hit(field: Field, row: Array, yaw: Array) -> Hit:
     x, y = field.origin + field.resolution * (row[:2] + 0.5)
-    yaw = 2.0 * np.pi / headings * row[2]
-    return Hit(np.array((x, y, yaw - 2.0 * np.pi * (yaw > np.pi))), float(row[3]))
+    return Hit(np.array((x, y, (yaw[int(row[2])] + np.pi) % (2.0 * np.pi) - np.pi)), float(row[3]))

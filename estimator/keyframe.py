@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from estimator import se2
 from estimator.records import Array, Scan
+
+if TYPE_CHECKING:
+    from estimator.submap import Settled
 
 Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
 """Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
@@ -28,18 +32,47 @@ class Virtual:
 
 
 @dataclass(slots=True, eq=False)
+class Submap:
+    """A stretch of the way, which corrections of the map move as one piece.
+
+    Attributes:
+        key: number, counted from 1. first: ID of its first keyframe, whose place is its own.
+        T_map_submap: follows every correction of the map. T_odom_submap: where it was laid, never changes.
+        way_m: driven until there. settled: what it consists of, once it is finished.
+        light: its place by what light alone said at its surest keyframe, with the covariance; None without.
+        into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
+    """
+
+    key: int
+    first: int
+    T_map_submap: Array
+    T_odom_submap: Array
+    way_m: float = 0.0
+    settled: Settled | None = None
+    light: tuple[Array, Array] | None = None
+    into: tuple[Submap, Array] | None = None
+
+    def place(self) -> Array:
+        """``T_map_submap`` as corrected so far."""
+        if self.into is None:
+            return self.T_map_submap
+        other, T_other_submap = self.into
+        return se2.compose(other.place(), T_other_submap)
+
+
+@dataclass(slots=True, eq=False)
 class Keyframe:
     """A scan kept.
 
     Attributes:
-        T_map_keyframe: follows every correction of the map. T_odom_keyframe: where it was laid, never changes.
+        submap: what it hangs on. T_odom_keyframe: where it was laid, never changes.
         T_base_lidar: mount. bearing_rad: shared with the other keyframes of the same lidar.
         turned_rad: yaw turned from the first to the last beam. range_m: float32. beam: uint8 of `Beam`.
         virtual: what light said, None where it said nothing good.
     """
 
     key: int
-    T_map_keyframe: Array
+    submap: Submap
     T_odom_keyframe: Array
     T_base_lidar: Array
     bearing_rad: Array
@@ -47,6 +80,11 @@ class Keyframe:
     range_m: npt.NDArray[np.float32]
     beam: npt.NDArray[np.uint8]
     virtual: Virtual | None = None
+
+    @property
+    def T_map_keyframe(self) -> Array:
+        """Its place in the map as corrected so far."""
+        return se2.compose(self.submap.place(), se2.between(self.submap.T_odom_submap, self.T_odom_keyframe))
 
     @property
     def T_odom_lidar(self) -> Array:
@@ -67,10 +105,10 @@ def unturned(bearing_rad: Array, turned_rad: float) -> Array:
 
 
 def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -> Keyframe:
-    """Make a keyframe of a scan matched at ``T_odom``."""
+    """Make a keyframe of a scan matched at ``T_odom``; it hangs on a submap of its own."""
     return Keyframe(
         key=key,
-        T_map_keyframe=T_map,
+        submap=Submap(0, key, T_map, T_odom),
         T_odom_keyframe=T_odom,
         T_base_lidar=scan.T_base_lidar,
         bearing_rad=scan.bearing_rad,

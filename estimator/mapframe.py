@@ -20,10 +20,14 @@ def move_map(state: State, T_map_odom: Array) -> None:
 
 
 def shift_map(state: State, moved: Array, since: int) -> None:
-    """Move the keyframes from ID ``since`` on, 0 being the start, as one piece."""
+    """Move the submaps that begin with keyframe ``since`` or later, 0 being the start, as one piece; and the newest."""
     if since == 0:
         state.T_map_start = se2.compose(moved, state.T_map_start)
-    state.retired = {key: T if key < since else se2.compose(moved, T) for key, T in state.retired.items()}
-    for key, frame in state.keyframes.items():
-        if key >= since:
-            frame.T_map_keyframe = se2.compose(moved, frame.T_map_keyframe)
+    for lone in reversed(state.lone.values()):
+        if lone.first < since:
+            break
+        lone.T_map_submap = se2.compose(moved, lone.T_map_submap)
+    newest = state.atlas.newest
+    for submap in state.atlas.submaps.values():
+        if submap.first >= since or submap is newest:
+            submap.T_map_submap = se2.compose(moved, submap.T_map_submap)

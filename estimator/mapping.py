@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from estimator import absolute, keyframe, localmap, se2
+from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
-from estimator.keyframe import Keyframe
+from estimator.keyframe import Keyframe, Submap
 from estimator.lines import lines_of
 from estimator.records import Array, Scan
 from estimator.result import MatchResult
@@ -42,10 +43,11 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
     if newest is not None and np.array_equal(newest.bearing_rad, frame.bearing_rad):
         frame.bearing_rad = newest.bearing_rad
     state.P_anchor = turned_back(state, covariance(state))
-    moving.P = NOTHING.copy()
+    P, moving.P = moving.P, NOTHING.copy()
     if state.absolute is not None:
         state.absolute.X = np.zeros((3, 3))
         frame.virtual = absolute.virtual(state)
+    keyframe_laid(state, frame, P, noise_of(state, scan))
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key
@@ -60,7 +62,7 @@ def lay_anchor(state: State) -> None:
     if tie is None or not tie.placed or not absolute.blind(state) or near:
         return
     if settings.history:
-        state.retired[state.next_key] = se2.compose(state.T_map_odom, T)
+        state.lone[state.next_key] = Submap(0, state.next_key, se2.compose(state.T_map_odom, T), T)
     state.anchor, state.T_odom_anchor, state.next_key = state.next_key, T, state.next_key + 1
 
 
@@ -91,5 +93,5 @@ def retire(state: State, newest: Keyframe) -> None:
     while len(here) > state.settings.keep:
         gone = state.keyframes.pop(here.pop(0))
         if state.settings.history:
-            state.retired[gone.key] = gone.T_map_keyframe
+            state.retired[gone.key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)
     state.places[place] = here

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, grid, matchers, matching, motion, se2
+from estimator import absolute, closing, grid, matchers, matching, motion, se2
 from estimator.commands import obey
 from estimator.fusion import covariance, fuse, noise_of
 from estimator.grid import Grid
@@ -16,7 +16,7 @@ from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
 from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
-from estimator.records import Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
+from estimator.records import Answer, Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
 from estimator.state import Settings, State, new_state
@@ -36,6 +36,8 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
         if isinstance(record, SampleBlock | LightEpoch):
             see_lights(state, record)
             lay_anchor(state)
+        if isinstance(record, Answer):
+            close_loops(state, record)
         if isinstance(record, Scan):
             points = virtual_frame(state, record)
             match = match_scan(state, record, points, limits)
@@ -117,6 +119,11 @@ def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> 
     return result
 
 
+def close_loops(state: State, answer: Answer) -> None:
+    """Sect. 4.3: take in what a job has found, a loop or a corrected map; `T_odom_base` never hears of it."""
+    closing.take_answer(state, answer)
+
+
 def light_first(state: State, prior: Prior) -> First:
     """T1 of Eq. 14 for the paper's matcher: from light, or the prediction where light tells nothing good."""
     assert state.local is not None
@@ -136,13 +143,14 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         known_axes=known_axes(state, match),
         match=match,
         keyframe=keyframe,
-        loop=None,
+        loop=state.atlas.take_news(),
         anchor=state.anchor,
         T_anchor_base=se2.between(state.T_odom_anchor, moving.T_odom_base),
         jumps=state.jumps,
         lights=None if state.light is None else state.light.result,
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
+        jobs=state.atlas.take_jobs(),
     )
 
 
@@ -162,7 +170,9 @@ def known_axes(state: State, match: MatchResult | None) -> Array:
 def keyframe_poses(state: State) -> dict[int, Array]:
     """``T_map_keyframe`` by ID as corrected so far, 0 being the start; those let go only where history is kept."""
     kept = {key: frame.T_map_keyframe for key, frame in state.keyframes.items()}
-    return {0: state.T_map_start} | state.retired | kept
+    gone = {key: se2.compose(submap.place(), T) for key, (submap, T) in state.retired.items()}
+    lone = {key: submap.place() for key, submap in state.lone.items()}
+    return {0: state.T_map_start} | lone | gone | kept
 
 
 def render_map(state: State, resolution: float) -> Grid:

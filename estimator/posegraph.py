@@ -58,6 +58,8 @@ class Solution:
         converged: not stopped by the cap.
         trust: (m,) weight of each constraint, 1 where it is not doubted, near 0 where it was voted out.
         parts: number of parts of the graph that no constraint joins; each keeps its first pose unless it is anchored.
+        covariance: (3, 3) of the pose that was asked for, in the map's axes: its own, all the others let go. Zeros for
+            one that is held, or if none was asked for.
     """
 
     poses: Array
@@ -66,9 +68,12 @@ class Solution:
     converged: bool
     trust: Array
     parts: int
+    covariance: Array
 
 
-def optimise(graph: Graph, most: int = 50, settled: float = 1e-4, phi: float = 10.0) -> Solution:
+def optimise(
+    graph: Graph, most: int = 50, settled: float = 1e-4, phi: float = 10.0, covariance_of: int = -1
+) -> Solution:
     """Optimise from ``graph.poses``.
 
     Args:
@@ -76,6 +81,7 @@ def optimise(graph: Graph, most: int = 50, settled: float = 1e-4, phi: float = 1
         most: cap on iterations.
         settled: relative decrease of chi2 that ends them.
         phi: chi2 of three degrees of freedom at which a doubtful constraint keeps a quarter of its weight.
+        covariance_of: pose whose covariance is wanted, -1 for none.
 
     Raises:
         ValueError: indices out of range, or numbers that are not finite.
@@ -99,7 +105,10 @@ def optimise(graph: Graph, most: int = 50, settled: float = 1e-4, phi: float = 1
     poses, trust = graph.poses.copy(), np.ones(len(graph.edges))
     told = np.array((float(most), settled, phi))
     chi2, iterations, converged = descend(poses, given, absolute, (place, pattern), trust, told)
-    return Solution(poses, chi2, int(iterations), bool(converged), trust, len(roots))
+    covariance = np.zeros((3, 3))
+    if covariance_of >= 0 and place[covariance_of] >= 0:
+        marginal(poses, given, absolute, (place, pattern), (trust, phi, int(place[covariance_of])), covariance)
+    return Solution(poses, chi2, int(iterations), bool(converged), trust, len(roots), covariance)
 
 
 def check(graph: Graph) -> None:
@@ -368,3 +377,30 @@ def descend(
     for i in range(len(poses)):
         poses[i, 2] = wrapped(poses[i, 2])
     return best, count, done and damping <= 1e6
+
+
+@kernel(f"b1(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), Tuple((f8[::1], f8, i8)), f8[:, ::1])")
+def marginal(
+    poses: Array,
+    given: Given,
+    absolute: Absolute,
+    structure: tuple[Ints, tuple[Ints, Ints, Ints, Ints]],
+    asked: tuple[Array, float, int],
+    covariance: Array,
+) -> bool:
+    """Covariance of one pose: its block of the inverse, column by column. ``asked``: trust, phi, place of the pose."""
+    trust, phi, which = asked
+    place, pattern = structure
+    n, nnz = len(pattern[0]) - 1, len(pattern[1])
+    diagonal, below, b = np.empty((n, 3, 3)), np.empty((nnz, 3, 3)), np.empty((n, 3))
+    inverse = np.empty((n, 3, 3))
+    linearise(poses, given, absolute, structure, (trust, slots_of(given[0], place, pattern), phi), (diagonal, below, b))
+    if factor(pattern, (diagonal, below), inverse) >= 0:
+        return False
+    for c in range(3):
+        b[:] = 0.0
+        b[which, c] = 1.0
+        solve(pattern, below, inverse, b)
+        for r in range(3):
+            covariance[r, c] = b[which, r]
+    return True

@@ -79,3 +79,10 @@ def carry(T_a_b: Array, T_b_c: Array, P_b: Array) -> Array:
     x, y, _ = (compose(T_a_b, T_b_c) - T_a_b).tolist()
     F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
     return np.asarray(F @ P_b @ F.T)
+
+
+def adjoint(T: Array) -> Array:
+    """3x3: what a small motion of the frame behind ``T`` is in the frame before it: ``T Exp(d) = Exp(Ad d) T``."""
+    A = rotation(float(T[2]))
+    A[0, 2], A[1, 2] = T[1], -T[0]
+    return A

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator import se2
-from estimator.keyframe import Keyframe
+from estimator.atlas import Atlas
+from estimator.keyframe import Keyframe, Submap
 from estimator.localmap import LocalMap, MapSettings
+from estimator.loop import LoopSettings
 from estimator.matchers import Matcher, Weight, load
 from estimator.matching import Asked, MatchSettings
 from estimator.motion import Motion, MotionNoise
@@ -41,6 +43,7 @@ class Settings:
             the beams still fit the map.
         keep: keyframes kept per half metre square and eighth of a turn.
         history: keep the pose of keyframes whose scan has been let go; for replay, which needs them once at the end.
+        loops: when a place counts as seen before; None: never.
         matcher: the default one, or one to compare it with. weight: of Eq. 15, where the matcher is the paper's.
     """
 
@@ -51,6 +54,7 @@ class Settings:
     keyframe_share: float = 0.7
     keep: int = 2
     history: bool = False
+    loops: LoopSettings | None = field(default_factory=LoopSettings)
     matcher: Matcher = Matcher.LINE
     weight: Weight = Weight.INFORMATION
     map: MapSettings = field(default_factory=MapSettings)
@@ -68,7 +72,9 @@ class State:
             where there is no photodiode.
         T_map_odom: absolute correction. T_map_start: keyframe 0, where the robot was switched on.
         keyframes: by ID, with their scans. places: their IDs by half metre square and eighth of a turn.
-        retired: T_map_keyframe of those let go, where history is kept.
+        atlas: what the keyframes hang on, and loops.
+        retired: where history is kept, what those let go hang on, and their places there. lone: where light alone held
+            the pose, by ID.
         anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, covariance of its place in the map.
         next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
@@ -84,7 +90,9 @@ class State:
     T_map_start: Array = field(default_factory=se2.identity)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     places: dict[Place, list[int]] = field(default_factory=dict)
-    retired: dict[int, Array] = field(default_factory=dict)
+    atlas: Atlas = field(default_factory=Atlas)
+    retired: dict[int, tuple[Submap, Array]] = field(default_factory=dict)
+    lone: dict[int, Submap] = field(default_factory=dict)
     local: LocalMap | None = None
     anchor: int = 0
     T_odom_anchor: Array = field(default_factory=se2.identity)

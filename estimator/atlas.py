@@ -1,0 +1,247 @@
+"""The map as submaps and what joins them, and the work on it that is under way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator import se2
+from estimator.keyframe import Keyframe, Submap
+from estimator.linear3 import invert3
+from estimator.loop import Found
+from estimator.posegraph import UPPER
+from estimator.records import Answer, Array, Job
+from estimator.result import Loop
+from estimator.submap import SIZE, Settled, settle
+
+Ints = npt.NDArray[np.int64]
+
+FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
+"""What a keyframe's place loses against the one before, beyond what the matches know of: 5 mm and 0.1 deg."""
+
+CELL_M, KEPT = 3.0, 2
+"""Submaps kept of each place so large and each quarter of heading."""
+
+MANY: Final = 3
+"""Loops kept between the same two submaps."""
+
+LOOK, SOLVE, SETTLE = 3, 2, 1
+"""Priorities of the jobs, lowest first."""
+
+Apply = Callable[[object], None]
+
+
+@dataclass(slots=True, eq=False)
+class Constraints:
+    """What joins the submaps; arrays with one row each.
+
+    Attributes:
+        between: (m, 2) keys of two submaps a, b. T: (m, 3) T_a_b. information: (m, 6), upper triangle, in b's axes.
+        loop: (m,) whether it is a loop, which may be false.
+    """
+
+    between: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    T: Array = field(default_factory=lambda: np.empty((0, 3)))
+    information: Array = field(default_factory=lambda: np.empty((0, 6)))
+    loop: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+
+    def add(self, a: int, b: int, T_a_b: Array, P: Array, is_loop: bool) -> None:
+        """Join two submaps; ``P`` is the covariance of T_a_b in b's axes. Of many loops of a pair the latest stay."""
+        same = np.flatnonzero(self.loop & (self.between == (a, b)).all(axis=1)) if is_loop else np.empty(0, np.int64)
+        if len(same) >= MANY:
+            self.keep(np.arange(len(self.loop)) != same[0])
+        H = invert3(P)
+        self.between = np.vstack((self.between, (a, b)))
+        self.T = np.vstack((self.T, T_a_b))
+        self.information = np.vstack((self.information, [H[i, j] for i, j in UPPER]))
+        self.loop = np.append(self.loop, is_loop)
+
+    def keep(self, which: npt.NDArray[np.bool_]) -> None:
+        """Forget all others."""
+        self.between, self.T = self.between[which], self.T[which]
+        self.information, self.loop = self.information[which], self.loop[which]
+
+    def covariance(self, row: int) -> Array:
+        """Of a constraint's T, 3x3, in b's axes."""
+        H = np.empty((3, 3))
+        for k, (i, j) in enumerate(UPPER):
+            H[i, j] = H[j, i] = self.information[row, k]
+        return invert3(H)
+
+    def of(self, key: int) -> Ints:
+        """Rows that join this submap with others."""
+        return np.flatnonzero((self.between == key).any(axis=1))
+
+    def seen_from(self, key: int, row: int) -> tuple[int, Array, Array]:
+        """The other submap of a constraint: its key, T_key_other, and the covariance of that in the other's axes."""
+        a, b = self.between[row].tolist()
+        T, P = self.T[row], self.covariance(row)
+        if a == key:
+            return b, T, P
+        A = se2.adjoint(T)
+        return a, se2.inverse(T), A @ P @ A.T
+
+    def reroute(self, key: int, hub: int, T_hub_key: Array, P: Array) -> None:
+        """Take a submap out: whatever else it is joined with is joined with ``hub`` by way of it; ``P`` in its axes."""
+        rows = self.of(key)
+        others = [(*self.seen_from(key, row), bool(self.loop[row])) for row in rows]
+        self.keep(~np.isin(np.arange(len(self.loop)), rows))
+        for other, T, P_other, is_loop in others:
+            if other != hub:
+                A = se2.adjoint(se2.inverse(T))
+                self.add(hub, other, se2.compose(T_hub_key, T), A @ P @ A.T + P_other, is_loop)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Waiting:
+    """A loop that would move the pose far, until a second one agrees: the same stretch of the way, found again.
+
+    Attributes:
+        T_found_odom: where the odom frame would lie, seen from the submap that was found.
+    """
+
+    found: Found
+    frame: Keyframe
+    T_found_odom: Array
+
+
+@dataclass(slots=True, eq=False)
+class Atlas:
+    """Submaps, constraints, and work under way.
+
+    Attributes:
+        submaps: by key, oldest first. frames: keyframes of the newest one. constraints: between them.
+        C: covariance (odom axes) of the newest keyframe's place relative to the newest submap's, T_odom_last its place.
+        marginal: covariance (odom axes) of the newest submap's place in the map.
+        way_m: driven between keyframes. since_look: keyframes laid since the last look.
+        waiting: loops without support. jobs: to be handed out. asked: what to do with each answer, by job ID.
+        busy: whether a look or a solution is under way. stale: whether the graph has changed since it was solved.
+        closures: loops accepted so far. news: the latest, until it was reported.
+    """
+
+    submaps: dict[int, Submap] = field(default_factory=dict)
+    frames: list[Keyframe] = field(default_factory=list)
+    constraints: Constraints = field(default_factory=Constraints)
+    C: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    T_odom_last: Array = field(default_factory=se2.identity)
+    marginal: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    way_m: float = 0.0
+    since_look: int = 0
+    waiting: list[Waiting] = field(default_factory=list)
+    jobs: list[Job] = field(default_factory=list)
+    asked: dict[int, Apply] = field(default_factory=dict)
+    next_job: int = 1
+    looking: bool = False
+    solving: bool = False
+    stale: bool = False
+    closures: int = 0
+    news: Loop | None = None
+
+    @property
+    def newest(self) -> Submap | None:
+        """The submap being driven through."""
+        return next(reversed(self.submaps.values()), None)
+
+    def ask(self, priority: int, run: Callable[[], object], then: Apply) -> None:
+        """Hand out a job."""
+        self.jobs.append(Job(self.next_job, priority, run))
+        self.asked[self.next_job] = then
+        self.next_job += 1
+
+    def take_jobs(self) -> tuple[Job, ...]:
+        """The jobs to be handed out now."""
+        jobs = tuple(self.jobs)
+        self.jobs.clear()
+        return jobs
+
+    def take_news(self) -> Loop | None:
+        """The latest loop, once."""
+        news, self.news = self.news, None
+        return news
+
+    def renewed(self) -> Atlas:
+        """An empty one; answers to what this one has asked will mean nothing to it."""
+        return Atlas(next_job=self.next_job, closures=self.closures)
+
+    def answer(self, answer: Answer) -> None:
+        """Take an answer in; one that nobody waits for any more is dropped."""
+        then = self.asked.pop(answer.job_id, None)
+        if then is not None:
+            then(answer.payload)
+
+    def add(self, frame: Keyframe, P: Array, sigma: float) -> None:
+        """Hang a keyframe, with its covariance relative to the one before (odom axes), on the newest submap."""
+        newest, T = self.newest, frame.T_odom_keyframe
+        x, y, _ = (T - self.T_odom_last).tolist()
+        F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+        self.C = F @ self.C @ F.T + P + FLOOR
+        self.way_m += math.hypot(x, y) if newest is not None else 0.0
+        self.T_odom_last = T
+        if newest is None or len(self.frames) >= SIZE:
+            self._begin(frame, newest, sigma)
+        frame.submap = next(reversed(self.submaps.values()))
+        self.frames.append(frame)
+        self.since_look += 1
+        if frame.virtual is not None:
+            T_keyframe_submap = se2.between(T, frame.submap.T_odom_submap)
+            P_map = se2.carry(frame.virtual.T_map_base, T_keyframe_submap, frame.virtual.covariance)
+            if frame.submap.light is None or np.trace(P_map) < np.trace(frame.submap.light[1]):
+                frame.submap.light = se2.compose(frame.virtual.T_map_base, T_keyframe_submap), P_map
+
+    def _begin(self, frame: Keyframe, before: Submap | None, sigma: float) -> None:
+        """A new submap at this keyframe; the one before is settled."""
+        key = 1 if before is None else before.key + 1
+        T = frame.T_odom_keyframe
+        if before is not None:
+            R = se2.rotation(-T[2])
+            self.constraints.add(before.key, key, se2.between(before.T_odom_submap, T), R @ self.C @ R.T, False)
+            self.marginal = self.spread(T)
+            self._settle(before, tuple(self.frames), sigma)
+        self.submaps[key] = Submap(key, frame.key, frame.T_map_keyframe, T, self.way_m)
+        self.C = np.zeros((3, 3))
+        self.frames = []
+
+    def spread(self, T_odom: Array) -> Array:
+        """Covariance (odom axes, of the map's oldest submap) of a place reached from the newest submap."""
+        newest = self.newest
+        assert newest is not None
+        x, y, _ = (T_odom - newest.T_odom_submap).tolist()
+        F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+        return np.asarray(F @ self.marginal @ F.T + self.C)
+
+    def _settle(self, submap: Submap, frames: tuple[Keyframe, ...], sigma: float) -> None:
+        def then(payload: object) -> None:
+            assert isinstance(payload, Settled)
+            submap.settled = payload
+            self.thin_out(submap)
+
+        self.ask(SETTLE, lambda: settle(frames, submap.T_odom_submap, sigma), then)
+
+    def thin_out(self, latest: Submap) -> None:
+        """Bound what is kept per area: of the submaps of one place and heading the newest few stay."""
+        here = [submap for submap in self.submaps.values() if cell_of(submap) == cell_of(latest)]
+        for submap in here[:-KEPT]:
+            self.let_go(submap)
+
+    def let_go(self, submap: Submap) -> None:
+        """Take a submap out of the graph; what hangs on it goes on hanging, on the neighbour that is surest of it."""
+        joined = [self.constraints.seen_from(submap.key, row) for row in self.constraints.of(submap.key)]
+        if not joined:
+            return
+        key, T, P = min(joined, key=lambda one: float(np.trace(one[2])))
+        hub, A = self.submaps[key], se2.adjoint(T)
+        self.constraints.reroute(submap.key, key, se2.inverse(T), A @ P @ A.T)
+        submap.into = hub, se2.between(hub.T_map_submap, submap.T_map_submap)
+        submap.settled = None
+        del self.submaps[submap.key]
+
+
+def cell_of(submap: Submap) -> tuple[int, int, int]:
+    """Place (of CELL_M) and heading (a quarter turn) of a submap."""
+    x, y, yaw = submap.T_map_submap.tolist()
+    return math.floor(x / CELL_M), math.floor(y / CELL_M), math.floor((yaw + math.pi) * 2.0 / math.pi) % 4

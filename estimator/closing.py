@@ -1,0 +1,217 @@
+"""Closing loops (Sect. 4.3): what happens to the map when the robot comes back.
+
+Nothing here delays a cycle. What takes long is handed out as a job (settle a submap, look for a loop, solve the graph)
+whose answer comes back as a record of a later step. ``T_odom_base`` never hears of it. Without light the correction
+goes into ``T_map_odom``; with light that has placed the map, it moves what was laid before, and light moves the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from estimator import se2
+from estimator.atlas import LOOK, SOLVE, Atlas, Ints, Waiting
+from estimator.keyframe import Keyframe, Submap
+from estimator.linear3 import invert3
+from estimator.loop import Candidate, Found, LoopSettings, look
+from estimator.mapframe import move_map
+from estimator.posegraph import UPPER, Graph, Solution, optimise
+from estimator.records import Answer, Array
+from estimator.result import Loop
+from estimator.state import State
+
+PHI: Final = 25.0
+"""chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real rooms bend more than noise."""
+
+SETTLED: Final = 1e-5
+MOST: Final = 60
+TOGETHER: Final = 60
+"""Keyframes, at most, between two loops that support each other."""
+
+APART: Final = 4.0
+"""By how much the variance of what light said is raised: its errors hang together over several submaps."""
+
+
+def take_answer(state: State, answer: Answer) -> None:
+    """Take in what a job has found."""
+    state.atlas.answer(answer)
+    solve_graph(state, state.atlas)
+
+
+def keyframe_laid(state: State, frame: Keyframe, P: Array, sigma: float) -> None:
+    """Hang a new keyframe on the map and look whether this place is known; ``P``, ``sigma`` as in `Atlas.add`."""
+    atlas, told = state.atlas, state.settings.loops
+    atlas.add(frame, P, sigma)
+    if told is not None and not atlas.looking and atlas.since_look >= told.every:
+        look_back(state, told, frame)
+
+
+def look_back(state: State, told: LoopSettings, frame: Keyframe) -> None:
+    """Hand out the search for a keyframe in the submaps that may lie here."""
+    atlas = state.atlas
+    asked = candidates(state, told, frame)
+    if not asked:
+        return
+    atlas.looking, atlas.since_look = True, 0
+
+    def then(payload: object) -> None:
+        assert isinstance(payload, tuple)
+        atlas.looking = False
+        for found in payload:
+            found_again(atlas, told, frame, found)
+
+    atlas.ask(LOOK, lambda: look(frame, asked, told), then)
+
+
+def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
+    """The nearest submaps that may be where the keyframe is, and were not left only just now."""
+    T, atlas = frame.T_map_keyframe, state.atlas
+    near = []
+    P = turned(state, atlas.spread(frame.T_odom_keyframe))
+    reach = min(told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])), told.most_m)
+    for submap in atlas.submaps.values():
+        x, y, _ = submap.T_map_submap.tolist()
+        away = math.hypot(x - T[0], y - T[1])
+        if submap.settled is not None and away < reach and atlas.way_m - submap.way_m > told.recent_m:
+            near.append((away, submap.key, submap, submap.settled))
+    near.sort(key=lambda one: one[:2])
+    made = []
+    for _, key, submap, settled in near[: told.candidates]:
+        R = se2.rotation(-submap.T_map_submap[2])
+        made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T))
+    return tuple(made)
+
+
+def turned(state: State, P_odom: Array) -> Array:
+    """A covariance of the odom frame in the axes of the map."""
+    R = se2.rotation(state.T_map_odom[2])
+    return np.asarray(R @ P_odom @ R.T)
+
+
+def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found) -> None:
+    """Accept a loop, or let it wait for a second one that agrees where it would move the pose far."""
+    if found.key not in atlas.submaps or frame.submap.key not in atlas.submaps:
+        return
+    x, y, yaw = found.moved.tolist()
+    if math.hypot(x, y) > told.supported_m or abs(yaw) > told.supported_rad:
+        T_found_odom = se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe))
+        one = Waiting(found, frame, T_found_odom)
+        friends = [other for other in atlas.waiting if agree(atlas, told, one, other)]
+        if not friends:
+            atlas.waiting = [*atlas.waiting[-20:], one]
+            return
+        atlas.waiting = [other for other in atlas.waiting if other not in friends]
+        for other in friends:
+            join(atlas, other.frame, other.found)
+    join(atlas, frame, found)
+
+
+def agree(atlas: Atlas, told: LoopSettings, one: Waiting, other: Waiting) -> bool:
+    """Whether two loops from different places put the odom frame into the same place of the map."""
+    a, b = atlas.submaps.get(one.found.key), atlas.submaps.get(other.found.key)
+    if a is None or b is None or other.frame.submap.into is not None or one.frame.key - other.frame.key > TOGETHER:
+        return False
+    T_b_a = se2.between(b.T_map_submap, a.T_map_submap)
+    x, y, yaw = se2.between(
+        se2.compose(other.T_found_odom, one.frame.T_odom_keyframe),
+        se2.compose(T_b_a, one.found.T_submap_keyframe),
+    ).tolist()
+    return math.hypot(x, y) < 0.5 * told.supported_m and abs(yaw) < 0.5 * told.supported_rad
+
+
+def join(atlas: Atlas, frame: Keyframe, found: Found) -> None:
+    """Add a loop to the graph: from the submap that was found to the one that the keyframe hangs on."""
+    T_keyframe_submap = se2.between(frame.T_odom_keyframe, frame.submap.T_odom_submap)
+    R, A = se2.rotation(-found.T_submap_keyframe[2]), se2.adjoint(se2.inverse(T_keyframe_submap))
+    P = A @ R @ found.P @ R.T @ A.T
+    atlas.constraints.add(found.key, frame.submap.key, se2.compose(found.T_submap_keyframe, T_keyframe_submap), P, True)
+    atlas.closures += 1
+    atlas.news = Loop(atlas.closures, frame.key, atlas.submaps[found.key].first, found.residual_m)
+    atlas.stale = True
+
+
+def solve_graph(state: State, atlas: Atlas) -> None:
+    """Hand out the graph, if it has changed and is not being solved."""
+    if atlas.solving or not atlas.stale:
+        return
+    atlas.solving, atlas.stale = True, False
+    submaps = tuple(atlas.submaps.values())
+    graph = graph_of(state, atlas, submaps)
+
+    def then(payload: object) -> None:
+        assert isinstance(payload, Solution)
+        atlas.solving = False
+        correct(state, atlas, submaps, graph.poses, payload)
+
+    last = len(submaps) - 1
+    atlas.ask(SOLVE, lambda: optimise(graph, MOST, SETTLED, PHI, covariance_of=last), then)
+
+
+def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
+    """The submaps as a graph: joined by the way and by loops, and anchored where light has told a place."""
+    joined = atlas.constraints
+    keys = np.array([submap.key for submap in submaps])
+    poses = np.array([submap.T_map_submap for submap in submaps])
+    edges = np.searchsorted(keys, joined.between)
+    tie = state.absolute
+    if tie is None or not tie.placed:
+        return Graph(poses, edges, joined.T, joined.information, joined.loop)
+    anchored, at, certainty = told_by_light(state, atlas, keys)
+    return Graph(poses, edges, joined.T, joined.information, joined.loop, anchored, at, certainty)
+
+
+def told_by_light(state: State, atlas: Atlas, keys: Ints) -> tuple[Ints, Array, Array]:
+    """Absolute constraints: what light said at earlier submaps, and where the pose holds the newest."""
+    newest, tie = atlas.newest, state.absolute
+    assert newest is not None
+    assert tie is not None
+    told = [(submap.key, *submap.light) for submap in atlas.submaps.values() if submap.light and submap is not newest]
+    told = [(key, T, APART * P) for key, T, P in told]
+    told.append((newest.key, newest.T_map_submap, turned(state, tie.P)))
+    anchored = np.searchsorted(keys, [key for key, _, _ in told])
+    return anchored, np.array([T for _, T, _ in told]), np.array([certainty_of(T, P) for _, T, P in told])
+
+
+def certainty_of(T: Array, P_map: Array) -> list[float]:
+    """Information of a place, upper triangle in its own axes, from its covariance in the map's."""
+    R = se2.rotation(-T[2])
+    H = invert3(R @ P_map @ R.T)
+    return [float(H[i, j]) for i, j in UPPER]
+
+
+def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> None:
+    """Move the submaps to where the graph has them, and the robot with the newest one.
+
+    A solution of what has been moved meanwhile is thrown away, and the graph is solved once more.
+    """
+    newest = atlas.newest
+    lit, last = state.absolute is not None and state.absolute.placed, submaps[-1]
+    same = all(
+        np.array_equal(submap.T_map_submap, T)
+        for submap, T in zip(submaps, before, strict=True)
+        if submap.into is None and not (lit and submap is last)
+    )
+    if newest is None or not same or not np.isfinite(solution.poses).all():
+        atlas.stale |= not same
+        return
+    moved = se2.compose(solution.poses[-1], se2.inverse(last.T_map_submap))
+    first = se2.compose(solution.poses[0], se2.inverse(submaps[0].T_map_submap))
+    for submap, T in zip(submaps, solution.poses, strict=True):
+        if not (lit and submap is last):
+            submap.T_map_submap = T
+    state.T_map_start = se2.compose(first, state.T_map_start)
+    if lit:
+        return
+    for submap in atlas.submaps.values():
+        if submap.key > last.key:
+            submap.T_map_submap = se2.compose(moved, submap.T_map_submap)
+    move_map(state, se2.compose(newest.T_map_submap, se2.inverse(newest.T_odom_submap)))
+    if newest is last:
+        R = se2.rotation(-state.T_map_odom[2])
+        atlas.marginal = R @ solution.covariance @ R.T
+        state.P_anchor = atlas.spread(state.T_odom_anchor)
+    else:
+        atlas.stale = True  # the newest one's certainty is not known yet

@@ -1,0 +1,148 @@
+"""Scan to map (Sect. 4.3): whether a keyframe has been at the place of an earlier submap before, and how sure that is.
+
+A loop is accepted on overlap (the share of beams that fit), on what speaks against it (beams that look through the
+map, points that hang in free space), on rank (no axis may be left open) and on the residual. A wide search sees how
+many places fit: where there are two, nothing is closed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator import se2
+from estimator.globalsearch import Around, SearchSettings, field_of, search
+from estimator.keyframe import Keyframe
+from estimator.linear3 import invert3
+from estimator.localmap import LocalMap, contradicted
+from estimator.matching import MatchSettings, Prior, View, match
+from estimator.records import Array
+from estimator.result import MatchResult
+from estimator.scanpoints import oriented
+from estimator.submap import Settled, points_of_frame
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSettings:
+    """When a loop is one.
+
+    Attributes:
+        sse_m: largest root mean square distance of the fitting beams from the map's surfaces (the paper's threshold).
+        share: least share of the beams that fit. against: largest share of the evidence that speaks against.
+        extra_m, extra_rad: errors of a match that its own covariance does not know: bent submaps, moved furniture.
+        recent_m: way back over which a submap is no loop but the way just driven.
+        reach_m: how near, beyond three deviations, a submap must be to be looked at; most_m: however uncertain.
+        candidates: submaps looked at for one keyframe. every: a look for every so many keyframes.
+        sure_m, sure_rad: deviations of the expected place up to which the matcher finds it by itself.
+        points: of a scan, at most. unlike: largest ratio of the second place's score to the first's.
+        supported_m, supported_rad: a loop that moves the pose by more than this waits for a second one that agrees as
+            well as this.
+    """
+
+    sse_m: float = 0.06
+    share: float = 0.7
+    against: float = 0.05
+    extra_m: float = 0.02
+    extra_rad: float = 0.007
+    recent_m: float = 10.0
+    reach_m: float = 3.0
+    most_m: float = 12.0
+    candidates: int = 2
+    every: int = 3
+    sure_m: float = 0.5
+    sure_rad: float = 0.15
+    points: int = 180
+    unlike: float = 0.9
+    supported_m: float = 0.3
+    supported_rad: float = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A submap in which the keyframe may be seen again: where, with the covariance of that guess (3x3, its axes)."""
+
+    key: int
+    submap: Settled
+    T_submap_keyframe: Array
+    P: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A keyframe found again in submap ``key``.
+
+    Attributes:
+        T_submap_keyframe: where; P: covariance (3x3, axes of the submap). share, against, residual_m: how well.
+        moved: (x, y, yaw) from where it was expected, in the keyframe's axes.
+    """
+
+    key: int
+    T_submap_keyframe: Array
+    P: Array
+    share: float
+    against: float
+    residual_m: float
+    moved: Array
+
+
+def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
+    """Look for a keyframe in each of the candidates."""
+    found = (look_in(frame, candidate, settings) for candidate in candidates)
+    return tuple(one for one in found if one is not None)
+
+
+def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Found | None:
+    """Look for a keyframe in one submap."""
+    sigma = candidate.submap.sigma
+    points = points_of_frame(frame, sigma)
+    if len(points.xy) < MatchSettings().min_points or len(candidate.submap.elements) < MatchSettings().min_points:
+        return None
+    start = candidate.T_submap_keyframe
+    deviation = np.sqrt(np.diag(candidate.P))
+    if float(np.hypot(*deviation[:2])) > settings.sure_m or deviation[2] > settings.sure_rad:
+        guess = wide(frame, points.xy, candidate, settings)
+        if guess is None:
+            return None
+        start = guess
+    local = candidate.submap.local()
+    view = View(oriented(points, settings.points), frame.T_base_lidar, frame.beams(), sigma)
+    loose = np.diag((settings.sure_m**-2, settings.sure_m**-2, settings.sure_rad**-2))
+    result = match(view, local, Prior(start, loose), 60, MatchSettings())
+    return judged(view, local, result, candidate, settings)
+
+
+def judged(
+    view: View, local: LocalMap, result: MatchResult, candidate: Candidate, settings: LoopSettings
+) -> Found | None:
+    """The match as a loop, if it is one."""
+    share = result.inliers / max(1, result.queries)
+    if not result.ok or not result.known_axes.all() or share < settings.share or result.residual_m > settings.sse_m:
+        return None
+    T = result.T_odom_base
+    against = contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m)
+    if against > settings.against:
+        return None
+    extra = np.diag((settings.extra_m**2, settings.extra_m**2, settings.extra_rad**2))
+    P = invert3(result.information) + extra
+    moved = se2.between(candidate.T_submap_keyframe, T)
+    R = se2.rotation(candidate.T_submap_keyframe[2])
+    off = R @ moved
+    if float(off @ invert3(candidate.P + P) @ off) > 25.0:
+        return None
+    return Found(candidate.key, T, P, share, against, result.residual_m, moved)
+
+
+def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> Array | None:
+    """The one place within three deviations where a scan fits, None where there are none or several."""
+    field = field_of(candidate.submap.elements[:, :2].astype(np.float64), resolution=0.1, sigma_m=0.1, reach_m=0.5)
+    deviation = 3.0 * np.sqrt(np.diag(candidate.P))
+    at = se2.compose(candidate.T_submap_keyframe, frame.T_base_lidar)
+    reach = min(float(deviation[:2].max()), settings.most_m), min(float(deviation[2]), np.pi)
+    seen = se2.apply(se2.inverse(frame.T_base_lidar), points)
+    asked = SearchSettings(least=0.5, hits=2, nodes=400_000, points=settings.points, around=Around(at, *reach))
+    outcome = search(field, seen, asked)
+    hits = outcome.hits
+    if not hits or not outcome.complete or (len(hits) > 1 and hits[1].score > settings.unlike * hits[0].score):
+        return None
+    return se2.compose(hits[0].T_map_lidar, se2.inverse(frame.T_base_lidar))
