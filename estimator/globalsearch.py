@@ -32,6 +32,15 @@ SPREAD = 3.0
 """Cells beyond which a point supports nothing, in deviations of the field."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Around:
+    """Where to search, if not everywhere: the sensor within ``reach_m`` (each axis) and ``reach_rad`` of a pose."""
+
+    T_map_lidar: Array
+    reach_m: float
+    reach_rad: float
+
+
 @dataclass(slots=True, eq=False)
 class Field:
     """Likelihood of a scan's point at each place of a map.
@@ -69,8 +78,10 @@ class Search:
     complete: bool
 
 
-def field_of(points: Array, resolution: float = 0.05, sigma_m: float = 0.05, reach_m: float = 1.0) -> Field:
-    """The field of a map's surface points (n, 2), as large as they reach and ``reach_m`` more.
+def field_of(
+    points: Array, resolution: float = 0.05, sigma_m: float = 0.05, reach_m: float = 1.0, around: Around | None = None
+) -> Field:
+    """The field of a map's surface points (n, 2), as large as they reach and ``reach_m`` more, and as is searched.
 
     Raises:
         ValueError: no points, or points that are not finite.
@@ -78,6 +89,9 @@ def field_of(points: Array, resolution: float = 0.05, sigma_m: float = 0.05, rea
     if not len(points) or not np.isfinite(points).all():
         raise ValueError(f"a map of {len(points)} points, all of them finite, is needed")
     low, high = points.min(axis=0) - reach_m, points.max(axis=0) + reach_m
+    if around is not None:
+        low = np.minimum(low, around.T_map_lidar[:2] - around.reach_m)
+        high = np.maximum(high, around.T_map_lidar[:2] + around.reach_m)
     width, height = np.ceil((high - low) / resolution).astype(int)
     pyramid = np.zeros((LEVELS, height, width), np.uint8)
     spread(np.ascontiguousarray(points), low, np.array((resolution, sigma_m)), pyramid[0])
@@ -240,15 +254,6 @@ def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -
                 push(keys, nodes, count, score, (np.int32(level - 1), np.int32(c), np.int32(r), np.int32(h)))
                 count += 1
     return hits, opened, True
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Around:
-    """Where to search, if not everywhere: the sensor within ``reach_m`` (each axis) and ``reach_rad`` of a pose."""
-
-    T_map_lidar: Array
-    reach_m: float
-    reach_rad: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,12 +135,13 @@ def judged(
 
 def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> Array | None:
     """The one place within three deviations where a scan fits, None where there are none or several."""
-    field = field_of(candidate.submap.elements[:, :2].astype(np.float64), resolution=0.1, sigma_m=0.1, reach_m=0.5)
     deviation = 3.0 * np.sqrt(np.diag(candidate.P))
     at = se2.compose(candidate.T_submap_keyframe, frame.T_base_lidar)
     reach = min(float(deviation[:2].max()), settings.most_m), min(float(deviation[2]), np.pi)
+    around = Around(at, *reach)
     seen = se2.apply(se2.inverse(frame.T_base_lidar), points)
-    asked = SearchSettings(least=0.5, hits=2, nodes=400_000, points=settings.points, around=Around(at, *reach))
+    field = field_of(candidate.submap.elements[:, :2].astype(np.float64), 0.1, 0.1, 0.5, around)
+    asked = SearchSettings(least=0.5, hits=2, nodes=400_000, points=settings.points, around=around)
     outcome = search(field, seen, asked)
     hits = outcome.hits
     if not hits or not outcome.complete or (len(hits) > 1 and hits[1].score > settings.unlike * hits[0].score):

@@ -1,0 +1,288 @@
+"""Loops: keyframes whose odometry drifts, in a room whose truth is known; jobs are run where they are asked for."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimator import se2
+from estimator.absolute import Absolute
+from estimator.atlas import KEPT, Constraints, cell_of
+from estimator.closing import keyframe_laid, take_answer
+from estimator.commands import forget
+from estimator.keyframe import Virtual, keep
+from estimator.loop import Candidate, LoopSettings, look, look_in
+from estimator.mapframe import shift_map
+from estimator.posegraph import UPPER, Graph, optimise
+from estimator.records import Answer, Array, Job
+from estimator.state import State, new_state
+from estimator.submap import SIZE, settle
+from tests.estimator.world import scan_in
+from tools.bench._scenes import Scene, bearings, office, paper_room, round_room
+
+HALF = bearings(181, 180.0)
+SMALL = np.diag((0.004**2, 0.004**2, 0.002**2))
+TOLD = LoopSettings()
+
+
+def circuit(step: float = 0.25, laps: float = 1.3) -> Array:
+    """Poses along a rounded square of 6 m in the paper's room, through its middle lane: (n, 3)."""
+    angle = np.linspace(0.0, laps * 2.0 * np.pi, int(laps * 2.0 * np.pi * 3.4 / step))
+    return np.column_stack((3.6 * np.cos(angle), 3.6 * np.sin(angle), angle + 0.5 * np.pi))
+
+
+def drifted(truth: Array, scale: float, turn: float) -> Array:
+    """What odometry makes of a path: every step ``scale`` too long and turned by ``turn`` rad too much."""
+    poses = [truth[0]]
+    for a, b in itertools.pairwise(truth):
+        poses.append(se2.compose(poses[-1], se2.between(a, b) * (scale, scale, 1.0) + (0.0, 0.0, turn)))
+    return np.array(poses)
+
+
+def run_jobs(state: State) -> list[Job]:
+    """Every job at once, and what its answer asks for; returns them."""
+    done = []
+    while jobs := state.atlas.take_jobs():
+        for job in jobs:
+            take_answer(state, Answer(0.0, job.job_id, job.run()))
+            done.append(job)
+    return done
+
+
+def lay(state: State, T_odom: Array, T_true: Array, scene: Scene, rng: np.random.Generator, key: int) -> None:
+    scan = scan_in(scene, T_true, HALF, rng)
+    state.fused.T_odom_base = state.T_odom_anchor = T_odom
+    frame = keep(key, se2.compose(state.T_map_odom, T_odom), T_odom, scan, 0.0)
+    keyframe_laid(state, frame, SMALL, 0.01)
+    state.keyframes[key] = frame
+
+
+def driven(laps: float = 1.3, settings: LoopSettings | None = TOLD, turn: float = 0.0008) -> tuple[State, Array]:
+    """A state after the circuit with drift, all jobs done as they came; and the true poses."""
+    state, truth = new_state(), circuit(laps=laps)
+    state.settings = replace(state.settings, loops=settings)
+    rng = np.random.default_rng(2)
+    state.fused.T_odom_base = state.T_map_start = truth[0]
+    for key, (T_odom, T_true) in enumerate(zip(drifted(truth, 1.004, turn), truth, strict=True), 1):
+        lay(state, T_odom, T_true, paper_room(), rng, key)
+        run_jobs(state)
+    return state, truth
+
+
+def test_a_loop_brings_the_map_together_and_the_odometry_never_hears_of_it() -> None:
+    state, truth = driven()
+    end = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    off, drift = se2.between(truth[-1], end), se2.between(truth[-1], state.fused.T_odom_base)
+    assert np.hypot(*drift[:2]) > 0.25
+    assert np.hypot(*off[:2]) < 0.05
+    assert abs(off[2]) < np.radians(0.7)
+    np.testing.assert_array_equal(state.fused.T_odom_base, drifted(truth, 1.004, 0.0008)[-1])
+    places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
+    assert np.hypot(*(places - truth)[:, :2].T).max() < 0.12  # the far side of the room as well
+    assert state.atlas.closures >= 3
+    assert state.jumps >= 1
+    np.testing.assert_array_equal(state.T_map_start, truth[0])
+    news = state.atlas.take_news()
+    assert news is not None
+    assert news.counter == state.atlas.closures
+    assert news.keyframe_old < news.keyframe_new
+    assert state.atlas.take_news() is None
+
+
+def test_the_pose_is_surer_after_the_loop_than_before() -> None:
+    state, _ = driven(laps=0.9)
+    before = state.atlas.spread(state.fused.T_odom_base)
+    state, _ = driven()
+    after = state.atlas.spread(state.fused.T_odom_base)
+    assert np.trace(after[:2, :2]) < 0.8 * np.trace(before[:2, :2])
+
+
+def test_without_settings_nothing_is_looked_for() -> None:
+    state, _ = driven(settings=None)
+    assert state.atlas.closures == 0
+    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
+
+
+def test_a_large_loop_waits_for_a_second_that_agrees() -> None:
+    state, _ = driven(settings=replace(TOLD, supported_m=0.0, supported_rad=0.0))
+    assert state.atlas.closures == 0  # no two agree better than by nothing
+    assert len(state.atlas.waiting) > 3
+    state, _ = driven(settings=replace(TOLD, supported_m=0.2))
+    assert state.atlas.closures >= 2
+
+
+def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
+    state, truth = driven(laps=1.02)
+    rng = np.random.default_rng(9)
+    for key in range(1000, 1000 + 2 * SIZE):
+        lay(state, state.fused.T_odom_base + np.array((0.05, 0.0, 0.0)), truth[-1], paper_room(), rng, key)
+    late = [Answer(0.0, job.job_id, job.run()) for job in state.atlas.take_jobs()]
+    assert late
+    forget(state)
+    for answer in late:
+        take_answer(state, answer)
+    assert not state.atlas.submaps
+    assert state.atlas.next_job > late[-1].job_id
+
+
+def test_a_map_moved_while_its_graph_was_solved_is_solved_again() -> None:
+    state, truth = driven()
+    state.atlas.stale = True
+    take_answer(state, Answer(0.0, -1, None))  # nobody asked: only makes the graph be handed out
+    (job,) = state.atlas.take_jobs()
+    shift_map(state, np.array((5.0, 0.0, 0.0)), 0)
+    state.T_map_odom = se2.compose(np.array((5.0, 0.0, 0.0)), state.T_map_odom)
+    take_answer(state, Answer(0.0, job.job_id, job.run()))
+    (again,) = state.atlas.take_jobs()
+    take_answer(state, Answer(0.0, again.job_id, again.run()))
+    places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
+    assert np.hypot(*(places - truth)[:, :2].T - np.array(((5.0,), (0.0,)))).max() < 0.15
+
+
+def test_what_is_kept_is_bounded_by_the_area_and_stays_in_place() -> None:
+    state, truth = driven(laps=4.0)
+    cells = [cell_of(submap) for submap in state.atlas.submaps.values()]
+    assert max(cells.count(cell) for cell in cells) <= KEPT + 1  # a correction may carry one over a border
+    assert len(cells) < 0.8 * len(truth) / SIZE
+    places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
+    assert np.hypot(*(places - truth)[:, :2].T).max() < 0.15  # those of submaps let go included
+
+
+def frame_at(scene: Scene, T: Array, seed: int = 0) -> tuple[Candidate, Array]:
+    """A submap of keyframes about ``T`` (three of them), with the guess that a robot at ``T`` is at its origin."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for key, dx in enumerate((-0.2, 0.0, 0.2), 1):
+        T_k = se2.compose(T, np.array((dx, 0.0, 0.0)))
+        frames.append(keep(key, T_k, T_k, scan_in(scene, T_k, HALF, rng), 0.0))
+    return Candidate(1, settle(frames, T, 0.01), np.zeros(3), np.diag((0.3**2, 0.3**2, 0.1**2))), T
+
+
+def test_a_place_is_known_again_and_another_is_not() -> None:
+    scene = office()
+    candidate, T = frame_at(scene, np.array((3.0, 6.0, 0.3)))
+    away = se2.compose(T, np.array((0.15, -0.1, 0.08)))
+    frame = keep(9, away, away, scan_in(scene, away, HALF, np.random.default_rng(5)), 0.0)
+    (found,) = look(frame, (candidate,), TOLD)
+    np.testing.assert_allclose(found.T_submap_keyframe, se2.between(T, away), atol=0.02)
+    other = np.array((12.5, 9.0, -1.2))
+    stranger = keep(9, other, other, scan_in(scene, other, HALF, np.random.default_rng(5)), 0.0)
+    assert look_in(stranger, candidate, TOLD) is None
+
+
+@pytest.mark.jit
+def test_a_far_place_is_found_by_search_and_two_alike_are_none() -> None:
+    candidate, T = frame_at(office(), np.array((3.0, 6.0, 0.3)))
+    unsure = replace(candidate, P=np.diag((0.8**2, 0.8**2, 0.4**2)))
+    away = se2.compose(T, np.array((0.9, -0.3, 0.5)))
+    frame = keep(9, away, away, scan_in(office(), away, HALF, np.random.default_rng(5)), 0.0)
+    found = look_in(frame, unsure, TOLD)
+    assert found is not None
+    np.testing.assert_allclose(found.T_submap_keyframe, se2.between(T, away), atol=0.03)
+    room = round_room()
+    candidate, T = frame_at(room, np.array((0.1, 0.0, 0.0)))
+    frame = keep(9, T, T, scan_in(room, T, HALF, np.random.default_rng(5)), 0.0)
+    assert look_in(frame, candidate, TOLD) is None  # no heading in a round room
+
+
+def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:
+    state, truth = driven(settings=None)
+    state.settings = replace(state.settings, loops=TOLD)
+    state.absolute = Absolute(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
+    for submap in state.atlas.submaps.values():
+        first = state.keyframes[submap.first]
+        told = truth[submap.first - 1]
+        first.virtual = Virtual(told, np.diag((0.04**2, 0.04**2, 0.02**2)), frozenset((1, 2, 3)))
+        submap.light = told, first.virtual.covariance
+    newest = state.atlas.newest
+    assert newest is not None
+    held = newest.T_map_submap
+    state.atlas.stale = True
+    take_answer(state, Answer(0.0, -1, None))
+    run_jobs(state)
+    np.testing.assert_array_equal(newest.T_map_submap, held)
+    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
+    firsts = [submap for submap in state.atlas.submaps.values() if submap is not newest]
+    off = np.array([se2.between(truth[submap.first - 1], submap.T_map_submap) for submap in firsts])
+    drift = np.array([se2.between(truth[submap.first - 1], submap.T_odom_submap) for submap in firsts])
+    assert np.hypot(*off[:-2, :2].T).mean() < 0.6 * np.hypot(*drift[:-2, :2].T).mean()
+
+
+def random_graph(rng: np.random.Generator, n: int = 7) -> tuple[Constraints, Array]:
+    truth = np.column_stack((rng.uniform(-3, 3, (n, 2)), rng.uniform(-3, 3, n)))
+    made = Constraints()
+    for a, b in [(k, k + 1) for k in range(n - 1)] + [(0, 4), (1, 6), (2, 5)]:
+        P = np.diag(rng.uniform(0.5, 2.0, 3) * (0.01**2, 0.02**2, 0.01**2))
+        noise = rng.normal(0.0, 1.0, 3) * np.sqrt(np.diag(P))
+        made.add(a + 1, b + 1, se2.compose(se2.between(truth[a], truth[b]), noise), P, b != a + 1)
+    return made, truth
+
+
+def test_a_submap_taken_out_leaves_the_others_where_they_are() -> None:
+    """Exactly so for a link of a chain: composing constraints loses nothing there."""
+    rng = np.random.default_rng(1)
+    made, truth = random_graph(rng)
+    made.keep(~made.loop)
+    made.add(1, 7, se2.between(truth[0], truth[6]), SMALL, True)
+
+    def solved(keys: list[int]) -> Array:
+        edges = np.searchsorted(keys, made.between)
+        doubtful = np.zeros(len(edges), np.bool_)
+        graph = Graph(truth[np.array(keys) - 1], edges, made.T, made.information, doubtful)
+        return optimise(graph, settled=1e-12).poses
+
+    whole = solved([1, 2, 3, 4, 5, 6, 7])
+    for gone in (4, 5):
+        row = int(made.of(gone)[0])
+        hub, T, P = made.seen_from(gone, row)
+        A = se2.adjoint(T)
+        made.reroute(gone, hub, se2.inverse(T), A @ P @ A.T)
+    assert not np.isin((4, 5), made.between).any()
+    np.testing.assert_allclose(solved([1, 2, 3, 6, 7]), whole[[0, 1, 2, 5, 6]], atol=3e-4)
+
+
+def test_the_inverse_of_a_constraint_says_the_same() -> None:
+    made, _ = random_graph(np.random.default_rng(3))
+    for row in range(len(made.loop)):
+        a, b = made.between[row].tolist()
+        back, forth = made.seen_from(b, row), made.seen_from(a, row)
+        assert (back[0], forth[0]) == (a, b)
+        np.testing.assert_allclose(se2.compose(forth[1], back[1]), np.zeros(3), atol=1e-12)
+        d = np.array((1e-4, -2e-4, 3e-4))  # the same small error, seen from either end
+        seen = se2.log(se2.compose(se2.inverse(back[1]), se2.inverse(se2.compose(forth[1], se2.exp(d)))))
+        np.testing.assert_allclose(d @ np.linalg.solve(forth[2], d), seen @ np.linalg.solve(back[2], seen), rtol=1e-2)
+
+
+def test_only_the_latest_loops_of_a_pair_stay() -> None:
+    made = Constraints()
+    made.add(1, 2, np.zeros(3), SMALL, False)
+    for k in range(9):
+        made.add(1, 2, np.array((0.1 * k, 0.0, 0.0)), SMALL, True)
+    assert made.loop.sum() == 3
+    np.testing.assert_allclose(made.T[:, 0], (0.0, 0.6, 0.7, 0.8))
+
+
+def test_the_covariance_of_a_pose_is_its_block_of_the_inverse() -> None:
+    made, truth = random_graph(np.random.default_rng(4))
+    edges = made.between - 1
+    graph = Graph(truth, edges, made.T, made.information, np.zeros(len(edges), np.bool_))
+    solution = optimise(graph, settled=1e-12, covariance_of=6)
+    H = np.zeros((21, 21))
+    for (i, j), T, told in zip(edges, made.T, made.information, strict=True):
+        W, J = np.zeros((3, 3)), np.zeros((3, 21))
+        for k, (r, c) in enumerate(UPPER):
+            W[r, c] = W[c, r] = told[k]
+        for column in range(6):
+            which, axis = (i, column) if column < 3 else (j, column - 3)
+            moved = []
+            for step in (1e-6, -1e-6):
+                P = solution.poses.copy()
+                P[which, axis] += step
+                moved.append(se2.between(T, se2.between(P[i], P[j])))
+            J[:, 3 * which + axis] = (moved[0] - moved[1]) / 2e-6
+        H += J.T @ W @ J
+    np.testing.assert_allclose(solution.covariance, np.linalg.inv(H[3:, 3:])[-3:, -3:], rtol=1e-5, atol=1e-12)
+    assert not optimise(graph, covariance_of=0).covariance.any()  # held
