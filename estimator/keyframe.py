@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -102,6 +102,11 @@ def unturned(bearing_rad: Array, turned_rad: float) -> Array:
     if turned_rad == 0.0 or n < 2:
         return bearing_rad
     return np.asarray(bearing_rad - turned_rad * (1.0 - np.arange(n) / (n - 1)))
+
+
+def unhung(frame: Keyframe) -> Keyframe:
+    """The same keyframe, fixed to where it is in the map now."""
+    return replace(frame, submap=Submap(0, frame.key, frame.T_map_keyframe, frame.T_odom_keyframe))
 
 
 def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -> Keyframe:

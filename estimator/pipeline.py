@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 
 import numpy as np
@@ -11,7 +10,7 @@ from estimator import absolute, closing, grid, matchers, matching, motion, se2
 from estimator.commands import obey
 from estimator.fusion import covariance, fuse, noise_of
 from estimator.grid import Grid
-from estimator.keyframe import unturned
+from estimator.keyframe import unhung, unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
 from estimator.matchers import First, Matcher, first_of
@@ -183,8 +182,8 @@ def render_map(state: State, resolution: float) -> Grid:
 def render_job(state: State, resolution: float, job_id: int, priority: int = 9) -> Job:
     """:func:`render_map` as work for the background worker: the keyframes of this moment, nothing else of the state.
 
-    The answer's payload is the `Grid`. Later steps do not disturb it: a keyframe's scan never changes, and a correction
-    replaces its pose as a whole.
+    The answer's payload is the `Grid`. Later steps do not disturb it: a keyframe's scan never changes, and these hang
+    on nothing that a correction moves.
     """
-    keyframes = tuple(copy.copy(frame) for frame in state.keyframes.values())
+    keyframes = tuple(unhung(frame) for frame in state.keyframes.values())
     return Job(job_id, priority, lambda: grid.render(keyframes, resolution))
