@@ -240,6 +240,34 @@ def between(u: Array, A: Array, v: Array) -> float:
     return total
 
 
+@kernel("void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, f8[:, ::1])")
+def see_across(points: Array, reference: Reference, T: Array, scale: float, out: Array) -> None:
+    """How much surface the points (n, 4) show across each direction at pose ``T``, and how much of it fits.
+
+    ``out`` (2, 3): sums of xx, xy, yy over the unit vectors across the tangents; of all points, and of those with a
+    partner whose line lies within two ``scale`` and along whose line they run.
+    """
+    rows, start, rays, lines = reference
+    c, s, gate = np.cos(T[2]), np.sin(T[2]), max(6.0 * scale, 0.1)
+    out[:] = 0.0
+    for i in range(len(points)):
+        px = c * points[i, 0] - s * points[i, 1] + T[0]
+        py = s * points[i, 0] + c * points[i, 1] + T[1]
+        ax, ay = -s * points[i, 2] - c * points[i, 3], c * points[i, 2] - s * points[i, 3]
+        out[0, 0] += ax * ax
+        out[0, 1] += ax * ay
+        out[0, 2] += ay * ay
+        row, _, _ = nearest(rows, start, rays, px, py, gate * gate)
+        if row < 0:
+            continue
+        nx, ny = lines[row, 0], lines[row, 1]
+        off = nx * (px - rows[row, 0]) + ny * (py - rows[row, 1])
+        if abs(off) < 2.0 * scale and abs(nx * ay - ny * ax) < ASKEW:
+            out[1, 0] += ax * ax
+            out[1, 1] += ax * ay
+            out[1, 2] += ay * ay
+
+
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
     " Tuple((f8[:, ::1], f8[::1], f8[:, ::1])))"

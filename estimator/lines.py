@@ -133,12 +133,11 @@ def fit_lines(xy: Array, eye: Array, sigma: float, lines: Array) -> int:
     found, reach = 0, max(REACH_M, REACH_SIGMAS * sigma)
     sums, columns = np.empty((len(xy) + 1, 5)), np.empty((2, len(xy)))
     add_up(xy, eye, sums, columns)
-    last_x = last_y = np.inf
-    nx = ny = 0.0
+    last_x = last_y = nx = ny = 0.0
     for i in range(len(xy)):
         x, y = xy[i, 0], xy[i, 1]
         dx, dy = x - last_x, y - last_y
-        if abs(nx * dy - ny * dx) < SPACING_M and abs(nx * dx + ny * dy) < OFF_M:
+        if found > 0 and abs(nx * dy - ny * dx) < SPACING_M and abs(nx * dx + ny * dy) < OFF_M:
             continue
         low, high = neighbours(xy, i, reach)
         count = float(high - low)

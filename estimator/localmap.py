@@ -30,6 +30,12 @@ MARGIN = 0.1
 SOLID_M, UNPROVED = 0.5, 0.1
 """A run longer than this is structure; what is smaller (legs of people, of chairs) counts little until seen again."""
 
+SAMPLES = 400
+"""Elements, and points, that are asked at least whether they speak against a pose."""
+
+HIT = int(Beam.HIT)
+UNSEEN: Beams = (np.empty(0), np.empty(0), np.empty(0, np.uint8))
+
 ALIKE = 0.94
 """Least cosine between the normals of elements that are merged: 20 deg."""
 
@@ -210,26 +216,46 @@ def index(elements: Array, origin: Array, number: int, newest: Keyframe | None) 
     return LocalMap(elements, axis, lines, number, newest)
 
 
+@kernel("f8(f8[:, ::1], f8[::1], Tuple((f8[::1], f8[::1], u1[::1])), f8[::1], Tuple((f8[::1], f8[::1], u1[::1])), f8)")
+def speaking_against(
+    elements: Array, eye: Array, beams: Beams, before: Array, beams_before: Beams, margin: float
+) -> float:
+    """Share of the evidence that speaks against a scan from ``eye``; one from ``before`` has looked about earlier."""
+    step = max(1, len(elements) // SAMPLES)
+    said = np.zeros(len(elements), np.int8)
+    look_at(elements, eye, beams, margin, step, said)
+    there = through = 0
+    for i in range(0, len(said), step):
+        there += said[i] > 0
+        through += said[i] < 0
+    bearing, distance, kind = beams
+    hits = 0
+    for i in range(len(kind)):
+        hits += kind[i] == HIT
+    step = max(1, hits // SAMPLES)
+    points = np.zeros(((hits + step - 1) // step, WIDTH))
+    at = 0
+    for i in range(len(kind)):
+        if kind[i] == HIT:
+            if at % step == 0:
+                angle = bearing[i] + eye[2]
+                points[at // step, X] = eye[0] + distance[i] * np.cos(angle)
+                points[at // step, Y] = eye[1] + distance[i] * np.sin(angle)
+            at += 1
+    said = np.zeros(len(points), np.int8)
+    look_at(points, before, beams_before, margin, 1, said)
+    for i in range(len(said)):
+        there += said[i] > 0
+        through += said[i] < 0
+    return through / max(1, there + through)
+
+
 def contradicted(local: LocalMap, T_odom_lidar: Array, beams: Beams, sigma: float) -> float:
     """Share of the evidence that speaks against a scan being from this pose, of about 400 + 400 samples.
 
     Evidence is of two kinds: elements in view that the scan looks through, and points of the scan that hang in space
     which the newest keyframe has looked through.
     """
-    margin = MARGIN + 5.0 * sigma
-    said = np.empty(len(local.elements), np.int8)
-    look_at(local.elements, T_odom_lidar, beams, margin, max(1, len(said) // 400), said)
-    there, through = int((said > 0).sum()), int((said < 0).sum())
-    if local.newest is None:
-        return through / max(1, there + through)
-    bearing, distance, kind = beams
-    hit = np.flatnonzero(kind == Beam.HIT)
-    hit = hit[:: max(1, len(hit) // 400)]
-    angle = bearing[hit] + T_odom_lidar[2]
-    points = np.zeros((len(hit), 4))
-    points[:, 0] = T_odom_lidar[0] + distance[hit] * np.cos(angle)
-    points[:, 1] = T_odom_lidar[1] + distance[hit] * np.sin(angle)
-    said = np.empty(len(points), np.int8)
-    look_at(points, local.newest.T_odom_lidar, local.newest.beams(), margin, 1, said)
-    agree, hang = int((said > 0).sum()), int((said < 0).sum())
-    return (through + hang) / max(1, there + through + agree + hang)
+    newest, margin = local.newest, MARGIN + 5.0 * sigma
+    before, beams_before = (T_odom_lidar, UNSEEN) if newest is None else (newest.T_odom_lidar, newest.beams())
+    return speaking_against(local.elements, T_odom_lidar, beams, before, beams_before, margin)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -227,23 +228,21 @@ def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
     A scan that is shifted along a wall fits it as well as ever, with most of its points; what shows the error are the
     few that lie across. Directions in which hardly anything is seen count as fitting.
     """
-    known = np.flatnonzero(known_axes(best.H)[:2])
-    if len(known) == 0:
+    known = known_axes(best.H)
+    if known[0] == known[1] == 0.0:
         return 1.0
-    axis, points = local.axis, best.view.points
-    row, scale = np.zeros(icp.TRACE), settings.scale * best.view.noise_m
-    row[:3] = T = best.T - np.array((axis.centre[0], axis.centre[1], 0.0))
-    row[icp.GATE], row[icp.STRIDE] = max(6.0 * scale, 0.1), 1.0
-    partner = icp.paired(points, (axis.rows, axis.start, axis.rays, local.lines), row)
-    R = se2.rotation(T[2])[:2, :2]
-    normal, tangent = local.lines[partner, :2], points[:, 2:] @ R.T
-    off = (normal * (se2.apply(T, points[:, :2]) - axis.rows[partner, :2])).sum(axis=1)
-    askew = np.abs((normal * tangent).sum(axis=1))
-    fits = (partner >= 0) & (np.abs(off) < 2.0 * scale) & (askew < icp.ASKEW)
-    across = np.column_stack((-tangent[:, 1], tangent[:, 0]))[:, known]
-    few = FEW * np.eye(len(known))
-    seen, fitting = across.T @ across + few, across[fits].T @ across[fits] + few
-    return float(np.linalg.eigvals(np.linalg.solve(seen, fitting)).real.min())
+    axis, out = local.axis, np.empty((2, 3))
+    T = best.T - np.array((axis.centre[0], axis.centre[1], 0.0))
+    reference = (axis.rows, axis.start, axis.rays, local.lines)
+    icp.see_across(best.view.points, reference, T, settings.scale * best.view.noise_m, out)
+    (sxx, sxy, syy), (fxx, fxy, fyy) = (out + np.array((FEW, 0.0, FEW))).tolist()
+    if known[0] == 0.0:
+        return float(fyy / syy)
+    if known[1] == 0.0:
+        return float(fxx / sxx)
+    # the lesser root of det(fitting - share * seen) = 0
+    a, b, c = sxx * syy - sxy * sxy, fxx * syy + fyy * sxx - 2.0 * fxy * sxy, fxx * fyy - fxy * fxy
+    return float((b - math.sqrt(max(0.0, b * b - 4.0 * a * c))) / (2.0 * a))
 
 
 def known_axes(H: Array) -> Array:
