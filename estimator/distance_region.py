@@ -1,155 +1,150 @@
 """The distance-region model (Eq. 10-12): exact nearest neighbours on a sorted distance axis.
 
-Reference points are ordered by their distance from one centre, the place the sensor is believed to be (Eq. 10: the
-"spatially adjacent sequence"). A query is inserted at its own distance, and the search walks from there to both ends of
-the axis. It may stop as soon as the next distance differs from the query's by more than the best pair found so far,
-because ``|r_p - r_q| <= |p - q|``: what has not been visited cannot be nearer, so the result is exact.
+1. T1 carries the new scan's points into the reference frame: the virtual frame S_new (Eq. 10, 11).
+2. Reference and virtual points are ordered by their distance from the reference's origin and merged: the fused sequence
+   S_fus (Eq. 12, Fig. 2b), with the light points on the same axis.
+3. From each virtual point ("the current data centre") the search walks to both ends of the axis. It may stop as soon as
+   the next distance differs from the point's own by more than the best pair found so far, because
+   ``|r_p - r_q| <= |p - q|``: what has not been visited cannot be nearer, so the result is exact.
 
-The plane around the centre may be cut into sectors, each with an axis of its own (ring x sector). A sector is skipped
-when the ray that bounds it is farther away than the best pair: still exact, and a wall, which is a pile of equal
-distances, is then spread over many short axes. One sector is the paper's single axis.
+That is :func:`fuse` and :func:`pair_fused`, the paper's form, on a single axis. A wall is a pile of equal distances,
+and there the single axis visits much of it. In the ring x sector form (:mod:`estimator.distance_axis`) each sector has
+an axis of its own; a sector is left out when the ray that bounds it, or the part of that ray inside its ring, is
+farther away than the best pair. Still exact, and :func:`nearest` does both: the number of points decides.
+
+Both forms also return a bound that no other point comes closer than. A point that has moved by less than half the
+difference to its partner's distance keeps its partner without being looked up (its safe radius).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator import se2
+from estimator.distance_axis import GROUP, Axis, Ints, build_axis, sector_of
 from estimator.kernel import kernel
 from estimator.records import Array
 
-Ints = npt.NDArray[np.int64]
+__all__ = ["Axis", "Fused", "Ints", "Kind", "build_axis", "fuse", "glance", "nearest", "nearest_all", "pair_fused"]
+
+GLANCE = 8
+"""Rows compared at first sight, without a branch."""
+
+SHORT = 32
+"""A group of at most this many rows is compared through; a longer one is searched along its axes."""
+
+WIDE = 16
+"""With fewer sectors than this a group spans more than a right angle, and its bounding ray says nothing of it."""
+
+
+class Kind(IntEnum):
+    """What stands on the fused axis: circles, triangles and filled circles of Fig. 2b."""
+
+    VIRTUAL = 0
+    REFERENCE = 1
+    LIGHT = 2
 
 
 @dataclass(slots=True, eq=False)
-class Axis:
-    """Reference points on their distance axis.
+class Fused:
+    """S_fus (Eq. 12): virtual, reference and light points in the order of their distance from the reference's origin.
 
     Attributes:
-        centre: (x, y) the distances are measured from.
-        rows: (n, 3) points relative to the centre and their distance: x, y, r; ordered by sector, then by r.
-        label: (n,) index of each row in the array the axis was built from.
-        start: (sectors + 1,) first row of each sector.
-        rays: (sectors + 1, 2) unit vectors of the sectors' bounds, counter-clockwise from +x.
+        kind, member, distance: (n,) per place on the axis: :class:`Kind`, index among the points of that kind (rows of
+            the axis; the new scan's points; lights), distance in metres.
+        virtual: (m, 2) the new scan's points relative to the axis centre.
+        below: (m,) how many reference rows are nearer to the origin than each of them: where its search begins.
+        kept: (m,) whether it was measured within L; order: (m,) the virtual points by distance.
+        rows: reference rows within L.
     """
 
-    centre: Array
-    rows: Array
-    label: Ints
-    start: Ints
-    rays: Array
+    kind: npt.NDArray[np.uint8]
+    member: Ints
+    distance: Array
+    virtual: Array
+    below: Ints
+    kept: npt.NDArray[np.bool_]
+    order: Ints
+    rows: int
 
 
-def sector_count(points: int) -> int:
-    """How many sectors make the search fastest for this many reference points."""
-    if points < 64:
-        return 1
-    return int(min(2048, max(16, points // 2)))
+def fuse(axis: Axis, points: Array, T: Array, far: float = np.inf, before: Fused | None = None) -> Fused:
+    """Virtual frame and fused sequence (Eq. 11, 12) of the new scan's points (m, 2), in its lidar's frame.
 
+    ``T``: pose of the new lidar in the axis' frame (x, y, yaw). ``far``: L of the quality filter; the axis is cut
+    behind L for reference points and behind ``L + |t|`` for virtual ones (none behind it can have been measured within
+    L), and what remains of these is checked. ``before``: the sequence of the iteration before; its order nearly
+    holds.
 
-def build_axis(points: Array, centre: Array, sectors: int = 0) -> Axis:
-    """Order points of shape (n, 2) around ``centre``; ``sectors`` 0 chooses by their number."""
-    n = len(points)
-    count = sectors or sector_count(n)
-    rows = np.empty((n, 3))
-    label = np.empty(n, np.int64)
-    start = np.zeros(count + 1, np.int64)
-    rays = np.empty((count + 1, 2))
-    order_points(np.ascontiguousarray(points), centre[0], centre[1], (rows, label, start, rays))
-    return Axis(centre, rows, label, start, rays)
-
-
-@kernel("f8(f8, f8)")
-def turn_of(x: float, y: float) -> float:
-    """A number in [0, 4) that grows with the angle of (x, y), one unit a quadrant; cheaper than an arctangent."""
-    if y >= 0.0:
-        if x > 0.0:
-            return y / (x + y)
-        return 1.0 - x / (y - x) if y > x else 0.0
-    if x < 0.0:
-        return 2.0 + y / (x + y)
-    return 3.0 + x / (x - y)
-
-
-@kernel("void(f8[:, ::1], i8[::1], i8, i8)")
-def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
-    """Shell's sort of rows [lo, hi) by distance."""
-    gap = 1
-    while gap < (hi - lo) // 3:
-        gap = 3 * gap + 1
-    while gap > 0:
-        for i in range(lo + gap, hi):
-            x, y, r, name = rows[i, 0], rows[i, 1], rows[i, 2], label[i]
-            j = i
-            while j >= lo + gap and rows[j - gap, 2] > r:
-                rows[j, 0], rows[j, 1], rows[j, 2], label[j] = (
-                    rows[j - gap, 0],
-                    rows[j - gap, 1],
-                    rows[j - gap, 2],
-                    label[j - gap],
-                )
-                j -= gap
-            rows[j, 0], rows[j, 1], rows[j, 2], label[j] = x, y, r, name
-        gap //= 3
-
-
-@kernel("void(f8[:, ::1], f8, f8, Tuple((f8[:, ::1], i8[::1], i8[::1], f8[:, ::1])))")
-def order_points(points: Array, cx: float, cy: float, out: tuple[Array, Ints, Ints, Array]) -> None:
-    """Eq. 10: counting sort into sectors, then by distance within each (Shell's sort; a sector holds a few points)."""
-    rows, label, start, rays = out
-    n = len(points)
-    sectors = len(start) - 1
-    for s in range(sectors + 1):
-        turn = 4.0 * (s % sectors) / sectors
-        quadrant = int(turn)
-        f = turn - quadrant
-        x, y = 1.0 - f, f
-        for _ in range(quadrant):
-            x, y = -y, x
-        length = np.sqrt(x * x + y * y)
-        rays[s, 0] = x / length
-        rays[s, 1] = y / length
-    home = np.empty(n, np.int64)
-    for i in range(n):
-        s = min(sectors - 1, int(turn_of(points[i, 0] - cx, points[i, 1] - cy) * 0.25 * sectors))
-        home[i] = s
-        start[s + 1] += 1
-    for s in range(sectors):
-        start[s + 1] += start[s]
-    fill = start[:sectors].copy()
-    for i in range(n):
-        j = fill[home[i]]
-        fill[home[i]] += 1
-        x, y = points[i, 0] - cx, points[i, 1] - cy
-        r = np.sqrt(x * x + y * y)
-        label[j] = i
-        rows[j, 0] = x
-        rows[j, 1] = y
-        rows[j, 2] = r
-    for s in range(sectors):
-        sort_rows(rows, label, start[s], start[s + 1])
-
-
-@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8, i8, f8, f8, Tuple((f8, i8, f8, f8)))")
-def nearest_on_axis(
-    rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[float, int, float, float]
-) -> tuple[int, float, float]:
-    """Walk the axis of rows [low, high) from the query's distance to both ends.
-
-    ``best`` is (r_q, row, d2, e2): the query's own distance, the best row so far, its squared distance, and a bound
-    that no other row comes closer than. Returns the last three, brought up to date.
+    Raises:
+        ValueError: the axis has sectors; the paper's form needs the single one (``build_axis(..., sectors=1)``).
     """
-    rq, row, d2, e2 = best
-    a, b = low, high
-    while a < b:
-        m = (a + b) >> 1
-        if rows[m, 2] < rq:
-            a = m + 1
+    if len(axis.start) != 2:
+        raise ValueError(f"the fused axis is a single one, this has {len(axis.start) - 1} sectors; build it with one")
+    virtual = np.ascontiguousarray(se2.apply(T, points) - axis.centre)
+    r = np.hypot(virtual[:, 0], virtual[:, 1])
+    order = np.argsort(r, kind="stable") if before is None else before.order[np.argsort(r[before.order], kind="stable")]
+    cut = float(np.hypot(T[0] - axis.centre[0], T[1] - axis.centre[1])) + far
+    reach = np.searchsorted(r, cut, side="right", sorter=order)
+    kept = np.zeros(len(r), np.bool_)
+    within = order[:reach]
+    kept[within] = np.hypot(points[within, 0], points[within, 1]) <= far
+    rows = int(np.searchsorted(axis.rows[:, 2], far, side="right"))
+    lamp = np.argsort(axis.lights[:, 2], kind="stable")
+    n = len(r) + len(axis.rows) + len(lamp)
+    kind, member, distance = np.empty(n, np.uint8), np.empty(n, np.int64), np.empty(n)
+    below = np.empty(len(r), np.int64)
+    merge(r[order], order, axis.rows, axis.lights[lamp, 2], lamp, (kind, member, distance, below))
+    return Fused(kind, member, distance, virtual, below, kept, order, rows)
+
+
+@kernel(
+    "void(f8[::1], i8[::1], f8[:, ::1], f8[::1], i8[::1], Tuple((u1[::1], i8[::1], f8[::1], i8[::1])))",
+)
+def merge(
+    r: Array,
+    order: Ints,
+    rows: Array,
+    shine: Array,
+    lamp: Ints,
+    out: tuple[npt.NDArray[np.uint8], Ints, Array, Ints],
+) -> None:
+    """Merge three sorted sequences into S_fus: virtual points ``r``, reference rows and lights ``shine``."""
+    kind, member, distance, below = out
+    v = p = k = 0
+    for at in range(len(kind)):
+        rv = r[v] if v < len(r) else np.inf
+        rp = rows[p, 2] if p < len(rows) else np.inf
+        rk = shine[k] if k < len(shine) else np.inf
+        if p < len(rows) and rp <= rv and rp <= rk:
+            kind[at], member[at], distance[at] = 1, p, rp
+            p += 1
+        elif v < len(r) and rv <= rk:
+            kind[at], member[at], distance[at] = 0, order[v], rv
+            below[order[v]] = p
+            v += 1
         else:
-            b = m
-    up, down = a, a - 1
+            kind[at], member[at], distance[at] = 2, lamp[k], rk
+            k += 1
+
+
+@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8, i8, i8, f8, f8, Tuple((i8, f8, f8)))")
+def walk(
+    rows: Array, low: int, high: int, at: int, qx: float, qy: float, best: tuple[int, float, float]
+) -> tuple[int, float, float, int]:
+    """From place ``at`` of the axis [low, high), before which all rows are nearer to the origin, to both ends.
+
+    ``best``: best row so far, its squared distance, and a bound (squared) that no other row comes closer than. Returns
+    them brought up to date, and the number of rows visited.
+    """
+    row, d2, e2 = best
+    known = row
+    rq = np.sqrt(qx * qx + qy * qy)
+    up, down = at, at - 1
     while True:
         du = rows[up, 2] - rq if up < high else np.inf
         dd = rq - rows[down, 2] if down >= low else np.inf
@@ -165,8 +160,9 @@ def nearest_on_axis(
                 break
             i = down
             down -= 1
-        dx = rows[i, 0] - qx
-        dy = rows[i, 1] - qy
+        if i == known:
+            continue
+        dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
         d = dx * dx + dy * dy
         if d < d2:
             e2 = min(e2, d2)
@@ -174,78 +170,192 @@ def nearest_on_axis(
             row = i
         else:
             e2 = min(e2, d)
-    return row, d2, e2
+    return row, d2, e2, up - down - 1
 
 
-@kernel("f8(f8[:, ::1], i8, f8, f8, f8)")
-def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float:
-    """Squared distance of a query from the ray ``s``: beyond a right angle its nearest point is the centre."""
-    ex, ey = rays[s, 0], rays[s, 1]
-    if ex * qx + ey * qy <= 0.0:
-        return r2
-    cross: float = ex * qy - ey * qx
-    return cross * cross
+@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], b1[::1], Tuple((i8[::1], f8[::1], i8[::1])))")
+def walk_all(
+    rows: Array, virtual: Array, below: Ints, kept: npt.NDArray[np.bool_], out: tuple[Ints, Array, Ints]
+) -> None:
+    """:func:`walk` for all virtual points, each from its own place on the fused axis."""
+    row, d2, visits = out
+    n = len(rows)
+    for i in range(len(virtual)):
+        if kept[i]:
+            at = min(below[i], n)
+            row[i], d2[i], _, visits[i] = walk(rows, 0, n, at, virtual[i, 0], virtual[i, 1], (-1, d2[i], np.inf))
+
+
+def pair_fused(axis: Axis, fused: Fused, bound: float = np.inf) -> tuple[Ints, Array, Ints]:
+    """Nearest reference row of every virtual point, its distance, and how many points were visited for it.
+
+    Row -1 where none is nearer than ``bound`` (the distance is then ``bound``) or the point is behind L.
+    """
+    m = len(fused.virtual)
+    row, d2, visits = np.full(m, -1), np.full(m, bound * bound), np.zeros(m, np.int64)
+    walk_all(axis.rows[: fused.rows], fused.virtual, fused.below, fused.kept, (row, d2, visits))
+    return row, np.sqrt(d2), visits
+
+
+@kernel("i8(f8[:, ::1], i8, i8, f8)")
+def place_on_axis(rows: Array, low: int, high: int, r: float) -> int:
+    """First row of the axis [low, high) that is not nearer to the origin than ``r``, by bisection."""
+    while low < high:
+        m = (low + high) >> 1
+        if rows[m, 2] < r:
+            low = m + 1
+        else:
+            high = m
+    return low
+
+
+@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)", inline=True)
+def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: float) -> tuple[int, float, float]:
+    """The few rows in the query's sector and beside it: row, squared distance, bound (squared) for all others.
+
+    The answer is final where the bound is not below the squared distance: then the rays that bound what was looked at
+    are at least as far away. Otherwise :func:`search` has to go on from it.
+    """
+    sectors = len(start) - 1
+    home = sector_of(qx, qy, sectors)
+    a, b = max(home - 1, 0), min(home + 2, sectors)
+    best, d2, e2 = -1.0, bound2, np.inf
+    if start[b] - start[a] > GLANCE or len(rows) < GLANCE:
+        return -1, bound2, -1.0
+    low = min(start[a], len(rows) - GLANCE)
+    for i in range(low, low + GLANCE):
+        dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
+        d = dx * dx + dy * dy
+        e2 = min(e2, max(d, d2))
+        best = float(i) if d < d2 else best  # as a float it stays free of branches
+        d2 = min(d, d2)
+    right = rays[a, 0] * qy - rays[a, 1] * qx
+    left = rays[b, 0] * qy - rays[b, 1] * qx
+    return int(best), d2, min(e2, min(right * right, left * left))
+
+
+@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8[::1], i8, f8, f8, Tuple((i8, f8, f8)))", inline=True)
+def look_through(
+    rows: Array, start: Ints, group: int, qx: float, qy: float, best: tuple[int, float, float]
+) -> tuple[int, float, float, int]:
+    """All rows of a group of sectors, or of each its axis where they are many; see :func:`walk`."""
+    row, d2, e2 = best
+    first = GROUP * group
+    last = min(first + GROUP, len(start) - 1)
+    low, high = start[first], start[last]
+    if high - low > SHORT:
+        visits = 0
+        rq = np.sqrt(qx * qx + qy * qy)
+        for s in range(first, last):
+            at = place_on_axis(rows, start[s], start[s + 1], rq)
+            row, d2, e2, n = walk(rows, start[s], start[s + 1], at, qx, qy, (row, d2, e2))
+            visits += n
+        return row, d2, e2, visits
+    known = row
+    for i in range(low, high):
+        dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
+        d = dx * dx + dy * dy if i != known else np.inf
+        e2 = min(e2, max(d, d2))
+        row = i if d < d2 else row
+        d2 = min(d, d2)
+    return row, d2, e2, high - low
+
+
+@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, i8, f8)")
+def search(
+    rows: Array, start: Ints, rays: Array, qx: float, qy: float, row: int, d2: float
+) -> tuple[int, float, float, int]:
+    """Row nearest to the query (relative to the centre), given one at squared distance ``d2`` (row -1: only a bound).
+
+    Returns row, squared distance, bound for all others (squared) and the number of rows visited. From the query's own
+    group the search goes round to both sides, until a ray is farther away than the best pair.
+    """
+    r2 = qx * qx + qy * qy
+    rq = np.sqrt(r2)
+    sectors = len(start) - 1
+    groups = (sectors + GROUP - 1) // GROUP
+    home = sector_of(qx, qy, sectors) // GROUP
+    row, d2, e2, visits = look_through(rows, start, home, qx, qy, (row, d2, np.inf))
+    todo = groups - 1
+    for side in range(1, -2, -2):
+        group = home
+        while todo > 0:
+            ray = GROUP * group
+            group += side
+            if group == groups:
+                group = 0
+            elif group < 0:
+                group = groups - 1
+            if side > 0:
+                ray = GROUP * group
+            along = rays[ray, 0] * qx + rays[ray, 1] * qy
+            across = rays[ray, 0] * qy - rays[ray, 1] * qx
+            far2 = across * across if along > 0.0 else r2  # beyond a right angle the ray is nearest at the centre
+            if far2 >= d2:
+                e2 = min(e2, far2)
+                break
+            todo -= 1
+            ring, outer = rays[GROUP * group, 2], rays[GROUP * group, 3]
+            if along > 0.0 and side * across <= 0.0 and sectors >= WIDE:
+                off = along - min(max(along, ring), outer)
+            else:  # the group may begin behind the query's back: its ring alone tells how far away it is
+                off, far2 = rq - min(max(rq, ring), outer), 0.0
+            far2 += off * off
+            if far2 >= d2:
+                e2 = min(e2, far2)
+                continue
+            row, d2, e2, n = look_through(rows, start, group, qx, qy, (row, d2, e2))
+            visits += n
+    return row, d2, e2, visits
 
 
 @kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)")
 def nearest(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: float) -> tuple[int, float, float]:
     """Row nearest to the query (relative to the centre), its squared distance, and a bound for all others' (squared).
 
-    Row -1 and ``bound2`` if none is nearer than that. The bound makes a safe radius: until the query has moved by half
-    the difference of the two distances, its nearest row cannot change.
+    Row -1 and ``bound2`` if none is nearer than that.
     """
-    r2 = qx * qx + qy * qy
-    rq = np.sqrt(r2)
-    sectors = len(start) - 1
-    home = min(sectors - 1, int(turn_of(qx, qy) * 0.25 * sectors)) if sectors > 1 else 0
-    row, d2, e2 = nearest_on_axis(rows, start[home], start[home + 1], qx, qy, (rq, -1, bound2, np.inf))
-    left = right = home
-    todo = sectors - 1
-    open_left = open_right = todo > 0
-    while open_left or open_right:
-        if open_left:
-            left = left + 1 if left + 1 < sectors else 0
-            ray2 = ray_distance2(rays, left, qx, qy, r2)
-            if ray2 >= d2:
-                e2 = min(e2, ray2)
-                open_left = False
-            else:
-                row, d2, e2 = nearest_on_axis(rows, start[left], start[left + 1], qx, qy, (rq, row, d2, e2))
-                todo -= 1
-                open_left = todo > 0
-                open_right = open_right and todo > 0
-        if open_right:
-            ray2 = ray_distance2(rays, right, qx, qy, r2)
-            right = right - 1 if right > 0 else sectors - 1
-            if ray2 >= d2:
-                e2 = min(e2, ray2)
-                open_right = False
-            else:
-                row, d2, e2 = nearest_on_axis(rows, start[right], start[right + 1], qx, qy, (rq, row, d2, e2))
-                todo -= 1
-                open_right = todo > 0
-                open_left = open_left and todo > 0
+    row, d2, e2 = glance(rows, start, rays, qx, qy, bound2)
+    if e2 < d2:
+        row, d2, e2, _ = search(rows, start, rays, qx, qy, row, d2)
     return row, d2, e2
 
 
-@kernel("void(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, Tuple((i8[::1], f8[::1], f8[::1])))")
+@kernel("void(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, Tuple((i8[::1], f8[::1], f8[::1], i8[::1])))")
 def nearest_all(
-    rows: Array, start: Ints, rays: Array, queries: Array, bound2: float, out: tuple[Ints, Array, Array]
+    rows: Array, start: Ints, rays: Array, queries: Array, bound2: float, out: tuple[Ints, Array, Array, Ints]
 ) -> None:
-    """:func:`nearest` for queries of shape (m, 2) relative to the centre."""
-    row, d2, e2 = out
+    """:func:`nearest` for queries of shape (m, 2) relative to the centre, and how many rows were visited for each.
+
+    Neighbours in the sequence are neighbours in the room: the partner of the one before is a first guess.
+    """
+    row, d2, e2, visits = out
+    last = -1
     for i in range(len(queries)):
-        row[i], d2[i], e2[i] = nearest(rows, start, rays, queries[i, 0], queries[i, 1], bound2)
+        qx, qy = queries[i, 0], queries[i, 1]
+        j, d, e = glance(rows, start, rays, qx, qy, bound2)
+        n = GLANCE if e >= 0.0 else 0
+        if e < d:
+            if last >= 0:
+                warm = (rows[last, 0] - qx) ** 2 + (rows[last, 1] - qy) ** 2
+                if warm < d:
+                    j, d = last, warm
+            j, d, e, more = search(rows, start, rays, qx, qy, j, d)
+            n += more
+        row[i], d2[i], e2[i], visits[i] = j, d, e, n
+        last = j
 
 
-def query_axis(axis: Axis, queries: Array, bound: float = np.inf) -> tuple[Ints, Array]:
-    """Label of the nearest reference point and its distance for each query (m, 2); -1 and ``bound`` where none."""
-    row = np.empty(len(queries), np.int64)
+def query_axis(axis: Axis, queries: Array, bound: float = np.inf) -> tuple[Ints, Array, Ints]:
+    """Label of the nearest reference point, its distance and the points visited for each query (m, 2).
+
+    Label -1 and distance ``bound`` where none is nearer than that.
+    """
+    row, visits = np.empty(len(queries), np.int64), np.empty(len(queries), np.int64)
     d2, e2 = np.empty(len(queries)), np.empty(len(queries))
     local = np.ascontiguousarray(queries - axis.centre)
-    nearest_all(axis.rows, axis.start, axis.rays, local, bound * bound, (row, d2, e2))
-    found = np.append(axis.label, -1)[row]
-    return found, np.sqrt(d2)
+    nearest_all(axis.rows, axis.start, axis.rays, local, bound * bound, (row, d2, e2, visits))
+    return np.append(axis.label, -1)[row], np.sqrt(d2), visits
 
 
 def nearest_slow(points: Array, queries: Array, bound: float = np.inf) -> tuple[Ints, Array]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.distance_region import Ints, nearest
+from estimator.distance_region import Ints, glance, search
 from estimator.kernel import kernel
 from estimator.linear3 import eigen3, positive, solve3
 from estimator.records import Array
@@ -124,7 +124,9 @@ def pair_up(body: Array, reference: Reference, T: Array, gate2: float, count: in
             if d2 >= gate2:
                 row = -1
         else:
-            row, d2, e2 = nearest(rows, start, rays, px, py, gate2)
+            row, d2, e2 = glance(rows, start, rays, px, py, gate2)
+            if e2 < d2:
+                row, d2, e2, _ = search(rows, start, rays, px, py, row, d2)
             found[i] = row
             safe[i, 0], safe[i, 1] = px, py
             safe[i, 2] = 0.25 * (np.sqrt(e2) - np.sqrt(d2)) ** 2

@@ -140,8 +140,10 @@ def cache_is_warm() -> bool:
     return any(CACHE_DIR.glob(f"{Path(__file__).parent.name}_*/*.nbc"))
 
 
-def kernel(signature: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def kernel(signature: str, inline: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
+
+    ``inline`` writes its body into the kernels that call it: handing over three arrays costs as much as ten points.
 
     The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage. With
     ``NUMBA_DISABLE_JIT=1`` nothing is compiled and every kernel is its own ``.py_func``.
@@ -149,7 +151,13 @@ def kernel(signature: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         compiled: Any = numba.njit(
-            signature, nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", boundscheck=None
+            signature,
+            nogil=True,
+            cache=True,
+            fastmath=FASTMATH,
+            error_model="numpy",
+            boundscheck=None,
+            inline="always" if inline else "never",
         )(function)
         if _numba_config.DISABLE_JIT:
             compiled.py_func = function

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator import icp
-from estimator.distance_region import Ints, ray_distance2, turn_of
+from estimator.distance_axis import Ints, ray_distance2, turn_of
 from estimator.kernel import kernel
 from estimator.linear3 import solve3
 from estimator.records import Array

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from estimator.distance_region import build_axis, nearest_all, nearest_slow, query_axis, sector_count, turn_of
+from estimator.distance_axis import build_axis, sector_count, turn_of
+from estimator.distance_region import nearest_all, nearest_slow, query_axis
 from estimator.records import Array
 
 COARSE = st.integers(-6, 6).map(lambda n: n * 0.25)  # duplicates, ties and points on sector bounds are common
@@ -20,7 +21,7 @@ SECTORS = st.sampled_from([0, 1, 2, 3, 7, 64])
 
 
 def agree(points: Array, queries: Array, centre: Array, sectors: int, bound: float = np.inf) -> None:
-    found, distance = query_axis(build_axis(points, centre, sectors), queries, bound)
+    found, distance, _ = query_axis(build_axis(points, centre, sectors), queries, bound)
     _, expected = nearest_slow(points, queries, bound)
     np.testing.assert_allclose(distance, expected, rtol=0, atol=1e-12)
     hit = found >= 0
@@ -42,9 +43,10 @@ def test_the_bound_for_all_other_rows_is_true(
     points: Array, queries: Array, centre: Array, sectors: int, bound: float
 ) -> None:
     axis = build_axis(points, centre, sectors)
-    row, d2, e2 = np.empty(len(queries), np.int64), np.empty(len(queries)), np.empty(len(queries))
+    row, visits = np.empty(len(queries), np.int64), np.empty(len(queries), np.int64)
+    d2, e2 = np.empty(len(queries)), np.empty(len(queries))
     local = np.ascontiguousarray(queries - centre)
-    nearest_all(axis.rows, axis.start, axis.rays, local, bound * bound, (row, d2, e2))
+    nearest_all(axis.rows, axis.start, axis.rays, local, bound * bound, (row, d2, e2, visits))
     for i, q in enumerate(local):
         others = np.delete(axis.rows, row[i], axis=0) if row[i] >= 0 else axis.rows
         if len(others):

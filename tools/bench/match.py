@@ -194,7 +194,8 @@ def _search() -> list[Figure]:
 def _ratio(pair: Pair) -> float:
     axis = distance_region.build_axis(points(pair.reference), STILL[:2])
     queries = np.ascontiguousarray(points(pair.new))
-    out = (np.empty(len(queries), np.int64), np.empty(len(queries)), np.empty(len(queries)))
+    n = len(queries)
+    out = (np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n, np.int64))
     mine = _best(lambda: distance_region.nearest_all(axis.rows, axis.start, axis.rays, queries, np.inf, out))
     return _best(lambda: brute(axis.rows, queries, out[0])) / mine
 
