@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.distance_region import Ints, glance, search
+from estimator.distance_region import Ints, glance, nearest, search
 from estimator.kernel import kernel
 from estimator.linear3 import eigen3, positive, solve3
 from estimator.records import Array
