@@ -1,6 +1,7 @@
 """Other matchers at their best settings, each in one thread: what ours is compared with in the same run.
 
-All get the points of two scans and a start, and do everything from there: normals, index, iterations.
+All get the points of two scans and a start, and do everything from there: normals, index, iterations. Each comes in two
+forms: as its documentation has it, and as we found it most accurate, at whatever cost.
 """
 
 from __future__ import annotations
@@ -22,12 +23,20 @@ GATE = 0.5
 STEP_M, STEP_RAD = 1e-4, 1e-5
 """A step shorter than this ends the iteration: a tenth of the accuracy that range noise allows."""
 MOST = 50
-NEIGHBOURS = 8
+NEIGHBOURS, MANY = 8, 20
 
 
-def kdtree(reference: Array, points: Array, start: Array) -> Array:
+def kdtree(neighbours: int) -> Match:
     """Point-to-line ICP on scipy's cKDTree, numpy throughout, Cauchy weights; normals from the scan's own order."""
-    tree, normal = cKDTree(reference), normals(reference)
+
+    def match(reference: Array, points: Array, start: Array) -> Array:
+        return iterate(cKDTree(reference), reference, normals(reference, neighbours), points, start)
+
+    return match
+
+
+def iterate(tree: cKDTree, reference: Array, normal: Array, points: Array, start: Array) -> Array:
+    """The iterations of :func:`kdtree`."""
     x, y, yaw = start
     scale = GATE / 2
     for _ in range(MOST):
@@ -49,10 +58,10 @@ def kdtree(reference: Array, points: Array, start: Array) -> Array:
     return np.array((x, y, yaw))
 
 
-def normals(xy: Array) -> Array:
+def normals(xy: Array, neighbours: int) -> Array:
     """Normals by principal components of each point's neighbours in the scan, vectorised."""
     n = len(xy)
-    half = NEIGHBOURS // 2
+    half = neighbours // 2
     window = np.clip(np.arange(n)[:, None] + np.arange(-half, half + 1), 0, n - 1)
     d = xy[window] - xy[:, None]
     d = np.where((np.hypot(d[..., 0], d[..., 1]) < 0.25)[..., None], d, 0.0)
@@ -64,17 +73,22 @@ def normals(xy: Array) -> Array:
     return np.column_stack((-np.sin(angle), np.cos(angle)))
 
 
-def small_gicp() -> Match:
-    """Koide's small_gicp. It is three-dimensional: without a second layer its normals would all point upwards."""
+def small_gicp(kind: str, neighbours: int) -> Match:
+    """Koide's small_gicp. It is three-dimensional: without a second layer its normals would all point upwards.
+
+    ``kind``: ``PLANE_ICP``, or ``GICP``, which takes distributions on both sides.
+    """
     s = import_module("small_gicp")
 
     def match(reference: Array, points: Array, start: Array) -> Array:
         target, tree = s.preprocess_points(
-            layers(reference), downsampling_resolution=1e-3, num_neighbors=2 * NEIGHBOURS
+            layers(reference), downsampling_resolution=1e-3, num_neighbors=2 * neighbours
         )
         source = s.PointCloud(flat(points))
+        if kind == "GICP":
+            source, _ = s.preprocess_points(layers(points), downsampling_resolution=1e-3, num_neighbors=2 * neighbours)
         found = s.align(
-            target, source, tree, lift(start), registration_type="PLANE_ICP", max_correspondence_distance=GATE,
+            target, source, tree, lift(start), registration_type=kind, max_correspondence_distance=GATE,
             num_threads=1, max_iterations=MOST, rotation_epsilon=STEP_RAD, translation_epsilon=STEP_M,
         )  # fmt: skip
         return drop(found.T_target_source)
@@ -82,12 +96,16 @@ def small_gicp() -> Match:
     return match
 
 
-def open3d() -> Match:
-    """Open3D's point-to-plane ICP with a robust kernel; normals handed to it, so it need not be lifted."""
+def open3d(stages: tuple[tuple[float, float], ...], neighbours: int) -> Match:
+    """Open3D's point-to-plane ICP with a robust kernel; normals handed to it, so it need not be lifted.
+
+    ``stages``: one run after the other, each with its gate and the scale of its robust kernel, m.
+    """
     o3d = import_module("open3d")
     registration = o3d.pipelines.registration
-    kernel = registration.TransformationEstimationPointToPlane(registration.CauchyLoss(0.05))
     stop = registration.ICPConvergenceCriteria(1e-7, 1e-7, MOST)
+    kernel, loss = registration.TransformationEstimationPointToPlane, registration.CauchyLoss
+    runs = [(gate, kernel(loss(scale))) for gate, scale in stages]
 
     def match(reference: Array, points: Array, start: Array) -> Array:
         target, source = o3d.geometry.PointCloud(), o3d.geometry.PointCloud()
@@ -95,9 +113,11 @@ def open3d() -> Match:
             o3d.utility.Vector3dVector(flat(reference)),
             o3d.utility.Vector3dVector(flat(points)),
         )
-        target.normals = o3d.utility.Vector3dVector(flat(normals(reference)))
-        found = registration.registration_icp(source, target, GATE, lift(start), kernel, stop)
-        return drop(found.transformation)
+        target.normals = o3d.utility.Vector3dVector(flat(normals(reference, neighbours)))
+        T = lift(start)
+        for gate, how in runs:
+            T = registration.registration_icp(source, target, gate, T, how, stop).transformation
+        return drop(T)
 
     return match
 
@@ -123,12 +143,24 @@ def drop(T: Array) -> Array:
     return np.array((T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])))
 
 
-def peers() -> dict[str, Match]:
-    """Those that are installed, by name and version."""
-    found: dict[str, Match] = {f"cKDTree (scipy {version('scipy')})": kdtree}
-    for name, make in (("small_gicp", small_gicp), ("open3d", open3d)):
+MAKERS: dict[str, tuple[float, Callable[[], tuple[Match, Match]]]] = {
+    "scipy": (6.0, lambda: (kdtree(NEIGHBOURS), kdtree(MANY))),
+    "small_gicp": (4.0, lambda: (small_gicp("PLANE_ICP", NEIGHBOURS), small_gicp("GICP", 2 * NEIGHBOURS))),
+    "open3d": (2.0, lambda: (open3d(((GATE, 0.05),), NEIGHBOURS), open3d(((GATE, 0.1), (0.15, 0.025)), MANY))),
+}
+"""How many times faster than each ours has to be, and its two forms."""
+
+
+def peers() -> dict[str, tuple[float, Match]]:
+    """Those that are installed, by name, version and form; open3d (400 MB with what it needs) is in no lock file."""
+    found = {}
+    for package, (least, make) in MAKERS.items():
         try:
-            found[f"{name} {version(name)}"] = make()
+            usual, accurate = make()
         except ImportError as error:
-            print(f"{name}: not compared, {error} (pip install {name})")
+            print(f"{package}: not compared, {error} (pip install {package})")
+            continue
+        name = f"{'cKDTree of ' if package == 'scipy' else ''}{package} {version(package)}"
+        found[name] = (least, usual)
+        found[f"{name}, for accuracy"] = (least, accurate)
     return found
