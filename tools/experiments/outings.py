@@ -1,4 +1,4 @@
-"""The paper's robot on two passes of a 160 m drive: records for `step`, and what different estimators make of them.
+"""The paper's robot on a drive of 160 m and half of it again: records for `step`, and what estimators make of them.
 
 Its lidar sees 180 deg with 721 beams at 40 Hz. Between the passes the lamps may age: each changes its power at once, up
 or down, by half to all of the given share. Everything is at the level of `step`: no daemon, no wire, light as decoded
@@ -36,7 +36,7 @@ THIN: Final = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outing:
-    """Two passes of one drive. ``seconds``: of each pass; both follow one another without a break."""
+    """A drive and, without a break, its first half once more. ``seconds``: of the first pass."""
 
     run: LightRun
     walkers: tuple[Walker, ...]
@@ -44,7 +44,7 @@ class Outing:
 
     def span(self, number: int) -> tuple[float, float]:
         """Begin and end of pass 0 or 1, s."""
-        return number * self.seconds, (number + 1) * self.seconds
+        return (self.seconds, 1.5 * self.seconds) if number else (0.0, self.seconds)
 
     def scans(self, number: int) -> list[Scan]:
         """What the laser sees on a pass."""
@@ -129,8 +129,8 @@ def note(log: Log, result: StepResult) -> None:
 
 
 def fresh(run: LightRun, lit: bool, settings: Settings) -> State:
-    """A robot that has just been switched on; with a photodiode it knows the lamps as new."""
-    kept = replace(settings, history=True)
+    """A robot that has just been switched on; with a photodiode it knows the lamps as new. No loops are closed."""
+    kept = replace(settings, history=True, loops=None)
     return new_state(kept, LightsSetup(run.survey, clock_ppm=0.0) if lit else None)
 
 
