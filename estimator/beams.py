@@ -27,11 +27,11 @@ ROOT_2PI = math.sqrt(2.0 * math.pi)
 GAP_M, GAP_SHARE = 0.15, 0.08
 """Neighbouring points are one surface if they are no farther apart than the first and that share of their range."""
 
+EDGE_ON = 1e-12
+"""Sine below which a segment is seen edge on, or is a point: which end is met first is then a matter of rounding."""
+
 HIT, SHORT, MAX, RAND, SIGMA, DECAY, FAR = range(7)
 """Columns of a model's row."""
-
-Seen = tuple[Array, Array, Array, npt.NDArray[np.uint8], Array]
-"""What a kernel needs for Eq. 9: segments of the reference, the scan's bearings, ranges and kinds, a model's row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +137,8 @@ def cast(segments: Array, eye: Array, bearing: Array, expected: Array) -> None:
         bx, by = segments[i, 2] - eye[0], segments[i, 3] - eye[1]
         ax, ay, bx, by = c * ax + s * ay, c * ay - s * ax, c * bx + s * by, c * by - s * bx
         cross, dot = ax * by - ay * bx, ax * bx + ay * by
-        if cross == 0.0:
-            continue  # seen edge on, or a point
+        if abs(cross) <= EDGE_ON * (ax * ax + ay * ay + bx * bx + by * by):
+            continue
         first, span = np.arctan2(ay, ax) / step, np.arctan2(cross, dot) / step
         low, high = min(first, first + span), max(first, first + span)
         lap = np.floor(low / turn) * turn  # the bearing's first beam is at 0, others up to n - 1
@@ -176,9 +176,16 @@ def log_likelihood(segments: Array, T_ref_lidar: Array, beams: Beams, model: Bea
     """
     if not tempering >= 1.0:
         raise ValueError(f"tempering {tempering} is below 1: beams are not more than independent")
-    expected = np.empty(len(beams[0]))
-    cast(segments, T_ref_lidar, beams[0], expected)
-    return float(sum_log(beams, expected, model.row(), 1)[0]) / tempering
+    return _sum(segments, T_ref_lidar, beams, model)[0] / tempering
+
+
+def mean_log(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel) -> float:
+    """``ln rho p`` of Eq. 9 as a mean per beam; ``rho`` makes it 0 where all hit what is expected. -inf without beams.
+
+    That is the tempering that Eq. 15 needs: all beams together weigh as much as one.
+    """
+    total, count, row = _sum(segments, T_ref_lidar, beams, model)
+    return total / count - math.log(row[HIT] / (ROOT_2PI * row[SIGMA])) if count else -math.inf
 
 
 def quality(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel) -> float:
@@ -186,8 +193,13 @@ def quality(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel)
 
     Above 0 the surfaces speak for the pose. A beam at a pose that knows nothing has any range up to the longest one.
     """
-    expected = np.empty(len(beams[0]))
-    cast(segments, T_ref_lidar, beams[0], expected)
-    row = model.row()
-    total, count = sum_log(beams, expected, row, 1)
+    total, count, row = _sum(segments, T_ref_lidar, beams, model)
     return total / count + math.log(row[FAR]) if count else math.nan
+
+
+def _sum(segments: Array, eye: Array, beams: Beams, model: BeamModel) -> tuple[float, int, Array]:
+    """Logarithm of Eq. 9, the number of beams that say something, and the model's row."""
+    expected, row = np.empty(len(beams[0])), model.row()
+    cast(segments, eye, beams[0], expected)
+    total, count = sum_log(beams, expected, row, 1)
+    return total, count, row

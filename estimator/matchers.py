@@ -23,7 +23,8 @@ from estimator.result import LightsResult, LinkState, MatchResult, Reason
 if TYPE_CHECKING:
     from estimator.state import Settings
 
-CENTRE = np.zeros(2)
+SETTLED_M = 2e-4
+"""Way that may remain when an iteration ends: a fifth of what range noise leaves uncertain in a room."""
 LIKELY = np.diag((0.02**2, 0.02**2, 0.005**2))
 """No relative pose from light is better than this: stamps, and errors of the light model that differ from place to
 place."""
@@ -49,8 +50,8 @@ class First:
     """T1 of Eq. 14, and how well it explains its own measurement (Eq. 6).
 
     Attributes:
-        T: T_odom_base. L: information of it, odom-aligned. misfit: mean squared deviation of the links. links: their
-            number, 0 where there is no light.
+        T: pose of the new base. L: information of it, in the axes of the frame it is given in.
+        misfit: mean squared deviation of the links. links: their number, 0 where there is no clear one.
     """
 
     T: Array
@@ -112,40 +113,31 @@ def points_of(frame: Keyframe, far_m: float) -> Array:
 
 def by_points(view: View, frame: Keyframe, xy: Array, first: First, cap: int, settings: Settings) -> Attempt:
     """The paper's matcher, see point.py."""
-    from estimator import beams, point
+    from estimator import point
 
-    axis = build_axis(xy, CENTRE, sectors=1)
-    lines = np.empty((len(xy), 4))
-    point.surfaces(xy, view.noise_m, lines)
-    reference = axis.rows, axis.start, axis.rays, lines[axis.label]
-    eye = frame.T_odom_lidar
-    T1 = se2.between(eye, first.T)
-    L1 = turned_back(first.L, first.T[2])
-    bearing, distance, kind = view.beams
-    model = beams.BeamModel(sigma_m=2.0 * view.noise_m, far_m=min(settings.far_m, 30.0)).row()
-    seen = (beams.segments_of(xy), bearing, distance, kind, model)
-    matched = settings.matching
-    mode = 1.0 if settings.weight is Weight.PAPER else 0.0
-    tail = (view.noise_m, matched.settled * 1e-3, mode, first.misfit, first.links, *view.T_base_lidar)
-    how = np.array((cap, matched.gate_m, matched.scale * view.noise_m, *tail), dtype=np.float64)
-    T, H, sums, trace = np.empty(3), np.zeros((3, 3)), np.zeros(icp.SUMS), np.zeros((cap, icp.TRACE))
-    n = point.iterate(view.points, reference, (T1, L1), seen, how, (T, H, sums, trace))
-    told = Prior(first.T, first.L)
-    return Attempt(se2.compose(eye, T), turned_back(H, -eye[2]), sums, n, len(view.points), trace[:n], view, told)
+    eye, how = frame.T_odom_lidar, settings.matching
+    here = First(se2.between(eye, first.T), turned_back(first.L, first.T[2]), first.misfit, first.links)
+    new = point.New(np.ascontiguousarray(view.points[:, :2]), view.T_base_lidar, view.beams, view.noise_m)
+    scalar = settings.weight is Weight.PAPER
+    limits = point.Limits(cap, how.gate_m, how.scale * view.noise_m, SETTLED_M, scalar)
+    course, H = point.register(new, point.reference_of(xy, view.noise_m), here, limits)
+    trace = np.array(course.trace).reshape(-1, icp.TRACE)
+    T, told = se2.compose(eye, course.T), Prior(first.T, first.L)
+    return Attempt(T, turned_back(H, -eye[2]), course.sums, len(trace), len(view.points), trace, view, told)
 
 
 def by_pic(view: View, frame: Keyframe, xy: Array, prior: Prior, cap: int, settings: Settings) -> Attempt:
     """The paper's baseline, see pic.py."""
     from estimator import pic
 
-    axis = build_axis(xy, CENTRE)
+    axis = build_axis(xy, np.zeros(2))
     eye = frame.T_odom_lidar
     T = se2.between(eye, prior.T)
     P = invert3(turned_back(prior.L, eye[2]))
     bearing = frame.bearing_rad
     across = abs(float(bearing[-1] - bearing[0])) / max(1, len(bearing) - 1) / np.sqrt(12.0) if len(bearing) else 0.0
     mount = view.T_base_lidar
-    how = np.array((cap, view.noise_m, across, settings.matching.settled * 1e-3, mount[0], mount[1]))
+    how = np.array((cap, view.noise_m, across, SETTLED_M, mount[0], mount[1]))
     H, sums, trace = np.zeros((3, 3)), np.zeros(icp.SUMS), np.zeros((cap, icp.TRACE))
     n = pic.iterate(view.points, (axis.rows, axis.start, axis.rays), T, P, how, (H, sums, trace))
     return Attempt(se2.compose(eye, T), turned_back(H, -eye[2]), sums, n, len(view.points), trace[:n], view, prior)

@@ -20,7 +20,7 @@ COMPATIBLE = 5.991
 """Squared Mahalanobis distance within which two points may be one: chi-squared, 2 degrees of freedom, 95 %."""
 
 LEAST, SHRINK = 4.0, 0.25
-"""How far, in deviations of a range, the displacement moves a point at least; and how fast its variance shrinks."""
+"""How far, in deviations of a point, the displacement moves it at least; and how fast its variance shrinks."""
 
 CAP, NOISE, ACROSS, SETTLED, EYE_X, EYE_Y = range(6)
 """Places in ``how``: iteration cap, range noise, bearing noise (rad), way that ends it (m), lidar in the base frame."""
@@ -204,7 +204,7 @@ def iterate(
     """Iterate pIC from ``T`` (base in the reference lidar's frame, moved in place) with covariance ``P``; their number.
 
     The displacement's covariance opens the compatible sets. As the displacement is found it shrinks, no faster than
-    the steps and never below ``LEAST`` deviations of a range: a set must hold points on either side along a wall, or
+    the steps and never below ``LEAST`` deviations of a point: a set must hold points on either side along a wall, or
     the virtual partner pulls along it. The solution's own covariance would be there at once, and stop short of it.
     ``out``: information, sums and trace in the layout of `icp`.
     """
@@ -212,7 +212,7 @@ def iterate(
     P = P.copy()
     b, step, before = np.empty(7), np.empty(3), np.zeros(3)
     lever = max(0.1, icp.mean_lever(points, how[EYE_X : EYE_Y + 1]))
-    damping, count, least = 1.0, 0, (LEAST * how[NOISE]) ** 2
+    damping, count, least = 1.0, 0, LEAST**2 * (how[NOISE] ** 2 + (lever * how[ACROSS]) ** 2)
     sums[icp.SETTLED] = 0.0
     while count < how[CAP] and sums[icp.SETTLED] == 0.0:
         row = trace[count]

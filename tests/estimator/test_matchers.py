@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from estimator import se2
-from estimator.matchers import First, Matcher, Weight, match
+from estimator.keyframe import Virtual, keep
+from estimator.matchers import First, Matcher, Weight, first_of, match
 from estimator.matching import Prior
 from estimator.pipeline import Settings, new_state, step
 from estimator.records import UNLIMITED, Array, Odometry
+from estimator.result import Fix, LightsResult, Link, LinkState
 from tests.estimator.world import map_of, moved, place_both, prior_at, scan_in, view_of
 from tools.bench._scenes import Scene, bearings, office, paper_room
 
@@ -92,3 +94,46 @@ def test_the_paper_weighs_light_by_one_number() -> None:
     by = {k: match(asked, light, Settings(matcher=Matcher.POINT, weight=k)) for k in Weight}
     assert 0.01 < by[Weight.PAPER].T_odom_base[0] - T_new[0] < 0.029
     assert abs(by[Weight.INFORMATION].T_odom_base[0] - T_new[0]) < 0.006
+
+
+def seen_by_light(T: Array, sd: float) -> Virtual:
+    return Virtual(T, np.diag((sd**2, sd**2, (0.2 * sd) ** 2)), frozenset({1, 2}))
+
+
+def links(*deviations: float) -> LightsResult:
+    used = [Link(k, k, LinkState.ACCEPTED, 1e-6, 0.02 * d, 0.02) for k, d in enumerate(deviations)]
+    out = Link(9, 9, LinkState.OCCLUDED, 1e-7, -0.5, 0.02)
+    P = np.eye(3)
+    return LightsResult(0.0, Fix.GOOD, np.zeros(3), P, (*used, out), frozenset(), np.zeros((3, 3)), np.zeros(3))
+
+
+def test_the_first_transform_is_lights_relative_pose_hung_on_the_keyframe() -> None:
+    """T1 = X_ref^-1 X_new in the odom frame, whatever lies between odom and map; occluded links have no say."""
+    scan = scan_in(paper_room(), np.zeros(3), bearings(19, 180.0), None)
+    T_odom, made, X_ref = np.array((1.0, 2.0, 0.5)), np.array((0.2, 0.05, 0.1)), np.array((-3.0, 1.0, -2.0))
+    frame = keep(1, T_odom, T_odom, scan, 0.0)
+    frame.virtual = seen_by_light(X_ref, 0.03)
+    now = seen_by_light(se2.compose(X_ref, made), 0.04)
+    prior = Prior(T_odom, np.eye(3))
+    first = first_of(prior, frame, now, links(1.0, -1.0, 2.0))
+    np.testing.assert_allclose(first.T, se2.compose(T_odom, made), atol=1e-12)
+    assert first.links == 3
+    assert first.misfit == pytest.approx(2.0)
+    P = np.linalg.inv(first.L)
+    assert 0.05**2 < P[0, 0] < 0.06**2
+    np.testing.assert_allclose(P[0, 1], P[1, 0], atol=1e-12)
+
+
+def test_without_light_the_first_transform_is_the_prediction() -> None:
+    scan = scan_in(paper_room(), np.zeros(3), bearings(19, 180.0), None)
+    frame, prior = keep(1, np.zeros(3), np.zeros(3), scan, 0.0), Prior(np.ones(3), np.eye(3))
+    good = seen_by_light(np.zeros(3), 0.03)
+    for newest, now, told in ((None, good, links(1.0)), (frame, good, links(1.0)), (frame, None, None)):
+        first = first_of(prior, newest, now, told)
+        assert first.T is prior.T
+        assert first.links == 0
+    frame.virtual = good
+    for told in (None, links()):
+        first = first_of(prior, frame, good, told)
+        assert first.T is prior.T
+        assert first.links == 0
