@@ -23,6 +23,8 @@ from estimator.result import LightsResult, LinkState, MatchResult, Reason
 if TYPE_CHECKING:
     from estimator.state import Settings
 
+CENTRE = np.zeros(2)
+"""Of the reference's axis: its lidar."""
 SETTLED_M = 2e-4
 """Way that may remain when an iteration ends: a fifth of what range noise leaves uncertain in a room."""
 LIKELY = np.diag((0.02**2, 0.02**2, 0.005**2))
@@ -130,7 +132,7 @@ def by_pic(view: View, frame: Keyframe, xy: Array, prior: Prior, cap: int, setti
     """The paper's baseline, see pic.py."""
     from estimator import pic
 
-    axis = build_axis(xy, np.zeros(2))
+    axis = build_axis(xy, CENTRE)
     eye = frame.T_odom_lidar
     T = se2.between(eye, prior.T)
     P = invert3(turned_back(prior.L, eye[2]))

@@ -17,11 +17,10 @@ import numpy as np
 from estimator import beams, icp, point_sums, se2
 from estimator.distance_region import Axis, Fused, Ints, build_axis, fuse, pair_fused
 from estimator.keyframe import Beams
-from estimator.matchers import First
+from estimator.matchers import CENTRE, First
 from estimator.records import Array
 from estimator.weights import combine, information_weight, moved, paper_weight, turned, twist_between
 
-CENTRE = np.zeros(2)
 PROBES = 4
 """Steps along the normals by which the solution's own error is looked for."""
 
