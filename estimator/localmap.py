@@ -207,12 +207,20 @@ def standing(frame: Keyframe, lines: Array, before: Keyframe, margin: float) -> 
     return lines[said >= 0]
 
 
+@kernel("void(f8[:, ::1], i8[::1], f8[:, ::1])")
+def lines_along(elements: Array, label: Ints, lines: Array) -> None:
+    """Normal, slope and weight of the elements in the order of the axis; the weight as the share of a scan's noise."""
+    for i in range(len(label)):
+        j = label[i]
+        lines[i, 0], lines[i, 1], lines[i, 2] = elements[j, NX], elements[j, NY], elements[j, SLOPE]
+        lines[i, 3] = elements[j, WEIGHT] / (elements[j, WEIGHT] + 1.0)
+
+
 def index(elements: Array, origin: Array, number: int, newest: Keyframe | None) -> LocalMap:
     """Order elements on the axis around ``origin``."""
     axis = build_axis(elements[:, :2], origin)
-    lines = elements[axis.label, NX : WEIGHT + 1]
-    weight = lines[:, 3]
-    lines[:, 3] = weight / (weight + 1.0)
+    lines = np.empty((len(elements), 4))
+    lines_along(np.ascontiguousarray(elements), axis.label, lines)
     return LocalMap(elements, axis, lines, number, newest)
 
 

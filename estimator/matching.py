@@ -174,10 +174,10 @@ def second_opinion(local: LocalMap, prior: Prior, settings: MatchSettings, tried
 
 def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> MatchResult:
     """Judge an attempt: whether it is a result, and why not."""
-    sums, length2 = best.sums, float(best.sums[icp.LENGTH2])
-    T = np.array((best.T[0], best.T[1], se2.wrap(best.T[2])))
-    correction = T - prior.T
-    correction[2] = se2.wrap(correction[2])
+    sums, (x, y, yaw), (x1, y1, yaw1) = best.sums.tolist(), best.T.tolist(), prior.T.tolist()
+    length2 = sums[icp.LENGTH2]
+    T = np.array((x, y, se2.wrap(yaw)))
+    correction = np.array((x - x1, y - y1, se2.wrap(yaw - yaw1)))
     if sums[icp.PAIRS] < settings.min_points:
         reason = Reason.TOO_FEW_PAIRS
     elif not plausible(best, T, correction, (view, local, prior), settings):
@@ -194,7 +194,7 @@ def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: 
         inliers=int(sums[icp.INLIERS]),
         queries=best.points,
         iterations=best.iterations,
-        residual_m=float(np.sqrt(sums[icp.SQUARES] / max(sums[icp.WEIGHTS], 1e-9))),
+        residual_m=math.sqrt(sums[icp.SQUARES] / max(sums[icp.WEIGHTS], 1e-9)),
         known_axes=known_axes(H) if ok else np.zeros(3),
         correction=correction,
         reason=reason,
@@ -206,11 +206,11 @@ def plausible(
 ) -> bool:
     """Whether enough of the scan fits the map there, and not too much of either speaks against the place."""
     view, local, prior = asked
-    L = prior.L
-    wide = 1.0 / L[0, 0] + 1.0 / L[1, 1] > settings.wide_m**2 or 1.0 / L[2, 2] > settings.wide_rad**2
+    Lx, Ly, Lyaw = prior.L.diagonal().tolist()
+    wide = 1.0 / Lx + 1.0 / Ly > settings.wide_m**2 or 1.0 / Lyaw > settings.wide_rad**2
     x, y, yaw = correction.tolist()
-    surprise = float(correction @ L @ correction) > 25.0
-    surprise = surprise and (x * x + y * y > settings.wide_m**2 or abs(yaw) > settings.wide_rad)
+    surprise = x * x + y * y > settings.wide_m**2 or abs(yaw) > settings.wide_rad
+    surprise = surprise and float(correction @ prior.L @ correction) > 25.0
     ways = settings.searching if wide or surprise else settings.tracking
     if best.share < ways[-1][0]:
         return False
@@ -247,8 +247,8 @@ def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
 
 def known_axes(H: Array) -> Array:
     """1 for each of x, y, yaw that the information brings from 0.5 m and 10 deg to 10 cm and 2 deg, else 0."""
-    P = invert3(H + VAGUE)
-    return np.array((P[0, 0] < 0.01, P[1, 1] < 0.01, P[2, 2] < 0.0012), dtype=np.float64)
+    x, y, yaw = invert3(H + VAGUE).diagonal().tolist()
+    return np.array((float(x < 0.01), float(y < 0.01), float(yaw < 0.0012)))
 
 
 def no_match(T_pred: Array, queries: int, reason: Reason) -> MatchResult:

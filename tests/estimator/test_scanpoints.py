@@ -47,6 +47,33 @@ def test_a_moving_scan_is_put_right() -> None:
     np.testing.assert_array_equal(points.origin, mount[:2])
 
 
+@pytest.mark.parametrize("uneven", [0.0, 1e-6, 1e-3])
+@pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (0.04, -0.01, 0.06)])
+def test_every_beam_is_where_its_own_sine_and_cosine_put_it(uneven: float, motion: tuple[float, ...]) -> None:
+    """A thousand beams, at even bearings, nearly even, and not: as by the definition, beam by beam."""
+    rng, mount, n = np.random.default_rng(0), np.array((0.15, -0.03, 0.3)), 1081
+    bearing = bearings(n, 270.0) + rng.uniform(-uneven, uneven, n)
+    ranges = rng.uniform(0.1, 30.0, n)
+    points = points_of(scan_of(ranges, bearing, mount), np.array(motion), 80.0, 0.0)
+    twist, expected = se2.log(np.array(motion)), np.empty((n, 2))
+    for i in range(n):
+        vx, vy, w = twist * (i - n + 1) / (n - 1)
+        end = se2.compose(mount, np.array((0.0, 0.0, bearing[i])))
+        x, y = se2.apply(end, np.array(((ranges[i], 0.0),)))[0]
+        c, s = np.cos(w), np.sin(w)
+        expected[i] = vx - 0.5 * w * vy + c * x - s * y, vy + 0.5 * w * vx + s * x + c * y
+    np.testing.assert_allclose(points.xy, expected, atol=3e-9)
+
+
+def test_a_bearing_that_is_no_number_is_left_out() -> None:
+    for at in (0, 3, 8):
+        bearing = np.linspace(-1.0, 1.0, 9)
+        bearing[at] = np.nan
+        points = points_of(scan_of(np.ones(9), bearing), np.array((0.1, 0.0, 0.1)), 80.0, 0.0)
+        assert points.xy.shape == (8, 2)
+        assert np.isfinite(points.xy).all()
+
+
 def test_unturned_bearings_point_where_the_beams_went() -> None:
     bearing, turned = bearings(11, 240.0), 0.05
     seen = unturned(bearing, turned)
