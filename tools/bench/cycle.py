@@ -124,7 +124,8 @@ def make_daemon(drive: EndlessDrive, clock: Clock, receiver: str, modbus: int) -
         modbus=ModbusConfig(port=modbus),
         pose=PoseConfig(receivers=(receiver,)),
     )
-    world = World(clock=clock, make_lidar=lidar, make_adc=adc, lights=told)
+    # the budget is told processor time, so that the work that is measured does not hang on what other programs do
+    world = World(clock=clock, make_lidar=lidar, make_adc=adc, lights=told, stopwatch=time.thread_time)
     daemon = Daemon(settings, world)
     daemon.cycle.parts.budget.learn_code(load(told).code_us)
     return daemon
@@ -231,8 +232,10 @@ def figures(outcome: Outcome) -> list[Figure]:
         if kind == WALL:
             rows += _whole("cycle not interrupted, wall", whole[~stages.interrupted])
         quarter = len(whole) // 4
-        growth = float(np.median(whole[-quarter:]) / np.median(whole[:quarter]))
-        rows.append(bounded(f"median of last over first quarter, {clock}", growth, "ratio", "<= 1.1", COMMAND))
+        for name, q in (("median", 50.0), ("lowest decile", 10.0)):  # other programs disturb this one least
+            growth = float(np.percentile(whole[-quarter:], q) / np.percentile(whole[:quarter], q))
+            what = f"{name} of last over first quarter, {clock}"
+            rows.append(bounded(what, growth, "ratio", "<= 1.1", COMMAND))
     for stage in STAGES:
         for name, value in quantiles(stages.of(stage, CPU)).items():
             rows.append(Figure(f"{stage}, CPU, {name}", 1e-3 * value, "ms", command=COMMAND))
