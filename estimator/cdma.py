@@ -171,24 +171,27 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
     profile = decoder.profile
     words = np.asarray(block.words, np.float64)
     n, top = len(words), 2.0**profile.front_end.bits - 1.0
-    if not (np.all(np.isfinite(words)) and -np.inf < block.t_begin < block.t_end < np.inf):
+    if not (np.isfinite(words).all() and -np.inf < block.t_begin < block.t_end < np.inf):
         return None, BlockFlag.MALFORMED
     if not abs(block.rate / profile.sample_rate - 1.0) <= RATE:
         return None, BlockFlag.MALFORMED
     if not 1.0 <= n / (block.rate * profile.period_s) <= LONGEST:
         return None, BlockFlag.LENGTH
-    if words.min() < 0.0 or words.max() > top:
+    low, high = float(words.min()), float(words.max())
+    if low < 0.0 or high > top:
         return None, BlockFlag.MALFORMED
-    if words.min() == words.max():
+    if low == high:
         return None, BlockFlag.FLAT
-    clipped = (words <= RAIL * top) | (words >= (1.0 - RAIL) * top)
-    if np.mean(clipped) > CLIP_SHARE:
+    mask, flags = np.ones(n), BlockFlag.NONE
+    if low <= RAIL * top or high >= (1.0 - RAIL) * top:
+        mask[(words <= RAIL * top) | (words >= (1.0 - RAIL) * top)] = 0.0
+        flags = BlockFlag.CLIPPED
+    if n - mask.sum() > CLIP_SHARE * n:
         return None, BlockFlag.SATURATED
-    mask = np.where(clipped, 0.0, 1.0)
     y = (words - 0.5 * (top + 1.0)) * mask
-    flags, rows = BlockFlag.NONE, decoder.mains.rows(y)
-    if clipped.any():
-        flags, rows = BlockFlag.CLIPPED, decoder.mains.masked(np.arange(n, dtype=float), mask)
+    rows = decoder.mains.rows(y)
+    if flags:
+        rows = decoder.mains.masked(np.arange(n, dtype=float), mask)
     chips = profile.chip_rate / block.rate * (1.0 + decoder.clocks.clock)
     at: Array = np.arange(n, dtype=np.float64) - 0.5 * (n - 1)
     return Sampled(y, at * chips, mask, rows), flags
@@ -197,7 +200,8 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
 def _offer(decoder: Decoder, residual: Sampled, t_middle: float) -> None:
     """Leave the block, without the lamps that are seen, to be searched."""
     tracks, lag = decoder.tracks, float(decoder.clocks.state[0])
-    slots = tracks.slots[~tracks.faint(tracks.slots)]
+    slots = tracks.slots
+    slots = slots[~tracks.faint(slots)]
     floor = SPURIOUS * float(np.max(tracks.amplitude[slots], initial=0.0))
     decoder.offered = Job(residual, t_middle, lag, tracks.code[slots], tracks.phase[slots] + lag, floor)
 
@@ -207,7 +211,7 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
     tracks, lsb = decoder.tracks, decoder.profile.front_end.lsb_a
     links = tracks.confirmed if not flags & UNUSABLE else np.empty(0, np.int64)
     code, amplitude, variance = tracks.code[links], tracks.amplitude[links], tracks.amplitude_var[links]
-    twin = np.count_nonzero(code[:, None] == code, axis=1) > 1
+    twin = (code[:, None] == code).sum(axis=1) > 1
     faint = tracks.faint(links)
     return LightEpoch(
         t_begin=block.t_begin,
@@ -216,7 +220,7 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
         amplitude=amplitude * lsb,
         variance=variance * lsb**2,
         flags=faint * int(LinkFlag.FAINT) + twin * int(LinkFlag.TWIN),
-        lamps=tuple(tracks.frames[k] for k in links),
+        lamps=tuple([tracks.frames[k] for k in links.tolist()]),
         block=flags,
         noise_a=decoder.noise * lsb,
         clock_ppm=decoder.clock_ppm,

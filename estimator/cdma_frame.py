@@ -87,6 +87,9 @@ def _payload(bits: int) -> LampFrame:
     return LampFrame(lamp_id=lamp_id, version=version, **values)
 
 
+_SYNC_TEXT: Final = f"{SYNC:0{SYNC_BITS}b}"
+
+
 def decode_ring(ring: int, code: int) -> LampFrame | None:
     """Find the frame in FRAME_BITS consecutive bits that begin anywhere in it; None if there is none.
 
@@ -94,10 +97,13 @@ def decode_ring(ring: int, code: int) -> LampFrame | None:
     """
     whole = (1 << FRAME_BITS) - 1
     for word in (ring, ring ^ whole):
-        for turn in range(FRAME_BITS):
+        bits = f"{word:0{FRAME_BITS}b}"
+        round_and_on = bits + bits[: SYNC_BITS - 1]
+        turn = round_and_on.find(_SYNC_TEXT)
+        while turn >= 0:
             turned = word << turn & whole | word >> FRAME_BITS - turn
-            if turned >> FRAME_BITS - SYNC_BITS == SYNC:
-                payload = turned >> CRC_BITS & (1 << PAYLOAD_BITS) - 1
-                if turned & 0xFFFF == _checksum(payload, code) and payload >> PAYLOAD_BITS - 2 == VERSION:
-                    return _payload(payload)
+            payload = turned >> CRC_BITS & (1 << PAYLOAD_BITS) - 1
+            if turned & 0xFFFF == _checksum(payload, code) and payload >> PAYLOAD_BITS - 2 == VERSION:
+                return _payload(payload)
+            turn = round_and_on.find(_SYNC_TEXT, turn + 1)
     return None

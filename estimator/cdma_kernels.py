@@ -66,43 +66,6 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
     return bounds
 
 
-@kernel("void(f8[:,:,::1], i8[:,::1], i8[:,::1], f8[:,::1], f8[::1], i8, i8[:,::1], f8[:,::1])")
-def cut(waves: F8, bounds: I8, index: I8, data: F8, drive: F8, tail: int, extent: I8, out: F8) -> None:
-    """Cut waveforms into one row per lamp and code period touched, each with the tail that reaches beyond its end.
-
-    Args:
-        waves: (2, 2 * L, N) of :func:`columns` without data signs: even periods of all lamps, then odd periods.
-        bounds: (L, P + 1) of the same.
-        index: (2, K) lamp and period of each row.
-        data: (2, N) what was received, and time.
-        drive: (L,) amplitude of lamps whose sign is certain from correlation alone; 0 for the others.
-        tail: samples by which a period outlasts itself.
-        extent: (2, K) first sample of each row and the one behind its last.
-        out: (K + 2, N) the rows; then the derivative of all driven lamps together, and that times time.
-    """
-    n_lamps, n_samples, last = bounds.shape[0], waves.shape[2], index.shape[1]
-    mixed = out[last]
-    mixed[:] = 0.0
-    for r in range(last):
-        i, p = index[0, r], index[1, r]
-        low, high = bounds[i, p], min(bounds[i, p + 1] + tail, n_samples)
-        value, slope = waves[0, (p % 2) * n_lamps + i], waves[1, (p % 2) * n_lamps + i]
-        row = out[r]
-        row[:low] = 0.0
-        row[high:] = 0.0
-        total = 0.0
-        for k in range(low, high):
-            row[k] = value[k]
-            total += value[k] * data[0, k]
-        extent[0, r], extent[1, r] = low, high
-        if drive[i] > 0.0:
-            weight = drive[i] if total >= 0.0 else -drive[i]
-            for k in range(low, high):
-                mixed[k] += weight * slope[k]
-    for k in range(n_samples):
-        out[last + 1, k] = mixed[k] * data[1, k]
-
-
 @kernel("void(f8[:,::1], i8[:,::1], i8, f8[:,::1])")
 def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
     """Inner products of all M rows with the first ``free`` rows, in tiles of 2 x 4; ``out`` is (M, free).

@@ -46,11 +46,11 @@ def basis(times: Array, frequency: float, harmonics: int) -> Array:
 
 
 def orthonormal(rows: Array) -> tuple[Array, Array]:
-    """Orthonormal rows q of the same span, and the lower factor with ``rows = lower @ q`` (Cholesky of the Gram)."""
+    """Orthonormal rows q of the same span, and the lower matrix with ``q = lower @ rows`` (Cholesky of the Gram)."""
     products = np.empty((len(rows), len(rows)))
     gram(rows, len(rows), products)
-    lower = np.linalg.cholesky(products)
-    return np.einsum("ij,jk->ik", np.linalg.inv(lower), rows), np.asarray(lower, np.float64)
+    lower = np.linalg.inv(np.linalg.cholesky(products))
+    return np.einsum("ij,jk->ik", lower, rows), np.asarray(lower, np.float64)
 
 
 class Mains:
@@ -63,7 +63,7 @@ class Mains:
         self._nominal = 0.0
         self._built = (0, 0.0)
         self._q: Array = np.empty((0, 0))
-        self._lower: Array = np.empty((0, 0))
+        self._upper: Array = np.empty((0, 0))
 
     @property
     def hertz(self) -> float:
@@ -88,20 +88,21 @@ class Mains:
         moved = abs(self._frequency - self._built[1]) > REBUILD * self._frequency
         if size != self._built[0] or moved:
             rows = basis(np.arange(size, dtype=float), self._frequency, self._harmonics)
-            self._q, self._lower = orthonormal(rows)
+            self._q, lower = orthonormal(rows)
+            self._upper = np.ascontiguousarray(lower.T)
             self._built = (size, self._frequency)
         return self._q
 
     def _follow(self, coefficient: Array, gain: float, jump: float) -> None:
         """First-order frequency correction: a sinusoid that is off by d looks like t times its quadrature."""
-        c = np.linalg.solve(self._lower.T, coefficient)
+        c = inner(self._upper, coefficient).tolist()
         size, built = self._built
         power = c[_COS] ** 2 + c[_SIN] ** 2 + c[_T_COS] ** 2 + c[_T_SIN] ** 2
         if power > 0.0:
             found = built + (c[_T_COS] * c[_SIN] - c[_T_SIN] * c[_COS]) / (np.pi * (size - 1) * power)
-            step = np.clip(found - self._frequency, -jump * self._nominal, jump * self._nominal)
+            step = min(max(found - self._frequency, -jump * self._nominal), jump * self._nominal)
             followed = self._frequency + gain * step
-            self._frequency = float(np.clip(followed, (1 - PULL) * self._nominal, (1 + PULL) * self._nominal))
+            self._frequency = min(max(followed, (1 - PULL) * self._nominal), (1 + PULL) * self._nominal)
 
     def _choose(self, y: Array) -> None:
         """50 or 60 Hz grid, and its frequency to first order, from the first block."""

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Fit, Prior, Sampled
-from estimator.cdma_kernels import columns, cut, gram, gram_within, inner, invert, mixed
+from estimator.cdma_cut import TAIL_CHIPS, cut, lay_out, solve_rows
+from estimator.cdma_kernels import columns, mixed
+from estimator.cdma_newton import REACH
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -29,9 +31,6 @@ ALIKE: Final = 0.1
 
 LONG_PIECE: Final = 0.25
 """A code period of which the block holds at least this share gets its likelier sign in any case."""
-
-REACH: Final = 0.12
-"""Chips: the derivative columns are trusted so far."""
 
 
 @dataclass(eq=False)
@@ -70,44 +69,19 @@ class Signs:
 
 def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     """Solve for the amplitude of each lamp in each code period touched, at the phases of the prior."""
-    waves, bounds = _waves(block, prior, table)
-    size = np.diff(bounds, axis=1)
-    touched = size > 0
-    touched[:, 0] = True  # if by nothing else, by the tail of its last chip
-    period, lamp = np.nonzero(touched.T)  # in order of time: neighbours in the Gram matrix cover the same samples
-    k, n = len(lamp), len(block.x)
-    stack = stacked(block, k + 2)
-    extent = np.zeros((2, len(stack)), np.int64)
-    extent[1] = n
-    drive = np.where(prior.amplitude > LEADER * np.max(prior.amplitude), prior.amplitude, 0.0)
-    tail = int(2.0 / (block.x[1] - block.x[0]))
-    data, index = np.stack([block.clean, block.x]), np.stack([lamp, period])
-    cut(waves, bounds, index, data, drive, tail, extent, stack)
-    normal, right, power = reduced(stack, k + 2, extent)
-    normal[range(k), range(k)] += 1e-3  # a thousandth of a sample's worth: pieces of one sample
-    normal[k, k] *= 1.001
-    normal[k + 1, k + 1] *= 1.001
-    invert(normal)
-    found = np.einsum("ij,j->i", normal, right)
-    noise_var = max(power - float(np.einsum("i,i->", right, found)), 1e-30) / max(n - len(block.q) - k - 2, 1)
-    return Pieces(lamp, period, size, stack[: k + 2], found, np.maximum(normal.diagonal()[:k], 1e-12), noise_var)
-
-
-def _waves(block: Sampled, prior: Prior, table: Array) -> tuple[Array, Index]:
-    """Waveforms (2, 2 * L, N) without data signs, of even periods and then of odd ones, and bounds (L, P + 1).
-
-    A chip's tail reaches into the next code period with the sign of its own, hence one without the other.
-    """
     n_lamps, length = prior.chips.shape
-    touched = (
-        int((block.x[-1] - block.x[0]) / length) + 4
-    )  # a tail in front, and one spare for corrections of the clock
-    signs = np.zeros((2 * n_lamps, touched))
-    signs[:n_lamps, ::2] = 1.0
-    signs[n_lamps:, 1::2] = 1.0
-    waves = np.empty((2, 2 * n_lamps, len(block.x)))
-    chips, lamps = np.concatenate([prior.chips, prior.chips]), np.tile(prior.lamps(), 2)
-    return waves, columns(chips, lamps, block.samples, signs, table, waves)[:n_lamps]
+    span = float(block.x[-1] - block.x[0])
+    periods = int(span / length) + 4  # a tail in front, and one spare for corrections of the clock
+    tail = int(TAIL_CHIPS / (block.x[1] - block.x[0]))
+    bounds, index = np.empty((n_lamps, periods + 1), np.int64), np.empty((4, n_lamps * periods), np.int64)
+    samples, lamps = np.stack([block.x, block.mask, block.clean]), prior.lamps()
+    k = lay_out(prior.chips, lamps, samples, tail, bounds, index)
+    stack = stacked(block, k + 2)
+    drive = np.where(prior.amplitude > LEADER * np.max(prior.amplitude), prior.amplitude, 0.0)
+    cut(prior.chips, lamps, samples, index, k, table, drive, stack)
+    found, unit_var = np.empty(k + 2), np.empty(k)
+    noise_var = solve_rows(stack, index, k, len(block.q), found, unit_var)
+    return Pieces(index[0, :k], index[1, :k], np.diff(bounds, axis=1), stack[: k + 2], found, unit_var, noise_var)
 
 
 def stacked(block: Sampled, free: int) -> Array:
@@ -116,26 +90,6 @@ def stacked(block: Sampled, free: int) -> Array:
     stack[free:-1] = block.q
     stack[-1] = block.y
     return stack
-
-
-def reduced(stack: Array, free: int, extent: Index | None = None) -> tuple[Array, Array, float]:
-    """Normal matrix and right side of the first ``free`` rows with the mains rows eliminated; power of y likewise.
-
-    Args:
-        stack: unknowns' rows, then the orthonormal mains rows, then y.
-        free: number of unknowns.
-        extent: (2, M) where rows are not zero; None: everywhere.
-    """
-    out = np.empty((len(stack), free))
-    if extent is None:
-        gram(stack, free, out)
-    else:
-        gram_within(stack, extent, free, out)
-    inside, y_inside = np.ascontiguousarray(out[free:-1].T), inner(stack[free:-1], stack[-1])
-    overlap = np.empty((free, free))
-    gram(inside, free, overlap)
-    power = np.einsum("i,i->", stack[-1], stack[-1]) - np.einsum("i,i->", y_inside, y_inside)
-    return out[:free] - overlap, out[-1] - np.einsum("ij,j->i", inside, y_inside), float(power)
 
 
 def without(block: Sampled, prior: Prior, table: Array) -> Array:
@@ -158,8 +112,9 @@ def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
     long = pieces.size > LONG_PIECE * whole
     settled = _settled(prior, soft, variance, long)
     settled[:, 1:] |= pieces.size[:, 1:] == 0
-    lag = float(np.clip(pieces.found[-2], -REACH, REACH))
-    clock = float(np.clip(pieces.found[-1], -REACH / block.x[-1], REACH / block.x[-1]))
+    reach = REACH / float(block.x[-1])
+    lag, clock = pieces.found[-2:].tolist()
+    lag, clock = min(max(lag, -REACH), REACH), min(max(clock, -reach), reach)
     signs = np.where(total < 0, -1.0, 1.0) * settled
     return Signs(signs, soft, variance, lag, clock, pieces.noise_var)
 

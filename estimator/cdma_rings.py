@@ -58,15 +58,17 @@ class BitRings:
 
         ``period`` is each lamp's running number now, which paces the attempts; all (L,).
         """
-        due = np.flatnonzero(period >= self._due[slots])
+        due = (period >= self._due[slots]).nonzero()[0]
+        if not len(due):
+            return []
         rows = slots[due]
         known = self._sum[rows] ** 2 > KNOWN**2 * self._weight[rows]  # never without any weight
         found = []
         for k in due[known.all(axis=1)]:
             slot = int(slots[k])
             self._due[slot] = period[k] + RETRY
-            bits = "".join("1" if s < 0 else "0" for s in self._sum[slot])
-            frame = decode_ring(int(bits, 2), int(codes[k]))
+            bits = int.from_bytes(np.packbits(self._sum[slot] < 0.0).tobytes(), "big") >> -FRAME_BITS % 8
+            frame = decode_ring(bits, int(codes[k]))
             if frame is not None:
                 found.append((slot, frame))
         return found

@@ -215,10 +215,10 @@ class Search:
         half = int(np.ceil(2 * window * spc)) + 1
         score = np.empty(2 * half + 1)
         align(correlation, np.stack([(0.5 * (n - 1) - phase * spc) % period, amplitude]), n, period, score)
-        best = int(np.clip(np.argmax(score), 1, 2 * half - 1))
-        bend = 2 * score[best] - score[best - 1] - score[best + 1]
-        fine = 0.25 * (score[best + 1] - score[best - 1]) / max(bend, 1e-9)
-        return float(0.5 * (best - half) + np.clip(fine, -0.25, 0.25)) / spc
+        best = min(max(int(score.argmax()), 1), 2 * half - 1)
+        before, there, behind = score[best - 1 : best + 2].tolist()
+        fine = 0.25 * (behind - before) / max(2 * there - before - behind, 1e-9)
+        return float(0.5 * (best - half) + min(max(fine, -0.25), 0.25)) / spc
 
     def _fit_size(self, n: int) -> None:
         """FFT length for blocks of ``n`` samples; another length empties the kept spectra."""

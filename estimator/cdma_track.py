@@ -69,6 +69,10 @@ class Life(IntEnum):
     CONFIRMED = 2
 
 
+_FREE, _TENTATIVE, _CONFIRMED = (int(life) for life in Life)
+"""As plain numbers, for comparisons with arrays."""
+
+
 class Clocks:
     """What all lamps share. Lag and drift are in chips and chips per chip; clock is the sample clock's relative error.
 
@@ -143,12 +147,12 @@ class Tracks:
     @property
     def slots(self) -> Index:
         """Occupied slots."""
-        return np.flatnonzero(self.life)
+        return self.life.nonzero()[0]
 
     @property
     def confirmed(self) -> Index:
         """Slots of lamps that are beyond doubt."""
-        return np.flatnonzero(self.life == Life.CONFIRMED)
+        return (self.life == _CONFIRMED).nonzero()[0]
 
     def predict(self, t: float) -> float:
         """Advance all phases to time ``t``; returns the seconds passed (0 at the first call)."""
@@ -161,7 +165,7 @@ class Tracks:
         p[:, 0, 1] += chips * p[:, 1, 1]
         p[:, 1, 0] = p[:, 0, 1]
         p[:, 1, 1] += RATE_WALK**2 * abs(dt)
-        for slot in self.slots[p[self.slots, 0, 0] > ASTRAY**2]:
+        for slot in ((p[:, 0, 0] > ASTRAY**2) & (self.life != _FREE)).nonzero()[0]:
             self.drop(int(slot))
         return dt
 
@@ -247,7 +251,7 @@ class Tracks:
     def learn_phases(self, slots: Index, fit: Fit) -> None:
         """Conditional Gaussian: the fit's posterior of each phase moves phase and rate."""
         before = self.cov[slots, 0, 0]
-        after = np.clip(fit.phase_var, FINEST**2, before)
+        after = np.minimum(np.maximum(fit.phase_var, FINEST**2), before)
         share = self.cov[slots, 0, 1] / before
         self.phase[slots] += fit.phase
         self.rate[slots] += share * fit.phase
@@ -257,14 +261,15 @@ class Tracks:
 
     def judge(self, slots: Index, floor: float) -> Index:
         """Count blocks seen and missed, drop the lost; returns candidates that have been seen often enough."""
-        seen = (self.amplitude[slots] > CLEAR * np.sqrt(self.amplitude_var[slots])) & (self.amplitude[slots] > floor)
-        tentative = self.life[slots] == Life.TENTATIVE
+        amplitude, sigma = self.amplitude[slots], np.sqrt(self.amplitude_var[slots])
+        seen = (amplitude > CLEAR * sigma) & (amplitude > floor)
+        tentative = self.life[slots] == _TENTATIVE
         missed = np.where(tentative, ~seen, self.faint(slots))
-        beyond = self.amplitude[slots] > EVIDENT * np.sqrt(self.amplitude_var[slots])
+        beyond = amplitude > EVIDENT * sigma
         self.hits[slots] += np.where(seen & beyond, HITS, seen)
         self.misses[slots] = np.where(missed, self.misses[slots] + 1, np.where(tentative, self.misses[slots], 0))
         limit = np.where(tentative, MISSES, LOST)
-        for slot in slots[self.misses[slots] >= limit]:
-            self.drop(int(slot))
-        ripe: Index = slots[(self.life[slots] == Life.TENTATIVE) & (self.hits[slots] >= HITS)]
+        for slot in slots[self.misses[slots] >= limit].tolist():
+            self.drop(slot)
+        ripe: Index = slots[(self.life[slots] == _TENTATIVE) & (self.hits[slots] >= HITS)]
         return ripe
