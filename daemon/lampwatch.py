@@ -105,7 +105,9 @@ class LampWatch:
             if link.lamp_id is None:
                 continue
             for state, fault in _ODD.items():
-                lasting = self._lamps.setdefault((link.lamp_id, state), _Lasting(LASTS_S))
+                lasting = self._lamps.get((link.lamp_id, state))
+                if lasting is None:
+                    lasting = self._lamps[link.lamp_id, state] = _Lasting(LASTS_S)
                 if lasting.now(t_mono, link.state is state) and link.state is state:
                     self._find(link, fault, t_mono)
             if link.state is LinkState.ACCEPTED and link.lamp_id in self.odd:

@@ -17,6 +17,7 @@ Triple = tuple[float, float, float]
 
 UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
 """Links that are listed and not received."""
+USES: Final = {state: LinkUse.__members__.get(state.name, LinkUse.OTHER) for state in LinkState}
 LONGEST_CARRY_PERIODS: Final = 3.0
 """A velocity is not carried further than this many scan periods; beyond, nothing is predicted."""
 
@@ -51,6 +52,7 @@ class Painter:
     map_id: int = 0
     _seq: int = 0
     _loop: tuple[int, int | None, int | None] = (0, None, None)
+    _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
 
     def paint(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
         """One snapshot of this moment."""
@@ -58,6 +60,7 @@ class Painter:
         if result is not None and result.loop is not None:
             self._loop = (result.loop.counter, result.loop.keyframe_new, result.loop.keyframe_old)
         estimate = None if result is None or not math.isfinite(result.t_mono) else result
+        received = _received(result, facts)
         return Snapshot(
             seq=self._seq,
             t_mono=facts.t_mono if estimate is None else estimate.t_mono,
@@ -76,9 +79,9 @@ class Painter:
             loop_counter=self._loop[0],
             loop_new=self._loop[1],
             loop_old=self._loop[2],
-            links=None if facts.adc_ok is None else len(_received(result, facts)),
-            light_id=next((link.lamp_id for link in _received(result, facts)), None),
-            light=None if facts.adc_ok is None else _light(result, facts),
+            links=None if facts.adc_ok is None else len(received),
+            light_id=received[0].lamp_id if received else None,
+            light=None if facts.adc_ok is None else _light(result, facts, self._shown(result)),
             scan_rate=facts.scan_rate,
             missed=facts.missed,
             overruns=facts.overruns,
@@ -89,15 +92,22 @@ class Painter:
             fault=facts.fault,
         )
 
+    def _shown(self, result: StepResult | None) -> tuple[LightLink, ...]:
+        """The first links as they are published; every other cycle brings no new ones."""
+        links = () if result is None or result.lights is None else result.lights.links
+        if links is not self._links[0]:
+            self._links = links, tuple([_link(link) for link in links[:ROWS]])
+        return self._links[1]
 
-def _received(result: StepResult | None, facts: Facts) -> tuple[Link, ...]:
+
+def _received(result: StepResult | None, facts: Facts) -> list[Link]:
     """Links that are above the noise, strongest first; none while no samples come."""
     if result is None or result.lights is None or not facts.adc_ok:
-        return ()
-    return tuple(link for link in result.lights.links if link.state not in UNHEARD)
+        return []
+    return [link for link in result.lights.links if link.state not in UNHEARD]
 
 
-def _light(result: StepResult | None, facts: Facts) -> LightPicture:
+def _light(result: StepResult | None, facts: Facts, links: tuple[LightLink, ...]) -> LightPicture:
     """What lights alone say; nothing while no samples come, however well the place was known before."""
     if result is None or result.lights is None or not facts.adc_ok:
         return LightPicture(blocks=facts.blocks, blocks_lost=facts.blocks_lost)
@@ -114,13 +124,12 @@ def _light(result: StepResult | None, facts: Facts) -> LightPicture:
         clock_ppm=lights.clock_ppm,
         blocks=facts.blocks,
         blocks_lost=facts.blocks_lost,
-        links=tuple(_link(link) for link in lights.links[:ROWS]),
+        links=links,
     )
 
 
 def _link(link: Link) -> LightLink:
-    use = LinkUse[link.state.name] if link.state.name in LinkUse.__members__ else LinkUse.OTHER
-    return LightLink(link.code, link.lamp_id, use, link.amplitude, link.residual)
+    return LightLink(link.code, link.lamp_id, USES[link.state], link.amplitude, link.residual)
 
 
 def _pose(result: StepResult) -> Triple:

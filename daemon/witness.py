@@ -76,17 +76,21 @@ class Witnesses:
         if not self._wheels:
             return None
         first, last = self._wheels[0][0], self._wheels[-1][0]
-        covered = [pose for pose in self._laser if max(first, last - WINDOW_S) <= pose[0] <= last]
-        if not covered or covered[-1][0] - covered[0][0] < SHORTEST * WINDOW_S:
+        first = max(first, last - WINDOW_S)
+        oldest = next((pose for pose in self._laser if first <= pose[0] <= last), None)
+        newest = next((pose for pose in reversed(self._laser) if first <= pose[0] <= last), None)
+        if oldest is None or newest is None or newest[0] - oldest[0] < SHORTEST * WINDOW_S:
             return None
-        return covered[0], covered[-1]
+        return oldest, newest
 
     def _wheel_pose(self, t_mono: float) -> Array:
         """The wheels' pose at an instant inside their history, at constant twist between two readings."""
-        after = next(index for index, (t, _) in enumerate(self._wheels) if t >= t_mono)
-        t_new, T_new = self._wheels[after]
-        if after == 0 or t_new == t_mono:
-            return T_new
-        t_old, T_old = self._wheels[after - 1]
-        part = (t_mono - t_old) / (t_new - t_old)
-        return se2.compose(T_old, se2.exp(part * se2.log(se2.between(T_old, T_new))))
+        t_new, T_new = self._wheels[-1]
+        for t_old, T_old in reversed(self._wheels):
+            if t_old < t_mono:
+                if t_new == t_mono:
+                    break
+                part = (t_mono - t_old) / (t_new - t_old)
+                return se2.compose(T_old, se2.exp(part * se2.log(se2.between(T_old, T_new))))
+            t_new, T_new = t_old, T_old
+        return T_new

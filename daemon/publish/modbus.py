@@ -312,8 +312,8 @@ class ModbusPublisher:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; never waits."""
-        make_lights = partial(encode_lights, snapshot)
-        self._responder.show(registers.encode_block(snapshot), registers.encode_mirror(snapshot), make_lights)
+        make_mirror, make_lights = partial(registers.encode_mirror, snapshot), partial(encode_lights, snapshot)
+        self._responder.show(registers.encode_block(snapshot), make_mirror, make_lights)
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:
         """Tell the client what became of its command."""

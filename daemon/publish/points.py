@@ -89,18 +89,23 @@ class Point:
 
     def encode(self, value: Value) -> int:
         """Raw integer for a value in `unit`; NaN and None give the not-known value, infinities saturate."""
-        wire = self.wire
-        if value is None or value != value:
-            return wire.not_known if self.can_be_unknown else 0
-        if self.rule is Rule.WRAP:
-            return int(value) % (1 << wire.bits)
-        low, high = wire.span
-        scaled = value * self.per_unit
-        if scaled >= high:
-            return high
-        if scaled <= low:
-            return low
-        return math.ceil(scaled) if self.ceil else round(scaled)
+        return self.encoder()(value)
+
+    def encoder(self) -> Callable[[Value], int]:
+        """:meth:`encode` with all that is the same for every value worked out beforehand."""
+        missing, modulus = self.wire.not_known if self.can_be_unknown else 0, 1 << self.wire.bits
+        (low, high), scale, to_int = self.wire.span, self.per_unit, math.ceil if self.ceil else round
+
+        def wrap(value: Value) -> int:
+            return missing if value is None or value != value else int(value) % modulus
+
+        def saturate(value: Value) -> int:
+            if value is None or value != value:
+                return missing
+            scaled = value * scale
+            return to_int(scaled) if low < scaled < high else high if scaled >= high else low
+
+        return wrap if self.rule is Rule.WRAP else saturate
 
     def decode(self, raw: int) -> Value:
         """Value in `unit` for a raw integer."""
@@ -140,11 +145,14 @@ class Layout:
         codes = "".join(p.wire.code for p in self.points)
         self.big: Final = struct.Struct(">" + codes)
         self.little: Final = struct.Struct("<" + codes)
-        self._plan: Final = tuple((p.encode, p.value) for p in self.points)
+        self._plan: Final = tuple((p.encoder(), p.value) for p in self.points)
+        self._latest: tuple[Snapshot | None, tuple[int, ...]] = (None, ())
 
-    def raw(self, snapshot: Snapshot) -> list[int]:
-        """Raw integers of a snapshot, in order."""
-        return [encode(value(snapshot)) for encode, value in self._plan]
+    def raw(self, snapshot: Snapshot) -> tuple[int, ...]:
+        """Raw integers of a snapshot, in order; those of the latest are kept, for several publishers ask for them."""
+        if self._latest[0] is not snapshot:
+            self._latest = snapshot, tuple([encode(value(snapshot)) for encode, value in self._plan])
+        return self._latest[1]
 
     def values(self, raw: Iterable[int]) -> dict[str, Value]:
         """Decoded values by name."""

@@ -31,7 +31,7 @@ from pymodbus.pdu.register_message import (
 
 from daemon.publish import lights
 from daemon.publish.holding import Holding, Refused
-from daemon.publish.registers import MIRROR_ADDRESS
+from daemon.publish.registers import MIRROR_ADDRESS, MIRROR_WORDS
 
 HEADER_SIZE: Final = 7  # transaction, protocol, length, unit
 MAX_FRAME: Final = 260  # header and a body of at most 253 bytes
@@ -67,24 +67,28 @@ class Responder:
     def __init__(self, holding: Holding | None = None) -> None:
         self._holding = holding
         self._framer = FramerSocket(DecodePDU(is_server=True))
-        self._shown: tuple[bytes, bytes] = (b"", b"")
-        self._make_lights: Callable[[], bytes] = bytes
+        self._block = b""
+        self._make: tuple[Callable[[], bytes], Callable[[], bytes]] = (bytes, bytes)
+        self._mirror: bytes | None = None
         self._lights: bytes | None = None
 
-    def show(self, block: bytes, mirror: bytes, make_lights: Callable[[], bytes] = bytes) -> None:
+    def show(
+        self, block: bytes, make_mirror: Callable[[], bytes] = bytes, make_lights: Callable[[], bytes] = bytes
+    ) -> None:
         """Put all blocks in place at once: no answer ever mixes two snapshots.
 
-        ``make_lights`` makes the block of lights of the same snapshot; it is called when that is read.
+        ``make_mirror`` and ``make_lights`` make the blocks of the same snapshot that few clients read; they are called
+        when those are read.
         """
-        self._shown = (block, mirror)
-        self._make_lights, self._lights = make_lights, None
+        self._block = block
+        self._make, self._mirror, self._lights = (make_mirror, make_lights), None, None
 
     def answer(self, frame: bytes) -> bytes:
         """The answer to one whole frame, which :func:`frame_size` has found good."""
         if len(frame) == _READ.size:
             transaction, _, _, unit, function, address, count = _READ.unpack(frame)
             if function in (READ_INPUT, READ_HOLDING) and 0 < count <= MAX_READ:
-                block = self._shown[0]
+                block = self._block
                 if address + count <= len(block) >> 1:
                     head = _READ_ANSWER.pack(transaction, 0, 3 + 2 * count, unit, function, 2 * count)
                     return head + block[2 * address : 2 * (address + count)]
@@ -127,13 +131,15 @@ class Responder:
         )
 
     def _registers(self, address: int, count: int, holding: bool) -> bytes:
-        shown = [(0, self._shown[0]), (MIRROR_ADDRESS, self._shown[1])]
+        start, memory = 0, self._block
         if lights.ADDRESS <= address < lights.ADDRESS + lights.BLOCK_WORDS:
-            self._lights = self._lights if self._lights is not None else self._make_lights()
-            shown = [(lights.ADDRESS, self._lights)]
-        for start, memory in shown:
-            if start <= address and 2 * (address - start + count) <= len(memory):
-                return memory[2 * (address - start) : 2 * (address - start + count)]
+            self._lights = self._lights if self._lights is not None else self._make[1]()
+            start, memory = lights.ADDRESS, self._lights
+        elif MIRROR_ADDRESS <= address < MIRROR_ADDRESS + MIRROR_WORDS:
+            self._mirror = self._mirror if self._mirror is not None else self._make[0]()
+            start, memory = MIRROR_ADDRESS, self._mirror
+        if 2 * (address - start + count) <= len(memory):
+            return memory[2 * (address - start) : 2 * (address - start + count)]
         if holding and self._holding is not None:
             return self._holding.read(address, count)
         raise Refused

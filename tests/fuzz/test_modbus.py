@@ -43,7 +43,7 @@ frames = st.builds(framed, words, st.integers(0, 255), bodies)
 
 def responder(write: bool = True) -> Responder:
     made = Responder(Holding(lambda _: None, lambda _: None) if write else None)
-    made.show(registers.encode_block(snapshot()), registers.encode_mirror(snapshot()))
+    made.show(registers.encode_block(snapshot()), lambda: registers.encode_mirror(snapshot()))
     return made
 
 

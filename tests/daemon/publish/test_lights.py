@@ -6,6 +6,7 @@ import json
 import math
 import struct
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,7 @@ def test_clients_read_all_of_it_or_a_part(function: int) -> None:
         made.append(taken)
         return lights.encode_lights(taken)
 
-    responder.show(registers.encode_block(taken), registers.encode_mirror(taken), make)
+    responder.show(registers.encode_block(taken), partial(registers.encode_mirror, taken), make)
     assert ask(responder, 0, 64, function)[9:] == registers.encode_block(taken)
     assert not made, "nobody has asked for the lights"
     assert ask(responder, 200, 120, function)[9:] == lights.encode_lights(taken)

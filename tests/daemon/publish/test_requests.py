@@ -24,7 +24,7 @@ class Bench:
         self.responder = Responder(self.holding if write else None)
         taken = snapshot()
         self.block, self.mirror = registers.encode_block(taken), registers.encode_mirror(taken)
-        self.responder.show(self.block, self.mirror)
+        self.responder.show(self.block, lambda: self.mirror)
 
     def ask(self, body: bytes, unit: int = 1) -> bytes:
         """Answer's body to a request's body."""
