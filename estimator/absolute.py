@@ -21,7 +21,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Virtual
-from estimator.linear3 import invert3
+from estimator.linear3 import add_turned, det3, invert3, largest_of, positive_part, swing
 from estimator.mapframe import move_map, shift_map
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
@@ -101,11 +101,13 @@ def on_motion(state: State, T_before: Array, P_before: Array, t_before: float) -
     if tie is None:
         return
     x, y, _ = (moving.T_odom_base - T_before).tolist()
-    F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
-    Q = moving.P - F @ P_before @ F.T
     way, dt = math.hypot(x, y), moving.t_mono - t_before
-    tie.P = F @ tie.P @ F.T + Q + np.diag(DRIFT * way)
-    tie.X = F @ tie.X @ F.T + Q
+    carried, P, X = P_before.copy(), tie.P.copy(), tie.X.copy()
+    for covariance in (carried, P, X):
+        swing(x, y, covariance)
+    Q = moving.P - carried
+    tie.P, tie.X = P + Q, X + Q
+    tie.P.flat[::4] += DRIFT * way
     tie.way += way
     tie.fresh = min(1.0, tie.fresh + way / FRESH_M + (dt / FRESH_S if math.isfinite(dt) else 0.0))
     tie.poses.append((moving.t_mono, moving.T_odom_base))
@@ -187,14 +189,15 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     assert tie is not None
     R = se2.rotation(state.T_map_odom[2])
     L_lights = invert3(lights.covariance)
-    most = float(np.linalg.eigvals(lights.gained @ lights.covariance).real.max())
+    most = largest_of(lights.gained, lights.covariance)
     part = min(1.0, tie.fresh / most) if most > 0.0 and not blind(state) else 1.0
     tie.fresh = max(0.0, tie.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
     before = R @ tie.P @ R.T
-    after = _symmetric(invert3(invert3(before) + _positive(G)))
-    keep = R.T @ after @ invert3(before) @ R
+    L_before = invert3(before)
+    after = _symmetric(invert3(L_before + positive_part(G)))
+    keep = R.T @ after @ L_before @ R
     tie.P, tie.X = R.T @ after @ R, keep @ tie.X
     correct(state, se2.compose(state.T_map_odom, T_odom_base) + after @ told, T_odom_base)
     if np.all(np.diag(after) < KNOWN):
@@ -240,18 +243,25 @@ def across_the_row(state: State, lights: LightsResult) -> LightsResult:
     """The lights' result, trusted less across the row where all lamps in use stand in one."""
     assert state.light is not None
     lamps = state.light.filter.catalogue.by_id
-    at = np.array([(lamps[k].x, lamps[k].y) for k in lights.accepted if k in lamps]).reshape(-1, 2)
-    if not len(at):
+    at = [(lamps[k].x, lamps[k].y) for k in lights.accepted if k in lamps]
+    if not at:
         return lights
-    values, vectors = np.linalg.eigh(np.cov(at.T, bias=True) if len(at) > 1 else np.zeros((2, 2)))
-    more = np.zeros((3, 3))
-    for k in range(2):  # one lamp is a row both ways
-        n, part = vectors[:, k], math.exp(-max(float(values[k]), 0.0) / ROW_M**2)
-        more[:2, :2] += ACROSS_M**2 * part * np.outer(n, n)
-        more[2, 2] = max(float(more[2, 2]), ACROSS_RAD**2 * part)
-    P = lights.covariance + more
+    along, across, angle = _spread(at)  # one lamp is a row both ways
+    wide, narrow = (math.exp(-variance / ROW_M**2) for variance in (along, across))
+    P = lights.covariance.copy()
+    add_turned(angle, np.array((ACROSS_M**2 * wide, ACROSS_M**2 * narrow, ACROSS_RAD**2 * narrow)), P)
     keep = invert3(P) @ lights.covariance
     return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T))
+
+
+def _spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
+    """Variances of points along and across the line that fits them best, and that line's direction."""
+    n = len(at)
+    x, y = sum(p[0] for p in at) / n, sum(p[1] for p in at) / n
+    xx, yy = sum((p[0] - x) ** 2 for p in at) / n, sum((p[1] - y) ** 2 for p in at) / n
+    xy = sum((p[0] - x) * (p[1] - y) for p in at) / n
+    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    return mean + half, max(mean - half, 0.0), 0.5 * math.atan2(2.0 * xy, xx - yy)
 
 
 def blind(state: State) -> bool:
@@ -293,14 +303,8 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
 
 def _surer(tie: Absolute, lights: LightsResult) -> bool:
     """Whether the lights' pose is so much better known that nothing is lost by taking it as it is."""
-    return tie.odd_since is None and float(np.linalg.det(lights.covariance)) < SURER * float(np.linalg.det(tie.P))
+    return tie.odd_since is None and det3(lights.covariance) < SURER * det3(tie.P)
 
 
 def _symmetric(A: Array) -> Array:
     return np.asarray(0.5 * (A + A.T))
-
-
-def _positive(A: Array) -> Array:
-    """The nearest matrix without negative eigenvalues: rounding must not take information away."""
-    values, vectors = np.linalg.eigh(_symmetric(A))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

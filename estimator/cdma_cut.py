@@ -56,8 +56,10 @@ def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, dri
     """Rows of one lamp in one code period each, with the tail that reaches beyond its end, at amplitude and sign 1.
 
     Args:
-        chips, lamps, samples, index: of :func:`lay_out`; samples: (3, N) with the weight of each sample, 1 or 0, and
-            with what was received.
+        chips: (L, C), as for :func:`lay_out`.
+        lamps: (2, L), likewise.
+        index: what that has written.
+        samples: (3, N) times; the weight of each sample, 1 or 0; what was received.
         count: how many pieces there are, K.
         table: of :func:`estimator.cdma_template.pulse_table`.
         drive: (L,) amplitude of lamps whose sign is certain from correlation alone; 0 for the others.
@@ -104,8 +106,10 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
     Args:
         stack: (K + 2 + mains + 1, N) rows of :func:`cut`, the mains rows, and the block itself.
         index: of :func:`lay_out`.
-        count: K. mains: rows of the mains subspace.
-        found: (K + 2,) out. unit_var: (K,) out, variance at unit noise.
+        count: K.
+        mains: rows of the mains subspace.
+        found: (K + 2,) out.
+        unit_var: (K,) out, variance at unit noise.
     """
     size, free = stack.shape[1], count + 2
     extent = np.zeros((2, stack.shape[0]), np.int64)
@@ -127,4 +131,5 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
         power -= right[a] * total
     for r in range(count):
         unit_var[r] = max(normal[r, r], 1e-12)
-    return max(power, 1e-30) / max(size - mains - free, 1)
+    noise_var: float = max(power, 1e-30) / max(size - mains - free, 1)
+    return noise_var

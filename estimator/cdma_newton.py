@@ -40,7 +40,8 @@ def reduce_rows(stack: F8, extent: I8, free: int, matrix: F8, right: F8) -> floa
         stack: (M, N) unknowns' rows, then the orthonormal mains rows, then y.
         extent: (2, M) first sample of each row that may not be zero, and the one behind the last.
         free: number of unknowns.
-        matrix: (free, free) out. right: (free,) out.
+        matrix: (free, free) out.
+        right: (free,) out.
     """
     rows = stack.shape[0]
     out = np.empty((rows, free))
@@ -104,8 +105,11 @@ def _share_lag(matrix: F8, right: F8, amplitude: F8, normal: F8, target: F8) -> 
     """Normal equations in the unknowns: slopes times amplitude are phases, and the lag moves all of these.
 
     Args:
-        matrix: (free, free), right: (free,), of the rows. amplitude: (L,).
-        normal: (free + 1, free + 1) out. target: (free + 1,) out.
+        matrix: (free, free) of the rows.
+        right: (free,) of the rows.
+        amplitude: (L,).
+        normal: (free + 1, free + 1) out.
+        target: (free + 1,) out.
     """
     n, free = amplitude.shape[0], right.shape[0]
     lag, unit = 2 * n, np.ones(free)
@@ -173,7 +177,8 @@ def solve_once(stack: F8, lamps: F8, common: F8, loose_precision: F8, noise: F8,
         common: see :data:`COMMON_ROWS`; likewise.
         loose_precision: inverse prior variance of each uncertain piece.
         noise: variance per sample, brought up to date; degrees of freedom.
-        theta: (free + 1,) out: the unknowns. variance: (free + 1,) out.
+        theta: (free + 1,) out: the unknowns.
+        variance: (free + 1,) out.
     """
     n, pauses, last = lamps.shape[1], common.shape[1] - 2, loose_precision.shape[0]
     free, lag = 2 * n + 1 + pauses + last, 2 * n
@@ -221,7 +226,10 @@ def leave(stack: F8, lamps: F8, scale: F8, theta: F8, out: F8) -> None:
     """What the last step's solution leaves of the block, and the derivative of the whole signal by a common phase.
 
     Args:
-        stack: as for :func:`solve_once`. lamps: after it. scale: amplitudes before it. theta: what it has found.
+        stack: as for :func:`solve_once`.
+        lamps: after it.
+        scale: amplitudes before it.
+        theta: what it has found.
         out: (2, N).
     """
     n, size, free = lamps.shape[1], stack.shape[1], theta.shape[0] - 1

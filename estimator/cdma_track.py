@@ -152,7 +152,8 @@ class Tracks:
     @property
     def confirmed(self) -> Index:
         """Slots of lamps that are beyond doubt."""
-        return (self.life == _CONFIRMED).nonzero()[0]
+        found: Index = (self.life == _CONFIRMED).nonzero()[0]
+        return found
 
     def predict(self, t: float) -> float:
         """Advance all phases to time ``t``; returns the seconds passed (0 at the first call)."""

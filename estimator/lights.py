@@ -21,7 +21,7 @@ from estimator.lights_catalogue import catalogue_of
 from estimator.lights_links import Sight, distrust, forget, judge, relearn, settled, sights, table, view_of
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
-from estimator.linear3 import invert3
+from estimator.linear3 import invert3, positive_part
 from estimator.records import Array, Imu, Odometry
 from estimator.result import Fix, LightsResult, Link, LinkState
 
@@ -258,10 +258,9 @@ def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:
     """Information that links added to the pose, and the correction they made; only the positive part of the former."""
     x, P = before
     more = invert3(np.ascontiguousarray(track.P[:3, :3])) - invert3(np.ascontiguousarray(P))
-    values, vectors = np.linalg.eigh(0.5 * (more + more.T))
     step = track.x[:3] - x
     step[2] = se2.wrap(float(step[2]))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T), step
+    return positive_part(more), step
 
 
 def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:

@@ -91,3 +91,76 @@ def invert3(A: Array) -> Array:
         for j in range(3):
             out[i, j] *= scale[i] * scale[j] / det
     return out
+
+
+@kernel("f8[:, ::1](f8[:, ::1])")
+def positive_part(A: Array) -> Array:
+    """The nearest symmetric matrix without negative eigenvalues."""
+    B, V, out = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            B[i, j] = 0.5 * (A[i, j] + A[j, i])
+    eigen3(B, V)
+    for k in range(3):
+        for i in range(3):
+            for j in range(3):
+                out[i, j] += V[i, k] * max(B[k, k], 0.0) * V[j, k]
+    return out
+
+
+@kernel("f8(f8[:, ::1], f8[:, ::1])")
+def largest_of(G: Array, P: Array) -> float:
+    """Largest eigenvalue of ``G P``, both symmetric, P not negative: it is that of ``L' G L`` with ``P = L L'``."""
+    L, B, V = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    for j in range(3):
+        for i in range(j, 3):
+            value = P[i, j]
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            if i == j:
+                L[j, j] = np.sqrt(max(value, 0.0))
+            else:
+                L[i, j] = value / L[j, j] if L[j, j] > 0.0 else 0.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    B[i, j] += L[k, i] * 0.5 * (G[k, m] + G[m, k]) * L[m, j]
+    eigen3(B, V)
+    most: float = max(B[0, 0], max(B[1, 1], B[2, 2]))
+    return most
+
+
+@kernel("f8(f8[:, ::1])")
+def det3(A: Array) -> float:
+    """Determinant."""
+    minor_0 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
+    minor_1 = A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0]
+    minor_2 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
+    det: float = A[0, 0] * minor_0 - A[0, 1] * minor_1 + A[0, 2] * minor_2
+    return det
+
+
+@kernel("void(f8, f8, f8[:, ::1])")
+def swing(x: float, y: float, P: Array) -> None:
+    """Covariance (x, y, yaw) of what a lever arm (x, y) in the same axes carries, in place: a heading error swings it.
+
+    ``P`` may be a covariance between two such errors as well; both swing alike.
+    """
+    for j in range(3):
+        P[0, j] -= y * P[2, j]
+        P[1, j] += x * P[2, j]
+    for i in range(3):
+        P[i, 0] -= y * P[i, 2]
+        P[i, 1] += x * P[i, 2]
+
+
+@kernel("void(f8, f8[::1], f8[:, ::1])")
+def add_turned(yaw: float, variance: Array, P: Array) -> None:
+    """Add noise whose axes are turned by ``yaw`` to a covariance, in place; ``variance`` along these axes."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    P[0, 0] += c * c * variance[0] + s * s * variance[1]
+    P[1, 1] += s * s * variance[0] + c * c * variance[1]
+    P[0, 1] += c * s * (variance[0] - variance[1])
+    P[1, 0] += c * s * (variance[0] - variance[1])
+    P[2, 2] += variance[2]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimator import se2
-from estimator.linear3 import invert3
+from estimator.linear3 import add_turned, invert3, swing
 from estimator.records import Array, Imu, Odometry
 
 LONGEST_CARRY_S = 0.5
@@ -114,9 +114,12 @@ class Motion:
 def move(motion: Motion, delta: Array, variance: Array) -> None:
     """Move the pose by ``delta`` in the base frame, with noise of ``variance`` (x, y, yaw; base-aligned)."""
     T = motion.T_odom_base
-    R = se2.rotation(T[2] + 0.5 * delta[2])
-    motion.P = se2.carry(T, delta, motion.P) + (R * (motion.doubt * variance)) @ R.T
     motion.T_odom_base = se2.compose(T, delta)
+    x, y, _ = (motion.T_odom_base - T).tolist()
+    P = motion.P.copy()
+    swing(x, y, P)
+    add_turned(float(T[2] + 0.5 * delta[2]), motion.doubt * variance, P)
+    motion.P = P
 
 
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
@@ -211,7 +214,8 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
         delta = se2.exp(motion.velocity * dt)
         variance = (motion.velocity_variance + np.array(noise.acceleration_variance()) * (dt * dt)) * (dt * dt)
         move(motion, delta, variance)
-        motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
+        if unseen > 0.0:
+            motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono
 

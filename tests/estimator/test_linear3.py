@@ -8,7 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from estimator.linear3 import TINY, eigen3, invert3, positive, solve3
+from estimator import se2
+from estimator.linear3 import (
+    TINY,
+    add_turned,
+    det3,
+    eigen3,
+    invert3,
+    largest_of,
+    positive,
+    positive_part,
+    solve3,
+    swing,
+)
 from estimator.records import Array
 
 FACTORS = arrays(np.float64, (3, 3), elements=st.floats(-3.0, 3.0))
@@ -69,3 +81,32 @@ def test_invert_is_finite_for_nothing_and_for_one_direction() -> None:
     assert np.isfinite(invert3(np.zeros((3, 3)))).all()
     line = np.outer((1.0, 2.0, 0.0), (1.0, 2.0, 0.0))
     assert np.isfinite(invert3(line)).all()
+
+
+@given(FACTORS)
+@settings(deadline=None)
+def test_positive_part_and_determinant(factor: Array) -> None:
+    A = np.ascontiguousarray(factor + factor.T)
+    values, vectors = np.linalg.eigh(A)
+    np.testing.assert_allclose(positive_part(A), (vectors * np.maximum(values, 0.0)) @ vectors.T, atol=1e-9)
+    assert det3(factor) == pytest.approx(np.linalg.det(factor), abs=1e-9)
+
+
+@given(FACTORS, FACTORS, SCALES)
+@settings(deadline=None)
+def test_largest_eigenvalue_of_a_product(factor: Array, other: Array, scale: tuple[float, float, float]) -> None:
+    G, P = np.ascontiguousarray(other + other.T), spd(factor, scale)
+    whole = np.linalg.eigvals(G @ P).real
+    assert largest_of(G, P) == pytest.approx(whole.max(), abs=1e-7 * np.abs(whole).max() + 1e-12)
+
+
+@given(FACTORS, st.floats(-4.0, 4.0), st.tuples(*[st.floats(0.0, 2.0)] * 3))
+@settings(deadline=None)
+def test_lever_arm_and_turned_noise(factor: Array, yaw: float, variance: tuple[float, float, float]) -> None:
+    P = factor.copy()
+    swing(0.7, -0.3, P)
+    F = np.array(((1.0, 0.0, 0.3), (0.0, 1.0, 0.7), (0.0, 0.0, 1.0)))
+    np.testing.assert_allclose(P, F @ factor @ F.T, atol=1e-12)
+    add_turned(yaw, np.array(variance), P)
+    R = se2.rotation(yaw)
+    np.testing.assert_allclose(P, F @ factor @ F.T + (R * np.array(variance)) @ R.T, atol=1e-12)
