@@ -72,6 +72,7 @@ def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, dri
     for r in range(count):
         i, p, low, high = index[0, r], index[1, r], index[2, r], index[3, r]
         code, row, rate, phase = chips[i], out[r], lamps[1, i], lamps[0, i]
+        before = code[length - 1] if p == 0 else 0.0  # what was sent ahead of the first period is not told apart
         for _ in range(p):
             phase -= length
         row[:low] = 0.0
@@ -84,7 +85,7 @@ def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, dri
                 row[n] = slope[n] = 0.0
                 continue
             own = code[k] if k < length else 0.0
-            last = code[k - np.uint64(1)] if k > 0 else 0.0
+            last = code[k - np.uint64(1)] if k > 0 else before
             at = (u - k) * steps
             j = np.uint64(at + 0.5)
             ramp = own * table[j, 2] + last * table[j, 3]

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from estimator import cdma_kernels
+from estimator import cdma_cut, cdma_kernels
 from estimator.cdma_profile import PROFILE_A
 from estimator.cdma_template import STEPS, pulse_table
 from estimator.codes import gold_codes
@@ -98,22 +98,28 @@ def test_inner_and_mixed_are_products_with_a_vector(rows: int) -> None:
 
 
 def test_cut_puts_each_period_into_a_row_of_its_own() -> None:
-    rng, n = np.random.default_rng(4), 60
-    waves, bounds = rng.normal(size=(2, 4, n)), np.array([[0, 0, 33, 60], [0, 21, 58, 60]])
-    index = np.array([[0, 1, 0, 1, 0, 1], [0, 0, 1, 1, 2, 2]])
-    data, drive = rng.normal(size=(2, n)), np.array([3.0, 0.0])
-    extent, out = np.zeros((2, 6), np.int64), np.full((8, n), np.nan)
-    cdma_kernels.cut(waves, bounds, index, data, drive, 5, extent, out)
+    rng, x = np.random.default_rng(4), np.arange(-140.0, 140.0, 0.9)
+    chips, lamps, n = gold_codes(7)[:2].copy(), np.array([[263.7, 141.0], [1.0, 1.001]]), len(x)
+    samples, drive = np.stack([x, (rng.random(n) > 0.1).astype(float), rng.normal(size=n)]), np.array([3.0, 0.0])
+    bounds, index = np.empty((2, 6), np.int64), np.empty((4, 10), np.int64)
+    count = cdma_cut.lay_out(chips, lamps, samples, 3, bounds, index)
+    whole = waves(lamps[0].tolist(), lamps[1].tolist(), x, np.ones((2, 5)))
+    np.testing.assert_array_equal(bounds, whole.bounds)
+    touched = [(p, i) for p in range(5) for i in range(2) if p == 0 or bounds[i, p + 1] > bounds[i, p]]
+    assert list(zip(index[1, :count], index[0, :count], strict=True)) == touched, "in order of time"
+    out = np.full((count + 2, n), np.nan)
+    cdma_cut.cut(chips, lamps, samples, index, count, TABLE, drive, out)
     driven = np.zeros(n)
-    for row, i, p, low, high in zip(out, *index, *extent, strict=False):
-        expected = np.zeros(n)
-        piece = slice(bounds[i, p], min(bounds[i, p + 1] + 5, n))
-        expected[piece] = waves[0, 2 * (p % 2) + i, piece]
-        np.testing.assert_array_equal(row, expected)
-        assert (low, high) == (piece.start, piece.stop)
-        driven[piece] += drive[i] * np.sign(expected @ data[0]) * waves[1, 2 * (p % 2) + i, piece]
-    np.testing.assert_allclose(out[6], driven)
-    np.testing.assert_allclose(out[7], driven * data[1])
+    for row, i, p, low, high in zip(out, *index[:, :count], strict=False):
+        signs = np.zeros((2, 5))
+        signs[:, p] = 1.0
+        alone = waves(lamps[0].tolist(), lamps[1].tolist(), x, signs)
+        np.testing.assert_allclose(row, alone.value[i] * samples[1], atol=1e-12)
+        assert not row[:low].any()
+        assert not row[high:].any()
+        driven += drive[i] * np.where(row @ samples[2] < 0.0, -1.0, 1.0) * alone.slope[i] * samples[1]
+    np.testing.assert_allclose(out[count], driven, atol=1e-9)
+    np.testing.assert_allclose(out[count + 1], driven * x, atol=1e-7)
 
 
 def test_fold_weighs_what_was_said_before() -> None:

@@ -76,4 +76,5 @@ def test_no_flicker_at_all() -> None:
 def test_orthonormal_gives_the_factor_too() -> None:
     rows = np.random.default_rng(0).normal(size=(5, 40))
     q, lower = orthonormal(rows)
-    np.testing.assert_allclose(lower @ q, rows, atol=1e-12)
+    np.testing.assert_allclose(lower @ rows, q, atol=1e-12)
+    np.testing.assert_allclose(q @ q.T, np.eye(5), atol=1e-12)
