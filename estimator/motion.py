@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimator import se2
-from estimator.linear3 import add_turned, invert3, swing
+from estimator.linear3 import invert3
 from estimator.records import Array, Imu, Odometry
 
 LONGEST_CARRY_S = 0.5
@@ -114,12 +114,9 @@ class Motion:
 def move(motion: Motion, delta: Array, variance: Array) -> None:
     """Move the pose by ``delta`` in the base frame, with noise of ``variance`` (x, y, yaw; base-aligned)."""
     T = motion.T_odom_base
+    R = se2.rotation(T[2] + 0.5 * delta[2])
+    motion.P = se2.carry(T, delta, motion.P) + (R * (motion.doubt * variance)) @ R.T
     motion.T_odom_base = se2.compose(T, delta)
-    x, y, _ = (motion.T_odom_base - T).tolist()
-    P = motion.P.copy()
-    swing(x, y, P)
-    add_turned(float(T[2] + 0.5 * delta[2]), motion.doubt * variance, P)
-    motion.P = P
 
 
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
