@@ -50,6 +50,8 @@ def _accuracy(name: str, errors: Errors) -> list[Figure]:
         bounded(f"{name}: rotation within 30 s", local.rotation_deg.mean(), "deg", "<= 0.55", COMMAND),
         Figure(f"{name}: translation beyond 30 s", whole.translation_m.mean(), "m", command=COMMAND),
         Figure(f"{name}: rotation beyond 30 s", whole.rotation_deg.mean(), "deg", command=COMMAND),
+        Figure(f"{name}: translation, all", errors.translation_m.mean(), "m", command=COMMAND),
+        Figure(f"{name}: rotation, all", errors.rotation_deg.mean(), "deg", command=COMMAND),
     ]
 
 
