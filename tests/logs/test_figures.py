@@ -25,6 +25,9 @@ def test_intel_against_relations_found_by_hand(outcome_of: Replayed, log_root: P
         assert len(local.translation_m) == 1773
         assert local.translation_m.mean() <= 0.022
         assert local.rotation_deg.mean() <= 0.55
+    closed = evaluate(ledger.final().stamps, ledger.final().poses, relations)
+    assert closed.translation_m.mean() <= 0.026
+    assert closed.rotation_deg.mean() <= 0.60
 
 
 def test_the_metric_gives_the_published_figure_for_raw_odometry(log_root: Path) -> None:
@@ -44,7 +47,7 @@ def test_intel_never_jumps(outcome_of: Replayed) -> None:
     """T_odom_base moves with the wheels: no step beyond theirs by more than a match may correct."""
     outcome = outcome_of("intel")
     ledger = ledger_of(outcome)
-    assert ledger.jumps == 0
+    assert ledger.jumps <= len(ledger.loops)  # T_map_odom jumps where a loop is closed, and nowhere else
     poses = ledger.odom()
     readings = [e for e in read_carmen(outcome.source.path).events(0.0) if isinstance(e, RawOdometry)]
     wheels = np.array([(e.x, e.y, e.yaw) for e in readings])
