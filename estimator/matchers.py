@@ -102,7 +102,7 @@ def match(asked: Asked, first: First, settings: Settings) -> MatchResult:
         best = by_points(view, newest, xy, first, cap, settings)
     else:
         best = by_pic(view, newest, xy, prior, cap, settings)
-    return matching.verdict(best, view, local, prior, settings.matching)
+    return matching.verdict(best, local, prior, settings.matching)
 
 
 def points_of(frame: Keyframe, far_m: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,19 +13,34 @@ from estimator.keyframe import Beams
 from estimator.linear3 import invert3
 from estimator.localmap import LocalMap, contradicted
 from estimator.records import Array
-from estimator.result import MatchResult, Reason
+from estimator.result import VAGUE, MatchResult, Reason
 
-VAGUE = np.diag((4.0, 4.0, 33.0))
-"""Information of a pose known to 0.5 m and 10 deg."""
+FIRST, TRIAL, FINISH, LEAST = 20, 10, 12, 8
+"""Most iterations of a first attempt and of a trial of the second opinion; iterations kept for the attempt that
+finishes it; fewer than the last are too few to begin one."""
 
-FIRST, SECOND = 30, 20
-"""Most iterations of a first attempt, and of the one that finishes a second opinion."""
+SURE = 0.8
+"""Share of fitting beams beyond which no evidence against a place is looked for, unless it is far away."""
 
 FEW = 3.0
 """Points that a direction must be seen with before it can speak against a place."""
 
-SURE = 0.8
-"""Share of fitting beams beyond which a good prediction needs no further evidence."""
+CLAIM = 1.15
+"""What an information matrix is worth in truth: a Cauchy weight counts a Gaussian residual 0.89 times, but costs only
+0.04 of what it knows; and surfaces met at a grazing angle are trusted less than an ideal beam would deserve."""
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What a place must show to be believed.
+
+    Attributes:
+        ways: each the least share of the beams that must fit and the largest share of the evidence that may speak
+            against it, in falling order. held: the least, see :func:`held`.
+    """
+
+    ways: tuple[tuple[float, float], ...]
+    held: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +51,12 @@ class MatchSettings:
         gate_m: farthest partner ever accepted. scale: final robust scale in units of the noise.
         settled: a step shorter than this share of its own standard deviation ends the iteration.
         min_points: fewest pairs that make a result.
-        tracking, searching: ways to be believed, each the least share of the beams that must fit and the largest share
-            of the evidence that may speak against it, in falling order: when the prediction was good, and when it was
-            not (a wrong place can look half right).
+        tracking, near, far: what is asked when the prediction was good; when it was vague, of a place within ``near_m``
+            and ``near_rad`` of it; and of one farther away, or where it was wrong (a wrong place can look half right).
         wide_m, wide_rad: deviations of the prediction beyond which it counts as not good.
-        doubt_share: where fewer beams fit, the prediction is doubted. doubt_m, doubt_rad: its deviations are then taken
-            to be at least these, and ``fan`` headings to either side are tried, ``fan_rad`` apart.
+        doubt_share, doubt_against: where fewer beams fit and more speaks against the place, another is looked for.
+        doubt_m, doubt_rad: deviations of the prediction are then taken to be at least these. ``fan`` headings to either
+            side are tried, ``fan_rad`` apart, then places ``shift_m`` away, on at most ``few`` points.
         coarse, dense: every how many points will do while the pose is far off, in scans of how many.
     """
 
@@ -48,16 +64,21 @@ class MatchSettings:
     scale: float = 2.5
     settled: float = 0.3
     min_points: int = 10
-    tracking: tuple[tuple[float, float], ...] = ((0.35, 0.35),)
-    searching: tuple[tuple[float, float], ...] = ((0.6, 0.03), (0.5, 0.01))
-    held: float = 0.5
+    tracking: Demand = Demand(((0.35, 0.35),))
+    near: Demand = Demand(((0.6, 0.1), (0.42, 0.02)), held=0.23)
+    far: Demand = Demand(((0.6, 0.03), (0.5, 0.01)), held=0.5)
+    near_m: float = 0.75
+    near_rad: float = 0.6
     wide_m: float = 0.15
     wide_rad: float = 0.1
     doubt_share: float = 0.6
     doubt_m: float = 0.3
     doubt_rad: float = 0.2
+    doubt_against: float = 0.02
     fan: int = 3
     fan_rad: float = 0.14
+    shift_m: float = 0.4
+    few: int = 90
     coarse: int = 4
     dense: int = 400
 
@@ -96,7 +117,8 @@ class Attempt:
     Attributes:
         T: pose. H: information of the laser. sums: of the last pass. points: queries.
         trace: (iterations, icp.TRACE), what each iteration saw and did; poses relative to the axis centre.
-        view, prior: what was matched, and from where.
+        view, prior: what was matched, and from where. contradicted: see :meth:`against`, None before that is asked.
+        demand: what was asked of it, None before a verdict.
     """
 
     T: Array
@@ -107,11 +129,28 @@ class Attempt:
     trace: Array
     view: View
     prior: Prior
+    contradicted: float | None = None
+    demand: Demand | None = None
 
     @property
     def share(self) -> float:
         """Share of the beams that fit."""
         return float(self.sums[icp.INLIERS]) / max(self.points, 1)
+
+    def against(self, local: LocalMap) -> float:
+        """Share of the evidence that speaks against the place; looked up once."""
+        if self.contradicted is None:
+            at = se2.compose(self.T, self.view.T_base_lidar)
+            self.contradicted = contradicted(local, at, self.view.beams, self.view.noise_m)
+        return self.contradicted
+
+    def score(self, local: LocalMap) -> float:
+        """How well a place fits, to be compared with others for the same scan."""
+        return self.share - 2.0 * self.against(local)
+
+    def fits(self, local: LocalMap, settings: MatchSettings) -> bool:
+        """Whether a place fits so well that no other need be looked for."""
+        return self.share > SURE and self.against(local) <= settings.doubt_against
 
 
 def match(
@@ -124,12 +163,18 @@ def match(
     tried = [] if tried is None else tried
     first = attempt(view, local, prior, min(cap, FIRST), settings)
     tried.append(first)
-    result = verdict(first, view, local, prior, settings)
+    result = verdict(first, local, prior, settings)
     left = cap - first.iterations
-    if left < SECOND or (result.ok and first.share >= settings.doubt_share):
+    if left < LEAST or not in_doubt(first, result, local, settings):
         return result
-    second = second_opinion(local, prior, settings, tried)
-    return replace(verdict(second, view, local, prior, settings), iterations=min(cap, second.iterations))
+    best, passed = second_opinion(local, prior, settings, tried, left * first.points)
+    used = first.iterations + -(-passed // max(1, first.points))
+    return replace(result if best is first else verdict(best, local, prior, settings), iterations=used)
+
+
+def reference_of(local: LocalMap) -> icp.Reference:
+    """The map as the kernels take it."""
+    return local.axis.rows, local.axis.start, local.axis.rays, local.lines
 
 
 def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> Attempt:
@@ -141,53 +186,82 @@ def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: Match
     how = np.array((view.T_base_lidar[0], view.T_base_lidar[1], *tail))
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = prior.T - centre
-    n = icp.iterate(view.points, (axis.rows, axis.start, axis.rays, local.lines), T, prior.L, how, (H, sums, trace))
-    return Attempt(T + centre, H, sums, n, len(view.points), trace[:n], view, prior)
+    n = icp.iterate(view.points, reference_of(local), T, prior.L, how, (H, sums, trace))
+    return Attempt(T + centre, CLAIM * H, sums, n, len(view.points), trace[:n], view, prior)
 
 
-def second_opinion(local: LocalMap, prior: Prior, settings: MatchSettings, tried: list[Attempt]) -> Attempt:
+def in_doubt(first: Attempt, result: MatchResult, local: LocalMap, settings: MatchSettings) -> bool:
+    """Whether another place might fit better: it is no result, or much does not fit and some speaks against it."""
+    if not result.ok:
+        return True
+    least = settings.doubt_share if first.demand is settings.tracking else SURE
+    return first.share < least and first.against(local) > settings.doubt_against
+
+
+def second_opinion(
+    local: LocalMap, prior: Prior, settings: MatchSettings, tried: list[Attempt], budget: int
+) -> tuple[Attempt, int]:
     """Doubt the prediction: look about it for the place and heading that fit best, on a few points; finish that one.
 
-    ``tried`` ends with the first attempt, and gets the others.
-
-    Iterations are counted by the points they took, so that what is said of the cost stays true.
+    ``tried`` ends with the first attempt, and gets the others. ``budget``: points that may be passed over in all
+    iterations, of which a share is kept for the last. Returns the better of first and last, and the points passed over.
     """
     first = tried[-1]
     view = first.view
-    L = np.diag(np.minimum(np.diag(prior.L), (settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2)))
-    few = replace(view, points=np.ascontiguousarray(view.points[:: max(1, len(view.points) // 180)]))
-    best, share, work = first, first.share + 0.05, 0
-    for k in range(-settings.fan, settings.fan + 1):
-        start = Prior(prior.T + np.array((0.0, 0.0, k * settings.fan_rad)), L)
-        trial = attempt(few, local, start, 12, settings)
+    few = replace(view, points=np.ascontiguousarray(view.points[:: -(-len(view.points) // settings.few)]))
+    best, left = first, budget - min(budget // 2, FINISH * first.points)
+    for start in starts(prior, tried, settings):
+        cap = min(TRIAL, left // len(few.points))
+        if cap < 1 or best.fits(local, settings):
+            break
+        trial = attempt(few, local, start, cap, settings)
         tried.append(trial)
-        work += trial.iterations * len(few.points)
-        if trial.share > share:
-            best, share = trial, trial.share
-    if best is not first:
-        best = attempt(view, local, Prior(best.T, L), SECOND, settings)
-        tried.append(best)
-        work += best.iterations * best.points
-    better = best if best.share > first.share else first
-    return replace(better, iterations=first.iterations + work // max(1, first.points))
+        left -= trial.iterations * len(few.points)
+        if trial.share > best.share and trial.score(local) > best.score(local) + 0.03:
+            best = trial
+    spent = budget - min(budget // 2, FINISH * first.points) - left
+    if best is first:
+        return first, spent
+    cap = (budget - spent) // first.points
+    last = attempt(view, local, Prior(best.T, doubted(prior, settings)), cap, settings)
+    tried.append(last)
+    better = last if last.score(local) > first.score(local) else first
+    return better, spent + last.iterations * last.points
 
 
-def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: MatchSettings) -> MatchResult:
+def doubted(prior: Prior, settings: MatchSettings) -> Array:
+    """Information of a prediction that has turned out to be worse than it said."""
+    most = settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2
+    return np.diag(np.minimum(np.diag(prior.L), most))
+
+
+def starts(prior: Prior, tried: list[Attempt], settings: MatchSettings) -> Iterator[Prior]:
+    """Where to look again: headings to either side of the prediction; then places around it, with the best heading."""
+    L = doubted(prior, settings)
+    for k in sorted(range(-settings.fan, settings.fan + 1), key=abs):
+        yield Prior(prior.T + np.array((0.0, 0.0, k * settings.fan_rad)), L)
+    yaw = max(tried, key=lambda trial: trial.share).T[2]
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        yield Prior(np.array((prior.T[0] + x * settings.shift_m, prior.T[1] + y * settings.shift_m, yaw)), L)
+
+
+def verdict(best: Attempt, local: LocalMap, prior: Prior, settings: MatchSettings) -> MatchResult:
     """Judge an attempt: whether it is a result, and why not."""
     sums, (x, y, yaw), (x1, y1, yaw1) = best.sums.tolist(), best.T.tolist(), prior.T.tolist()
     length2 = sums[icp.LENGTH2]
     T = np.array((x, y, se2.wrap(yaw)))
     correction = np.array((x - x1, y - y1, se2.wrap(yaw - yaw1)))
+    best.demand = demand_on(prior, correction, settings)
     if sums[icp.PAIRS] < settings.min_points:
         reason = Reason.TOO_FEW_PAIRS
-    elif not plausible(best, T, correction, (view, local, prior), settings):
+    elif not plausible(best, best.demand, local, settings):
         reason = Reason.REJECTED
     elif sums[icp.SETTLED]:
         reason = Reason.CONVERGED
     else:
         reason = Reason.OSCILLATING if sums[icp.DAMPING] < 0.5 and length2 > 1.0 else Reason.ITERATION_CAP
     ok = reason in (Reason.CONVERGED, Reason.ITERATION_CAP)
-    H = best.H / (1.0 + length2)
+    H = best.H / (1.0 + length2) if ok else np.zeros((3, 3))
     return MatchResult(
         T_odom_base=T if ok else prior.T.copy(),
         information=H,
@@ -195,31 +269,35 @@ def verdict(best: Attempt, view: View, local: LocalMap, prior: Prior, settings: 
         queries=best.points,
         iterations=best.iterations,
         residual_m=math.sqrt(sums[icp.SQUARES] / max(sums[icp.WEIGHTS], 1e-9)),
-        known_axes=known_axes(H) if ok else np.zeros(3),
+        known_axes=known_axes(H),
         correction=correction,
         reason=reason,
     )
 
 
-def plausible(
-    best: Attempt, T: Array, correction: Array, asked: tuple[View, LocalMap, Prior], settings: MatchSettings
-) -> bool:
-    """Whether enough of the scan fits the map there, and not too much of either speaks against the place."""
-    view, local, prior = asked
+def demand_on(prior: Prior, correction: Array, settings: MatchSettings) -> Demand:
+    """What is asked of a place: more if the prediction was vague or wrong, and most if it is far from it, too."""
     Lx, Ly, Lyaw = prior.L.diagonal().tolist()
     wide = 1.0 / Lx + 1.0 / Ly > settings.wide_m**2 or 1.0 / Lyaw > settings.wide_rad**2
     x, y, yaw = correction.tolist()
-    surprise = x * x + y * y > settings.wide_m**2 or abs(yaw) > settings.wide_rad
+    off2, turn = x * x + y * y, abs(yaw)
+    surprise = off2 > settings.wide_m**2 or turn > settings.wide_rad
     surprise = surprise and float(correction @ prior.L @ correction) > 25.0
-    ways = settings.searching if wide or surprise else settings.tracking
-    if best.share < ways[-1][0]:
+    if not wide and not surprise:
+        return settings.tracking
+    near = off2 <= settings.near_m**2 and turn <= settings.near_rad and not surprise
+    return settings.near if near else settings.far
+
+
+def plausible(best: Attempt, demand: Demand, local: LocalMap, settings: MatchSettings) -> bool:
+    """Whether enough of the scan fits the map there, and not too much of either speaks against the place."""
+    if best.share < demand.ways[-1][0]:
         return False
-    if best.share > SURE and ways is settings.tracking:
-        return True
-    against = contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m)
-    if not any(best.share >= share and against <= most for share, most in ways):
-        return False
-    return ways is settings.tracking or held(best, local, settings) >= settings.held
+    if best.share <= SURE or demand is settings.far:
+        against = best.against(local)
+        if not any(best.share >= share and against <= most for share, most in demand.ways):
+            return False
+    return demand.held == 0.0 or held(best, local, settings) >= demand.held
 
 
 def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
@@ -231,10 +309,9 @@ def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
     known = known_axes(best.H)
     if known[0] == known[1] == 0.0:
         return 1.0
-    axis, out = local.axis, np.empty((2, 3))
-    T = best.T - np.array((axis.centre[0], axis.centre[1], 0.0))
-    reference = (axis.rows, axis.start, axis.rays, local.lines)
-    icp.see_across(best.view.points, reference, T, settings.scale * best.view.noise_m, out)
+    out = np.empty((2, 3))
+    T = best.T - np.array((local.axis.centre[0], local.axis.centre[1], 0.0))
+    icp.see_across(best.view.points, reference_of(local), T, settings.scale * best.view.noise_m, out)
     (sxx, sxy, syy), (fxx, fxy, fyy) = (out + np.array((FEW, 0.0, FEW))).tolist()
     if known[0] == 0.0:
         return float(fyy / syy)

@@ -7,11 +7,20 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+import numpy as np
+
 from estimator.cdma_epoch import BlockFlag
 from estimator.records import Array, Job
 
 SURPRISE: Final = 16.3
 """Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) beyond which the pose and the lights' do not agree."""
+
+
+VAGUE: Final = np.diag((4.0, 4.0, 33.0))
+"""Information of a pose known to 0.5 m and 10 deg: what a match starts from when it is asked which axes it knows."""
+
+KNOWN: Final = np.sqrt((0.01, 0.01, 0.0012))
+"""Deviations (m, m, rad) below which an axis counts as known: 10 cm and 2 deg."""
 
 
 class Reason(Enum):
@@ -53,6 +62,17 @@ class MatchResult:
     def ok(self) -> bool:
         """Whether the pose may be used."""
         return self.reason in (Reason.CONVERGED, Reason.ITERATION_CAP)
+
+    def blind_directions(self) -> Array:
+        """Directions (k, 3), k = 0 to 3, of which this match says nothing, whatever way the surroundings are turned.
+
+        A row is a unit vector of (x, y, yaw) in the odom frame, with the three in units of 10 cm, 10 cm and 2 deg: a
+        corridor at 45 deg gives (0.71, 0.71, 0), where ``known_axes`` can only say that neither x nor y is known; a
+        round room gives the turn about its middle.
+        """
+        P = np.linalg.inv(self.information + VAGUE) / np.outer(KNOWN, KNOWN)
+        value, vector = np.linalg.eigh(P)
+        return np.asarray(vector[:, value > 1.0].T)
 
 
 @dataclass(frozen=True, slots=True)
