@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -16,6 +17,7 @@ from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
 from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
 from estimator.records import Answer, Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
+from estimator.refusal import nothing_of, refused
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
 from estimator.state import Settings, State, new_state
@@ -31,15 +33,17 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
     match: MatchResult | None = None
     keyframe = -1
     for record in sorted(records, key=order):
-        predict(state, record)
+        why = refused(state, record) if isinstance(record, Scan) else None
+        if why is None:
+            predict(state, record)
         if isinstance(record, SampleBlock | LightEpoch):
             see_lights(state, record)
             lay_anchor(state)
         if isinstance(record, Answer):
             close_loops(state, record)
         if isinstance(record, Scan):
-            points = virtual_frame(state, record)
-            match = match_scan(state, record, points, limits)
+            points = nothing_of(record) if why else virtual_frame(state, record)
+            match = match_scan(state, record, points, limits, why)
             fuse(state, match)
             if limits.update_map and keyframe_due(state, points, match):
                 keyframe = lay_keyframe(state, record, points)
@@ -51,11 +55,13 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
 def order(record: Record) -> tuple[float, bool]:
     """Records go by the instant up to which they speak; a scan after whatever moved the robot until then."""
     end = record.t_end if isinstance(record, Scan | SampleBlock | LightEpoch | Odometry | Imu) else record.t_begin
-    return end, isinstance(record, Scan)
+    return end if math.isfinite(end) else -math.inf, isinstance(record, Scan)
 
 
 def predict(state: State, record: Record) -> None:
     """Bring the pose to the record's instant: by odometry, by gyro, else at constant velocity; obey a command."""
+    if not math.isfinite(order(record)[0]):
+        return  # it would take the pose with it, out of all time
     noise = state.settings.noise
     before = state.fused.T_odom_base, state.fused.P, state.fused.t_mono
     if state.light is not None:
@@ -95,12 +101,16 @@ def virtual_frame(state: State, scan: Scan) -> ScanPoints:
     return points_of(scan, moved, state.settings.far_m, state.settings.quality)
 
 
-def match_scan(state: State, scan: Scan, points: ScanPoints, limits: Limits) -> MatchResult:
+def match_scan(
+    state: State, scan: Scan, points: ScanPoints, limits: Limits, refusal: Reason | None = None
+) -> MatchResult:
     """Eq. 12-14: nearest neighbours on the distance axis, point-to-line, the prediction weighted in."""
     state.since_keyframe += 1
     T_pred, count = state.fused.T_odom_base, len(points.xy)
     asked: Asked | None = None
-    if state.local is None:
+    if refusal is not None:
+        result = matching.no_match(T_pred, count, refusal)
+    elif state.local is None:
         result = matching.no_match(T_pred, count, Reason.NO_MAP)
     elif count < state.settings.matching.min_points:
         result = matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)

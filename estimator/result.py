@@ -33,6 +33,8 @@ class Reason(Enum):
     TOO_FEW_PAIRS = "too few beams found a partner in the map"
     NO_MAP = "nothing to match against yet"
     REJECTED = "residual or correction implausible"
+    MALFORMED = "not a scan: lengths, bearings, times, mount or noise cannot be those of a sweep"
+    LATE = "older than the scan before it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -79,6 +79,7 @@ class State:
         next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
         t_scan, T_odom_scan: instant and pose of the latest scan.
+        t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
         journal: is told of every match before it is fused, None: nobody asks.
     """
 
@@ -104,6 +105,8 @@ class State:
     noise_m: float = 0.0
     t_scan: float = -math.inf
     T_odom_scan: Array = field(default_factory=se2.identity)
+    t_newest_scan: float = -math.inf
+    bearing_rad: Array | None = None
     journal: Journal | None = None
 
 
