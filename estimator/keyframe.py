@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
 """Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
 
+LONGEST_M = 1e6
+"""Ranges beyond are kept as this: they say the same, and fit into single precision."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Virtual:
@@ -118,6 +121,6 @@ def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -
         T_base_lidar=scan.T_base_lidar,
         bearing_rad=scan.bearing_rad,
         turned_rad=turned_rad,
-        range_m=scan.range_m.astype(np.float32),
+        range_m=np.clip(scan.range_m, -LONGEST_M, LONGEST_M).astype(np.float32),
         beam=scan.beam,
     )

@@ -17,7 +17,7 @@ from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
 from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
 from estimator.records import Answer, Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
-from estimator.refusal import nothing_of, refused
+from estimator.refusal import in_time, nothing_of, refused
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
 from estimator.state import Settings, State, new_state
@@ -55,13 +55,13 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
 def order(record: Record) -> tuple[float, bool]:
     """Records go by the instant up to which they speak; a scan after whatever moved the robot until then."""
     end = record.t_end if isinstance(record, Scan | SampleBlock | LightEpoch | Odometry | Imu) else record.t_begin
-    return end if math.isfinite(end) else -math.inf, isinstance(record, Scan)
+    return end if in_time(end) else -math.inf, isinstance(record, Scan)
 
 
 def predict(state: State, record: Record) -> None:
     """Bring the pose to the record's instant: by odometry, by gyro, else at constant velocity; obey a command."""
-    if not math.isfinite(order(record)[0]):
-        return  # it would take the pose with it, out of all time
+    if order(record)[0] == -math.inf:
+        return  # at no time
     noise = state.settings.noise
     before = state.fused.T_odom_base, state.fused.P, state.fused.t_mono
     if state.light is not None:

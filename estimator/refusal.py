@@ -18,6 +18,8 @@ from estimator.state import State
 LONGEST_SWEEP_S = 10.0
 FARTHEST_MOUNT_M = 100.0
 LARGEST_NOISE_M = 1.0
+LATEST_S = 1e11
+"""No clock of a robot, and no stamp of a log, is three thousand years from its zero."""
 FULL_TURN = 2.0 * math.pi + 0.1
 """Bearings of one sweep span no more than this."""
 
@@ -42,7 +44,7 @@ def well_formed(scan: Scan) -> bool:
         return False
     x, y, yaw = mount.tolist()
     placed = math.hypot(x, y) < FARTHEST_MOUNT_M and math.isfinite(yaw)
-    timed = math.isfinite(scan.t_end) and 0.0 <= scan.t_end - scan.t_begin < LONGEST_SWEEP_S
+    timed = in_time(scan.t_end) and 0.0 <= scan.t_end - scan.t_begin < LONGEST_SWEEP_S
     return placed and timed and 0.0 <= scan.sigma_m < LARGEST_NOISE_M
 
 
@@ -61,3 +63,8 @@ def even(state: State, bearing: Array) -> bool:
 def nothing_of(scan: Scan) -> ScanPoints:
     """What is seen of a scan that may not be looked at."""
     return ScanPoints(np.empty((0, 2)), np.zeros(2), 0.0, scan.sigma_m)
+
+
+def in_time(t_mono: float) -> bool:
+    """Whether an instant can be one; a pose that was carried to another would be out of time for good."""
+    return abs(t_mono) < LATEST_S

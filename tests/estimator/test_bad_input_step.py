@@ -79,6 +79,9 @@ def settled(matcher: Matcher, scans: int = 12) -> tuple[State, Array]:
         if k:
             records.append(Odometry(0.05 * (k - 1), 0.05 * k, se2.between(truth[k - 1], T)))
         step(state, records, UNLIMITED)
+    for _ in range(10):
+        t = state.fused.t_mono + 0.05
+        stand(state, t, scan_at(truth[-1], t, 49, noise))
     return state, truth[-1]
 
 
@@ -101,16 +104,16 @@ def honest(result: StepResult, truth: Array) -> bool:
 def test_what_is_no_scan_is_refused(name: str) -> None:
     state, T = settled(Matcher.LINE, 4)
     before = state.fused.T_odom_base
-    scan = MALFORMED[name](scan_at(T, 0.2, 50))
-    result = stand(state, 0.2, scan)
+    scan = MALFORMED[name](scan_at(T, 0.7, 50))
+    result = stand(state, 0.7, scan)
     assert result.match is not None
     assert result.match.reason is Reason.MALFORMED
     np.testing.assert_allclose(result.T_odom_base, before, atol=1e-9)
     assert honest(result, T)
-    again = stand(state, 0.25, scan_at(T, 0.25, 51))
+    again = stand(state, 0.75, scan_at(T, 0.75, 51))
     assert again.match is not None
     assert again.match.ok
-    assert again.t_mono == 0.25
+    assert again.t_mono == 0.75
 
 
 @pytest.mark.parametrize("name", MALFORMED)
@@ -128,14 +131,14 @@ def test_a_robot_that_is_switched_on_with_it_waits_for_a_scan(name: str) -> None
 @pytest.mark.parametrize("matcher", Matcher)
 def test_scans_without_points_say_so(matcher: Matcher) -> None:
     state, T = settled(matcher)
-    t, before = 0.6, state.fused.T_odom_base
+    t, before = 1.2, state.fused.T_odom_base
     for k, change in enumerate(WITHOUT_POINTS.values()):
         result = stand(state, t + 0.05 * k, change(scan_at(T, t + 0.05 * k, 50 + k)))
         assert result.match is not None
         assert result.match.reason is Reason.TOO_FEW_POINTS
         np.testing.assert_allclose(result.T_odom_base, before, atol=1e-9)
         assert honest(result, T)
-    again = stand(state, 2.0, scan_at(T, 2.0, 99))
+    again = stand(state, 2.5, scan_at(T, 2.5, 99))
     assert again.match is not None
     assert again.match.ok
 
@@ -147,13 +150,13 @@ def test_scans_that_fit_nowhere_move_nothing(name: str, matcher: Matcher) -> Non
     """Two are passed over; a third in a row begins the map anew, at the place where the robot is."""
     state, T = settled(matcher)
     for k in range(5):
-        t = 0.6 + 0.05 * k
+        t = 1.2 + 0.05 * k
         result = stand(state, t, MISFITS[name](scan_at(T, t, 50 + k)))
         assert result.match is not None
         assert not result.match.ok or k > 2
         assert honest(result, T)
     for k in range(5):
-        t = 1.0 + 0.05 * k
+        t = 1.6 + 0.05 * k
         result = stand(state, t, scan_at(T, t, 80 + k))
         assert honest(result, T)
     assert result.match is not None
@@ -164,11 +167,11 @@ def test_scans_that_fit_nowhere_move_nothing(name: str, matcher: Matcher) -> Non
 def test_a_scan_from_before_is_too_late(matcher: Matcher) -> None:
     state, T = settled(matcher)
     far = path(60)[0]
-    late = stand(state, 0.6, scan_at(far, 0.3, 3))
+    late = stand(state, 1.2, scan_at(far, 0.3, 3))
     assert late.match is not None
     assert late.match.reason is Reason.LATE
     assert honest(late, T)
-    same = stand(state, 0.65, scan_at(T, 0.65, 51))
+    same = stand(state, 1.25, scan_at(T, 1.25, 51))
     assert same.match is not None
     assert same.match.ok
 
@@ -187,13 +190,13 @@ def test_a_clock_that_was_set_back_costs_one_scan() -> None:
 def test_the_same_scan_again_and_again_is_the_same_place(matcher: Matcher) -> None:
     """A stuck device: what is known does not shrink to nothing, and the pose stays."""
     state, T = settled(matcher)
-    scan = scan_at(T, 0.6, 50, np.random.default_rng(4))
+    scan = scan_at(T, 1.2, 50, np.random.default_rng(4))
     for _ in range(40):
         result = step(state, [scan], UNLIMITED)
         assert result.match is not None
         assert result.match.ok
         assert honest(result, T)
-    again = stand(state, 0.7, scan_at(T, 0.7, 51))
+    again = stand(state, 1.3, scan_at(T, 1.3, 51))
     assert again.match is not None
     assert again.match.ok
 
@@ -206,8 +209,8 @@ def test_a_hundred_thousand_beams() -> None:
     bearing = np.linspace(BEARING[0], BEARING[-1], n)
     ranges = np.interp(bearing, BEARING, scan_at(T, 0.0, 0).range_m)
     ranges += np.random.default_rng(1).normal(0.0, 0.01, n)
-    scan = Scan(0.6, 0.6, 50, STILL.copy(), bearing, ranges, np.ones(n, np.uint8), 0.01)
-    result = stand(state, 0.6, scan)
+    scan = Scan(1.2, 1.2, 50, STILL.copy(), bearing, ranges, np.ones(n, np.uint8), 0.01)
+    result = stand(state, 1.2, scan)
     assert result.match is not None
     assert result.match.ok
     assert result.match.queries == n
@@ -252,14 +255,14 @@ def fuzzed(
 
 @pytest.mark.jit
 @pytest.mark.parametrize("matcher", Matcher)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(cases=st.lists(FUZZ, min_size=1, max_size=6))
 def test_whatever_comes_the_step_goes_on(
     matcher: Matcher, cases: list[tuple[int, tuple[float, float], str, int, float, float, tuple[float, ...]]]
 ) -> None:
     """Records at random on a robot that stands: never an exception, never a confident wrong pose, and it recovers."""
     state, T = settled(matcher, 4)
-    t = 0.2
+    t = 0.7
     for case in cases:
         scan = fuzzed(case, T, t)
         result = stand(state, t, scan)
