@@ -1,17 +1,20 @@
-"""Consecutive scans of a CARMEN log, with what the wheels say of the way between them."""
+"""A CARMEN log for timing: scans in a row with what the wheels say of the way between them, and whole steps."""
 
 from __future__ import annotations
 
+import statistics
+import time
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from daemon.bridge import ScanBridge
+from daemon.bridge import OdometryBridge, ScanBridge
 from daemon.config import LidarConfig
 from estimator import se2
-from estimator.records import Array, Scan
+from estimator.pipeline import new_state, step
+from estimator.records import UNLIMITED, Array, Record, Scan
 from hal.odometry import RawOdometry
 from hal.replay.carmen import read_carmen
 
@@ -41,3 +44,28 @@ def consecutive(path: Path, count: int, least_m: float = 0.01, least_rad: float 
     moving = [i for i, w in enumerate(ways) if np.hypot(w[0], w[1]) > least_m or abs(w[2]) > least_rad]
     chosen = [moving[i] for i in np.linspace(0, len(moving) - 1, count).astype(int)]
     return [Step(bridge.scan(raw[i]), bridge.scan(raw[i + 1]), ways[i]) for i in chosen]
+
+
+def front_end(path: Path, scans: int) -> float:
+    """Milliseconds of one core that the estimator's step takes for a scan and its odometry, median of the first scans.
+
+    From the records to the fused pose: placing, matching against the local map, keyframes and map where they are due.
+    """
+    log, wheels = read_carmen(path), OdometryBridge()
+    bridge, state = ScanBridge(LidarConfig()), new_state()
+    bridge.T_base_lidar = np.array(log.mount)
+    due: list[Record] = []
+    times: list[int] = []
+    for event in log.events(0.0):
+        if isinstance(event, RawOdometry):
+            moved = wheels.increment(event)
+            due += [] if moved is None else [moved]
+            continue
+        due.append(bridge.scan(event))
+        begin = time.process_time_ns()
+        step(state, due, UNLIMITED)
+        times.append(time.process_time_ns() - begin)
+        due.clear()
+        if len(times) == scans:
+            break
+    return 1e-6 * statistics.median(times)
