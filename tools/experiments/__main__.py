@@ -18,7 +18,9 @@ from typing import Final
 from tools.experiments.report import Report, Skipped, Work, save
 from tools.figures import table
 
-GROUPS: Final = {"lights": ("fig4", "fig5", "claim", "adaptive", "room", "tones", "static", "walks", "survey")}
+GROUPS: Final = {
+    "lights": ("fig4", "fig5", "claim", "adaptive", "room", "tones", "static", "walks", "survey", "beamquality")
+}
 
 
 def available(group: str) -> list[str]:
