@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -183,7 +183,7 @@ def _asked(asked: Asked) -> dict[str, Any]:
         "T_base_lidar": view.T_base_lidar.tolist(),
         "noise_m": view.noise_m,
         "most_iterations": cap,
-        "settings": {name: _plain(getattr(settings, name)) for name in settings.__slots__},
+        "settings": asdict(settings),
         "map": {"columns": names, "elements": _rounded(local.elements[:, : len(names)]), "updates": local.updates},
     }
 
@@ -249,7 +249,3 @@ def _rounded(values: Array) -> list[Any]:
     """Micrometres, microradians: what is computed from further is in full."""
     rounded: list[Any] = np.round(values, 6).tolist()
     return rounded
-
-
-def _plain(value: object) -> Any:
-    return list(value) if isinstance(value, tuple) else value
