@@ -25,8 +25,8 @@ Ints = npt.NDArray[np.int64]
 GROUP = 4
 """Sectors that share a ring."""
 
-ONE_AXIS = 64
-"""Fewer points than this are searched on the single axis (measured: docs/estimator.md)."""
+FEWEST = 16
+"""Sectors, where there are any: a group must not span more than a right angle. Points below which there are none."""
 
 
 @dataclass(slots=True, eq=False)
@@ -53,17 +53,20 @@ class Axis:
 
 def sector_count(points: int) -> int:
     """How many sectors make the search fastest for this many reference points: two points in each, over 270 deg."""
-    if points < ONE_AXIS:
-        return 1
-    return min(8192, max(64, 2 * points // 3 // 16 * 16))
+    return min(8192, max(FEWEST, 2 * points // 48 * 16)) if points >= FEWEST else 1
 
 
 def build_axis(points: Array, centre: Array, sectors: int = 0, lights: Array | None = None) -> Axis:
     """Order points of shape (n, 2) around ``centre``; ``sectors`` 0 chooses by their number.
 
     ``lights``: (k, 2) light points in the same frame.
+
+    Raises:
+        ValueError: more than one sector, but fewer than ``FEWEST``.
     """
     n = len(points)
+    if 1 < sectors < FEWEST:
+        raise ValueError(f"{sectors} sectors are too wide to be searched; use 1, {FEWEST} or more, or 0 to choose")
     rays = ray_table(sectors or sector_count(n)).copy()
     rows, label, start = np.empty((n, 3)), np.empty(n, np.int64), np.zeros(len(rays), np.int64)
     order_points(np.ascontiguousarray(points), centre[0], centre[1], (rows, label, start, rays))

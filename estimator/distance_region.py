@@ -37,8 +37,8 @@ GLANCE = 8
 SHORT = 32
 """A group of at most this many rows is compared through; a longer one is searched along its axes."""
 
-WIDE = 16
-"""With fewer sectors than this a group spans more than a right angle, and its bounding ray says nothing of it."""
+PATIENCE = 16
+"""Points an axis of a sector is walked for; what then still remains is compared through, which costs less a point."""
 
 
 class Kind(IntEnum):
@@ -132,32 +132,30 @@ def merge(
             k += 1
 
 
-@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8, i8, i8, f8, f8, Tuple((i8, f8, f8)))")
+@kernel("Tuple((i8, f8, f8, i8, i8))(f8[:, ::1], i8, i8, i8, f8, f8, Tuple((i8, f8, f8, i8)))")
 def walk(
-    rows: Array, low: int, high: int, at: int, qx: float, qy: float, best: tuple[int, float, float]
-) -> tuple[int, float, float, int]:
+    rows: Array, low: int, high: int, at: int, qx: float, qy: float, best: tuple[int, float, float, int]
+) -> tuple[int, float, float, int, int]:
     """From place ``at`` of the axis [low, high), before which all rows are nearer to the origin, to both ends.
 
-    ``best``: best row so far, its squared distance, and a bound (squared) that no other row comes closer than. Returns
-    them brought up to date, and the number of rows visited.
+    ``best``: best row so far, its squared distance, a bound (squared) that no other row comes closer than, and how many
+    rows to visit at most. Returns the first three brought up to date, and the next row towards each end.
     """
-    row, d2, e2 = best
+    row, d2, e2, most = best
     known = row
     rq = np.sqrt(qx * qx + qy * qy)
     up, down = at, at - 1
-    while True:
+    while up - down <= most:
         du = rows[up, 2] - rq if up < high else np.inf
         dd = rq - rows[down, 2] if down >= low else np.inf
+        gap = min(du, dd)
+        if gap * gap >= d2:
+            e2 = min(e2, gap * gap)
+            break
         if du <= dd:
-            if du * du >= d2:
-                e2 = min(e2, du * du)
-                break
             i = up
             up += 1
         else:
-            if dd * dd >= d2:
-                e2 = min(e2, dd * dd)
-                break
             i = down
             down -= 1
         if i == known:
@@ -170,7 +168,7 @@ def walk(
             row = i
         else:
             e2 = min(e2, d)
-    return row, d2, e2, up - down - 1
+    return row, d2, e2, down, up
 
 
 @kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], b1[::1], Tuple((i8[::1], f8[::1], i8[::1])))")
@@ -183,7 +181,8 @@ def walk_all(
     for i in range(len(virtual)):
         if kept[i]:
             at = min(below[i], n)
-            row[i], d2[i], _, visits[i] = walk(rows, 0, n, at, virtual[i, 0], virtual[i, 1], (-1, d2[i], np.inf))
+            row[i], d2[i], _, down, up = walk(rows, 0, n, at, virtual[i, 0], virtual[i, 1], (-1, d2[i], np.inf, n + 1))
+            visits[i] = up - down - 1
 
 
 def pair_fused(axis: Axis, fused: Fused, bound: float = np.inf) -> tuple[Ints, Array, Ints]:
@@ -234,31 +233,79 @@ def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: 
     return int(best), d2, min(e2, min(right * right, left * left))
 
 
+@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8, i8, f8, f8, Tuple((i8, f8, f8)))")
+def compare_through(
+    rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
+) -> tuple[int, float, float]:
+    """All rows [low, high), four at a time; ``best`` as in :func:`walk`."""
+    row, d2, e2 = best
+    known = row
+    i = low
+    while i < high:
+        last = min(i + 4, high)
+        if last == i + 4:
+            a = (rows[i, 0] - qx) ** 2 + (rows[i, 1] - qy) ** 2
+            b = (rows[i + 1, 0] - qx) ** 2 + (rows[i + 1, 1] - qy) ** 2
+            c = (rows[i + 2, 0] - qx) ** 2 + (rows[i + 2, 1] - qy) ** 2
+            d = (rows[i + 3, 0] - qx) ** 2 + (rows[i + 3, 1] - qy) ** 2
+            if min(min(a, b), min(c, d)) >= e2:
+                i = last
+                continue
+        for j in range(i, last):
+            d = (rows[j, 0] - qx) ** 2 + (rows[j, 1] - qy) ** 2
+            if d < e2 and j != known:
+                e2 = max(d, d2)
+                if d < d2:
+                    row, d2 = j, d
+        i = last
+    return row, d2, e2
+
+
+@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8, i8, f8, f8, Tuple((i8, f8, f8)))")
+def search_axis(
+    rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
+) -> tuple[int, float, float, int]:
+    """:func:`walk` along the axis [low, high) of one sector; what lies at like distances is compared through."""
+    row, d2, e2 = best
+    rq = np.sqrt(qx * qx + qy * qy)
+    at = place_on_axis(rows, low, high, rq)
+    row, d2, e2, down, up = walk(rows, low, high, at, qx, qy, (row, d2, e2, PATIENCE))
+    if up - down <= PATIENCE:
+        return row, d2, e2, up - down - 1
+    reach = np.sqrt(d2)
+    first, last = place_on_axis(rows, low, down + 1, rq - reach), place_on_axis(rows, up, high, rq + reach)
+    row, d2, e2 = compare_through(rows, first, down + 1, qx, qy, (row, d2, e2))
+    row, d2, e2 = compare_through(rows, up, last, qx, qy, (row, d2, e2))
+    if first > low:
+        e2 = min(e2, (rq - rows[first - 1, 2]) ** 2)
+    if last < high:
+        e2 = min(e2, (rq - rows[last, 2]) ** 2)
+    return row, d2, e2, last - first
+
+
 @kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8[::1], i8, f8, f8, Tuple((i8, f8, f8)))", inline=True)
-def look_through(
+def search_group(
     rows: Array, start: Ints, group: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float, int]:
-    """All rows of a group of sectors, or of each its axis where they are many; see :func:`walk`."""
+    """The rows of a group of sectors, each its axis where they are many; ``best`` as in :func:`walk`."""
     row, d2, e2 = best
     first = GROUP * group
     last = min(first + GROUP, len(start) - 1)
-    low, high = start[first], start[last]
-    if high - low > SHORT:
+    visits = start[last] - start[first]
+    if visits > SHORT:
         visits = 0
-        rq = np.sqrt(qx * qx + qy * qy)
         for s in range(first, last):
-            at = place_on_axis(rows, start[s], start[s + 1], rq)
-            row, d2, e2, n = walk(rows, start[s], start[s + 1], at, qx, qy, (row, d2, e2))
+            row, d2, e2, n = search_axis(rows, start[s], start[s + 1], qx, qy, (row, d2, e2))
             visits += n
-        return row, d2, e2, visits
-    known = row
-    for i in range(low, high):
-        dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
-        d = dx * dx + dy * dy if i != known else np.inf
-        e2 = min(e2, max(d, d2))
-        row = i if d < d2 else row
-        d2 = min(d, d2)
-    return row, d2, e2, high - low
+    else:
+        known = row
+        for i in range(start[first], start[last]):
+            dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
+            d = dx * dx + dy * dy if i != known else np.inf
+            e2 = min(e2, max(d, d2))
+            row = i if d < d2 else row
+            d2 = min(d, d2)
+    return row, d2, e2, visits
 
 
 @kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, i8, f8)")
@@ -268,18 +315,22 @@ def search(
     """Row nearest to the query (relative to the centre), given one at squared distance ``d2`` (row -1: only a bound).
 
     Returns row, squared distance, bound for all others (squared) and the number of rows visited. From the query's own
-    group the search goes round to both sides, until a ray is farther away than the best pair.
+    group the search goes round to both sides, until a ray is farther away than the best pair. No ray is farther away
+    than the centre: where that is nearer than the best pair, bearings mean nothing and all rows are compared.
     """
     r2 = qx * qx + qy * qy
-    rq = np.sqrt(r2)
     sectors = len(start) - 1
     groups = (sectors + GROUP - 1) // GROUP
     home = sector_of(qx, qy, sectors) // GROUP
-    row, d2, e2, visits = look_through(rows, start, home, qx, qy, (row, d2, np.inf))
-    todo = groups - 1
+    row, d2, e2, visits = search_group(rows, start, home, qx, qy, (row, d2, np.inf))
+    if groups == 1:
+        return row, d2, e2, visits
+    if d2 > r2:
+        row, d2, e2 = compare_through(rows, 0, len(rows), qx, qy, (row, d2, e2))
+        return row, d2, e2, visits + len(rows)
     for side in range(1, -2, -2):
         group = home
-        while todo > 0:
+        while True:
             ray = GROUP * group
             group += side
             if group == groups:
@@ -294,17 +345,12 @@ def search(
             if far2 >= d2:
                 e2 = min(e2, far2)
                 break
-            todo -= 1
-            ring, outer = rays[GROUP * group, 2], rays[GROUP * group, 3]
-            if along > 0.0 and side * across <= 0.0 and sectors >= WIDE:
-                off = along - min(max(along, ring), outer)
-            else:  # the group may begin behind the query's back: its ring alone tells how far away it is
-                off, far2 = rq - min(max(rq, ring), outer), 0.0
-            far2 += off * off
+            off = along - min(max(along, rays[GROUP * group, 2]), rays[GROUP * group, 3])
+            far2 += off * off  # of that part of the ray that is inside the group's ring
             if far2 >= d2:
                 e2 = min(e2, far2)
                 continue
-            row, d2, e2, n = look_through(rows, start, group, qx, qy, (row, d2, e2))
+            row, d2, e2, n = search_group(rows, start, group, qx, qy, (row, d2, e2))
             visits += n
     return row, d2, e2, visits
 

@@ -17,7 +17,7 @@ from estimator.records import Array
 COARSE = st.integers(-6, 6).map(lambda n: n * 0.25)  # duplicates, ties and points on sector bounds are common
 POINTS = st.integers(0, 40).flatmap(lambda n: arrays(np.float64, (n, 2), elements=COARSE))
 CENTRES = arrays(np.float64, 2, elements=COARSE)
-SECTORS = st.sampled_from([0, 1, 2, 3, 7, 64])
+SECTORS = st.sampled_from([0, 1, 16, 18, 21, 64])
 
 
 def agree(points: Array, queries: Array, centre: Array, sectors: int, bound: float = np.inf) -> None:
@@ -73,7 +73,7 @@ def one_place(n: int) -> Array:
 
 
 @pytest.mark.parametrize("shape", [wall, circle, corridor, one_place])
-@pytest.mark.parametrize("sectors", [0, 1, 5, 256])
+@pytest.mark.parametrize("sectors", [0, 1, 16, 256])
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.17, -0.05), (3.0, 1.0), (40.0, -7.0)])
 def test_exact_on_walls_circles_and_corridors(
     shape: Callable[[int], Array], sectors: int, offset: tuple[float, float]

@@ -83,6 +83,6 @@ def test_a_light_on_top_of_a_laser_point_is_not_its_partner() -> None:
 
 
 def test_an_axis_with_sectors_is_refused_by_name() -> None:
-    axis = build_axis(np.ones((100, 2)), np.zeros(2), 4)
-    with pytest.raises(ValueError, match="4 sectors"):
+    axis = build_axis(np.ones((100, 2)), np.zeros(2), 16)
+    with pytest.raises(ValueError, match="16 sectors"):
         fuse(axis, np.ones((3, 2)), np.zeros(3))

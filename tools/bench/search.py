@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from estimator import distance_region
-from estimator.distance_axis import Axis, Ints, build_axis, sector_count
+from estimator.distance_axis import FEWEST, Axis, Ints, build_axis, sector_count
 from estimator.records import Array
 from tools.bench._scenes import Scene, corridor, office, paper_room, round_room
 from tools.bench.match import FAR, STILL, pairs, points
@@ -165,7 +165,7 @@ def _crossover() -> list[Figure]:
         for name, off in (("converged", CLOSE), ("17 cm / 4 deg", FAR)):
             found = pairs(office(), beams, 270.0, off, 6)
             time_of = {}
-            for sectors in (1, max(16, sector_count(beams))):
+            for sectors in (1, max(FEWEST, sector_count(beams))):
                 tasks = [Task(points(p.reference), points(p.new), sectors=sectors) for p in found]
                 time_of[sectors == 1] = microseconds(lambda t: (t.index(), t.ours()), tasks)
             label = f"index and pass, {beams} points, {name}"
