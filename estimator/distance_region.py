@@ -222,7 +222,7 @@ def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: 
     if start[b] - start[a] > GLANCE or len(rows) < GLANCE:
         return -1, bound2, -1.0
     low = min(start[a], len(rows) - GLANCE)
-    for i in range(low, low + GLANCE):
+    for i in range(np.uint64(low), np.uint64(low + GLANCE)):
         dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
         d = dx * dx + dy * dy
         e2 = min(e2, max(d, d2))
@@ -240,24 +240,23 @@ def compare_through(
     """All rows [low, high), four at a time; ``best`` as in :func:`walk`."""
     row, d2, e2 = best
     known = row
-    i = low
-    while i < high:
-        last = min(i + 4, high)
-        if last == i + 4:
-            a = (rows[i, 0] - qx) ** 2 + (rows[i, 1] - qy) ** 2
-            b = (rows[i + 1, 0] - qx) ** 2 + (rows[i + 1, 1] - qy) ** 2
-            c = (rows[i + 2, 0] - qx) ** 2 + (rows[i + 2, 1] - qy) ** 2
-            d = (rows[i + 3, 0] - qx) ** 2 + (rows[i + 3, 1] - qy) ** 2
-            if min(min(a, b), min(c, d)) >= e2:
-                i = last
-                continue
-        for j in range(i, last):
-            d = (rows[j, 0] - qx) ** 2 + (rows[j, 1] - qy) ** 2
-            if d < e2 and j != known:
-                e2 = max(d, d2)
-                if d < d2:
-                    row, d2 = j, d
-        i = last
+    whole = low + (high - low) // 4 * 4
+    for i in range(low, whole, 4):
+        least = np.inf
+        for j in range(np.uint64(i), np.uint64(i + 4)):
+            dx, dy = rows[j, 0] - qx, rows[j, 1] - qy
+            least = min(least, dx * dx + dy * dy)
+        if least < e2:
+            for j in range(i, i + 4):
+                d = (rows[j, 0] - qx) ** 2 + (rows[j, 1] - qy) ** 2
+                if d < e2 and j != known:
+                    e2 = max(d, d2)
+                    row, d2 = (j, d) if d < d2 else (row, d2)
+    for j in range(whole, high):
+        d = (rows[j, 0] - qx) ** 2 + (rows[j, 1] - qy) ** 2
+        if d < e2 and j != known:
+            e2 = max(d, d2)
+            row, d2 = (j, d) if d < d2 else (row, d2)
     return row, d2, e2
 
 
@@ -316,7 +315,7 @@ def search(
 
     Returns row, squared distance, bound for all others (squared) and the number of rows visited. From the query's own
     group the search goes round to both sides, until a ray is farther away than the best pair. No ray is farther away
-    than the centre: where that is nearer than the best pair, bearings mean nothing and all rows are compared.
+    than the centre: where that is nearer than the best pair, bearings mean nothing and the rings alone decide.
     """
     r2 = qx * qx + qy * qy
     sectors = len(start) - 1
@@ -326,8 +325,15 @@ def search(
     if groups == 1:
         return row, d2, e2, visits
     if d2 > r2:
-        row, d2, e2 = compare_through(rows, 0, len(rows), qx, qy, (row, d2, e2))
-        return row, d2, e2, visits + len(rows)
+        rq = np.sqrt(r2)
+        for group in range(groups):
+            off = max(rays[GROUP * group, 2] - rq, 0.0)
+            if off * off >= d2 or group == home:
+                e2 = min(e2, off * off) if group != home else e2
+                continue
+            row, d2, e2, n = search_group(rows, start, group, qx, qy, (row, d2, e2))
+            visits += n
+        return row, d2, e2, visits
     for side in range(1, -2, -2):
         group = home
         while True:
