@@ -22,11 +22,14 @@ from estimator.records import Array
 
 Ints = npt.NDArray[np.int64]
 
-GROUP = 4
+GROUP = 8
 """Sectors that share a ring."""
 
-FEWEST = 16
-"""Sectors, where there are any: a group must not span more than a right angle. Points below which there are none."""
+FEWEST = 32
+"""Sectors, where there are any: a group must not span more than a right angle."""
+
+ONE_AXIS = 16
+"""Fewer points than this are searched on the single axis (measured: docs/estimator.md)."""
 
 
 @dataclass(slots=True, eq=False)
@@ -53,7 +56,7 @@ class Axis:
 
 def sector_count(points: int) -> int:
     """How many sectors make the search fastest for this many reference points: two points in each, over 270 deg."""
-    return min(8192, max(FEWEST, 2 * points // 48 * 16)) if points >= FEWEST else 1
+    return min(8192, max(FEWEST, 2 * points // 48 * 16)) if points >= ONE_AXIS else 1
 
 
 def build_axis(points: Array, centre: Array, sectors: int = 0, lights: Array | None = None) -> Axis:
@@ -115,9 +118,17 @@ def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float
     return cross * cross
 
 
+@kernel("b1(f8[::1], f8, f8, f8)", inline=True)
+def is_behind(row: Array, x: float, y: float, r: float) -> bool:
+    """Whether a row belongs behind (x, y, r) on its axis."""
+    if row[2] != r:
+        return bool(row[2] > r)
+    return bool(row[0] > x or (row[0] == x and row[1] > y))
+
+
 @kernel("void(f8[:, ::1], i8[::1], i8, i8)")
 def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
-    """Shell's sort of rows [lo, hi) by distance."""
+    """Shell's sort of rows [lo, hi) by distance; rows at one distance by x and y, so that equal points lie together."""
     gap = 1
     while gap < (hi - lo) // 3:
         gap = 3 * gap + 1
@@ -125,7 +136,7 @@ def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
         for i in range(lo + gap, hi):
             x, y, r, name = rows[i, 0], rows[i, 1], rows[i, 2], label[i]
             j = i
-            while j >= lo + gap and rows[j - gap, 2] > r:
+            while j >= lo + gap and is_behind(rows[j - gap], x, y, r):
                 rows[j, 0], rows[j, 1] = rows[j - gap, 0], rows[j - gap, 1]
                 rows[j, 2], label[j] = rows[j - gap, 2], label[j - gap]
                 j -= gap

@@ -34,7 +34,7 @@ __all__ = ["Axis", "Fused", "Ints", "Kind", "build_axis", "fuse", "glance", "nea
 GLANCE = 8
 """Rows compared at first sight, without a branch."""
 
-SHORT = 32
+SHORT = 64
 """A group of at most this many rows is compared through; a longer one is searched along its axes."""
 
 PATIENCE = 16
@@ -237,9 +237,11 @@ def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: 
 def compare_through(
     rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float]:
-    """All rows [low, high), four at a time; ``best`` as in :func:`walk`."""
+    """All rows [low, high) of an axis, four at a time, equal ones once; ``best`` as in :func:`walk`."""
     row, d2, e2 = best
     known = row
+    if high > low and rows[low, 0] == rows[high - 1, 0] and rows[low, 1] == rows[high - 1, 1]:
+        high = min(high, low + 2)  # rows between equal ones are equal; two give the distance and the bound
     whole = low + (high - low) // 4 * 4
     for i in range(low, whole, 4):
         least = np.inf
@@ -297,13 +299,14 @@ def search_group(
             row, d2, e2, n = search_axis(rows, start[s], start[s + 1], qx, qy, (row, d2, e2))
             visits += n
     else:
-        known = row
-        for i in range(start[first], start[last]):
+        known, at = row, float(row)
+        for i in range(np.uint64(start[first]), np.uint64(start[last])):
             dx, dy = rows[i, 0] - qx, rows[i, 1] - qy
             d = dx * dx + dy * dy if i != known else np.inf
             e2 = min(e2, max(d, d2))
-            row = i if d < d2 else row
+            at = float(i) if d < d2 else at
             d2 = min(d, d2)
+        row = int(at)
     return row, d2, e2, visits
 
 

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from estimator.distance_axis import build_axis, sector_count, turn_of
-from estimator.distance_region import nearest_all, nearest_slow, query_axis
+from estimator.distance_region import nearest, nearest_all, nearest_slow, query_axis, search
 from estimator.records import Array
 
 COARSE = st.integers(-6, 6).map(lambda n: n * 0.25)  # duplicates, ties and points on sector bounds are common
 POINTS = st.integers(0, 40).flatmap(lambda n: arrays(np.float64, (n, 2), elements=COARSE))
 CENTRES = arrays(np.float64, 2, elements=COARSE)
-SECTORS = st.sampled_from([0, 1, 16, 18, 21, 64])
+SECTORS = st.sampled_from([0, 1, 32, 34, 45, 64])
 
 
 def agree(points: Array, queries: Array, centre: Array, sectors: int, bound: float = np.inf) -> None:
@@ -55,6 +55,55 @@ def test_the_bound_for_all_other_rows_is_true(
         assert e2[i] >= d2[i] or row[i] < 0
 
 
+CLOUDS = st.tuples(st.integers(0, 2**32 - 1), st.integers(1, 300), st.sampled_from([0.01, 0.3, 3.0]))
+
+
+@given(CLOUDS, CENTRES, st.sampled_from([0, 1, 32, 100, 1000]), st.sampled_from([np.inf, 0.5]))
+@settings(max_examples=100, deadline=None)
+@pytest.mark.jit
+def test_exact_in_clouds_of_many_densities_from_any_first_guess(
+    cloud: tuple[int, int, float], centre: Array, sectors: int, bound: float
+) -> None:
+    """Points, dense or scattered, with some doubled; queries among them and far out; the guess may be any row."""
+    seed, n, spread = cloud
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, spread, (n, 2)) + rng.normal(0.0, 2.0, 2)
+    points[n // 2 :: 7] = points[0]
+    queries = np.vstack((points[::5] + rng.normal(0.0, 0.02, 2), rng.normal(0.0, 4.0, (10, 2)), points[:2], centre))
+    agree(points, queries, centre, sectors, bound)
+    axis = build_axis(points, centre, sectors)
+    for q in queries - centre:
+        guess = int(rng.integers(n))
+        d2 = float(((axis.rows[guess, :2] - q) ** 2).sum())
+        row, found2, others2, visits = search(axis.rows, axis.start, axis.rays, q[0], q[1], guess, d2)
+        distance2 = ((axis.rows[:, :2] - q) ** 2).sum(axis=1)
+        assert found2 == pytest.approx(distance2.min(), abs=1e-12)
+        assert distance2[row] == pytest.approx(found2, abs=1e-12)
+        assert np.delete(distance2, row).min(initial=np.inf) >= others2 - 1e-12
+        assert others2 >= found2
+        assert 0 <= visits <= n + 1
+
+
+@pytest.mark.parametrize("sectors", [0, 1, 32])
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 8])
+def test_few_points_and_the_edge_of_the_bound(n: int, sectors: int) -> None:
+    """A point exactly at the bound is not nearer than it."""
+    points = np.column_stack((np.arange(n) + 1.0, np.zeros(n)))
+    axis = build_axis(points, np.zeros(2), sectors)
+    row, d2, others2 = nearest(axis.rows, axis.start, axis.rays, 0.5, 0.0, 0.25)
+    assert (row, d2) == (-1, 0.25)
+    assert others2 >= 0.25
+    row, d2, others2 = nearest(axis.rows, axis.start, axis.rays, 0.5, 0.0, 0.2501)
+    assert d2 == (0.25 if n else 0.2501)
+    assert (row == -1) == (n == 0)
+    assert others2 >= d2
+
+
+def test_sectors_that_are_too_wide_are_refused() -> None:
+    with pytest.raises(ValueError, match="3 sectors are too wide"):
+        build_axis(np.ones((40, 2)), np.zeros(2), 3)
+
+
 def wall(n: int) -> Array:
     return np.column_stack((np.linspace(-5.0, 5.0, n), np.full(n, 1.0)))
 
@@ -73,7 +122,7 @@ def one_place(n: int) -> Array:
 
 
 @pytest.mark.parametrize("shape", [wall, circle, corridor, one_place])
-@pytest.mark.parametrize("sectors", [0, 1, 16, 256])
+@pytest.mark.parametrize("sectors", [0, 1, 32, 256])
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.17, -0.05), (3.0, 1.0), (40.0, -7.0)])
 def test_exact_on_walls_circles_and_corridors(
     shape: Callable[[int], Array], sectors: int, offset: tuple[float, float]

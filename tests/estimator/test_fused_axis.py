@@ -72,6 +72,19 @@ def test_the_order_of_the_iteration_before_changes_nothing() -> None:
         assert np.array_equal(one, other)
 
 
+def test_points_visited_are_those_whose_distance_differs_less_than_the_best() -> None:
+    """As the reverse triangle inequality has it, and the first that ends the walk is not compared."""
+    rng = np.random.default_rng(8)
+    reference, points = rng.normal(0.0, 3.0, (300, 2)), rng.normal(0.0, 3.0, (100, 2))
+    axis = build_axis(reference, np.zeros(2), 1)
+    row, distance, visits = pair_fused(axis, fuse(axis, points, np.zeros(3)))
+    gap = np.abs(axis.rows[:, 2] - np.hypot(*points.T)[:, None])
+    within = (gap < distance[:, None]).sum(axis=1)
+    assert (visits >= within).all()
+    assert (visits <= within + 2).all()
+    assert (row >= 0).all()
+
+
 def test_a_light_on_top_of_a_laser_point_is_not_its_partner() -> None:
     light = np.array(((1.0, 0.0),))
     axis = build_axis(np.array(((3.0, 0.0),)), np.zeros(2), 1, light)
@@ -83,6 +96,6 @@ def test_a_light_on_top_of_a_laser_point_is_not_its_partner() -> None:
 
 
 def test_an_axis_with_sectors_is_refused_by_name() -> None:
-    axis = build_axis(np.ones((100, 2)), np.zeros(2), 16)
-    with pytest.raises(ValueError, match="16 sectors"):
+    axis = build_axis(np.ones((100, 2)), np.zeros(2), 32)
+    with pytest.raises(ValueError, match="32 sectors"):
         fuse(axis, np.ones((3, 2)), np.zeros(3))

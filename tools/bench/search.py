@@ -153,7 +153,7 @@ def _paper_form() -> list[Figure]:
         figures += [
             Figure(f"fused axis, paper room, {name}: merging", whole, "us", command=COMMAND),
             Figure(f"fused axis, paper room, {name}: search", walk, "us", command=COMMAND),
-            Figure(f"fused axis, paper room, {name}: points visited per query", float(np.mean(seen)), "", "", None, COMMAND),
+            Figure(f"fused axis, paper room, {name}: points visited", float(np.mean(seen)), "", command=COMMAND),
         ]  # fmt: skip
     return figures
 
