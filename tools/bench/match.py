@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numba
 import numpy as np
 
-from estimator import distance_region, localmap, se2
+from estimator import localmap, se2
 from estimator.keyframe import keep
 from estimator.lines import lines_of
 from estimator.localmap import LocalMap
@@ -27,7 +26,7 @@ from estimator.scanpoints import oriented, points_of
 from tools.bench._bound import bound
 from tools.bench._intel import consecutive, front_end
 from tools.bench._peers import Match, peers
-from tools.bench._scenes import Scene, bearings, office, paper_room, round_room
+from tools.bench._scenes import Scene, bearings, office, paper_room
 from tools.figures import Figure, bounded
 
 COMMAND: Final = "python -m tools.bench match"
@@ -157,7 +156,7 @@ def run() -> list[Figure]:
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(cores)})
     try:
-        return [*_against_peers(), *_other_sizes(), *_intel(), *_growth(), *_search()]
+        return [*_against_peers(), *_other_sizes(), *_intel(), *_growth()]
     finally:
         os.sched_setaffinity(0, cores)
 
@@ -242,46 +241,3 @@ def _growth() -> list[Figure]:
     ms = [measure(ours(FAR), pairs(paper_room(), n, 270.0, FAR, 20)).ms for n in sizes]
     slope = float(np.polyfit(np.log(sizes), np.log(ms), 1)[0])
     return [bounded("time grows with the points to the power of", slope, "", "<= 1.2", COMMAND)]
-
-
-def _search() -> list[Figure]:
-    """The nearest-neighbour pass alone against brute force in compiled code."""
-    figures = []
-    cases = {
-        "17 cm / 4 deg": (paper_room(), FAR, ">= 8"), "converged": (paper_room(), (0.001, 0.01), ">= 25"),
-        "1 m / 20 deg": (paper_room(), (1.0, 20.0), ">= 1"), "circle, centred": (round_room(), (0.02, 1.0), ">= 1"),
-    }  # fmt: skip
-    for name, (scene, off, target) in cases.items():
-        ratios = [_ratio(pair) for pair in pairs(scene, 1081, 270.0, off, 12)]
-        figures.append(bounded(f"search pass, {name}: brute / ours", statistics.median(ratios), "x", target, COMMAND))
-    return figures
-
-
-def _ratio(pair: Pair) -> float:
-    axis = distance_region.build_axis(points(pair.reference), STILL[:2])
-    queries = np.ascontiguousarray(points(pair.new))
-    n = len(queries)
-    out = (np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n, np.int64))
-    mine = _best(lambda: distance_region.nearest_all(axis.rows, axis.start, axis.rays, queries, np.inf, out))
-    return _best(lambda: brute(axis.rows, queries, out[0])) / mine
-
-
-@numba.njit(fastmath=True)
-def brute(rows: Array, queries: Array, found: distance_region.Ints) -> None:
-    """Every pair compared, compiled: what a search has to beat."""
-    for i in range(len(queries)):
-        best, at = np.inf, -1
-        for j in range(len(rows)):
-            d2 = (rows[j, 0] - queries[i, 0]) ** 2 + (rows[j, 1] - queries[i, 1]) ** 2
-            if d2 < best:
-                best, at = d2, j
-        found[i] = at
-
-
-def _best(work: Callable[[], object]) -> float:
-    times = []
-    for _ in range(7):
-        begin = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begin)
-    return min(times)
