@@ -49,7 +49,7 @@ def sum_up_slow(points: Array, reference: Array, T: Array, P: Array, eye: Array)
     return A, b
 
 
-@pytest.mark.parametrize("sectors", [1, 7, 64])
+@pytest.mark.parametrize("sectors", [1, 32, 64])
 def test_sums_are_those_of_the_definitions(sectors: int) -> None:
     rng = np.random.default_rng(0)
     reference = rng.uniform(-4.0, 4.0, (60, 2))
