@@ -324,9 +324,11 @@ def search(
     sectors = len(start) - 1
     groups = (sectors + GROUP - 1) // GROUP
     home = sector_of(qx, qy, sectors) // GROUP
+    if sectors == 1:  # the paper's form, walked to where it ends
+        at = place_on_axis(rows, 0, len(rows), np.sqrt(r2))
+        row, d2, e2, down, up = walk(rows, 0, len(rows), at, qx, qy, (row, d2, np.inf, len(rows) + 1))
+        return row, d2, e2, up - down - 1
     row, d2, e2, visits = search_group(rows, start, home, qx, qy, (row, d2, np.inf))
-    if groups == 1:
-        return row, d2, e2, visits
     if d2 > r2:
         rq = np.sqrt(r2)
         for group in range(groups):
