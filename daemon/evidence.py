@@ -48,6 +48,7 @@ class Observer:
         self._unreachable = False
         self._t_shown = [t_mono] * 3
         self._guessed = [False] * 3
+        self._anew = 0
 
     def odometry_ok(self, t_mono: float) -> bool | None:
         """Whether odometry is arriving; None where none is configured."""
@@ -142,11 +143,15 @@ class Observer:
 
         Without odometry, along an axis that no match shows, the pose is only carried on by its last velocity. A
         keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
-        is the place in the surroundings, not in the map. An order or a loop closure ends that.
+        is the place in the surroundings, not in the map. The same is true, along every axis, of a map that was begun
+        anew because nothing fitted the old one. An order or a loop closure ends that, and light that agrees.
         """
         if ordered or result.loop is not None or (result.placed and result.gap is not None and result.gap <= SURPRISE):
             self._guessed = [False] * 3
             self._t_shown = [t_mono] * 3
+        if result.anew > self._anew:
+            self._guessed = [True] * 3
+        self._anew = result.anew
         for axis, known in enumerate(match.known):
             if (match.good and known) or self.odometry_ok(t_mono):
                 self._t_shown[axis] = t_mono

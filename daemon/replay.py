@@ -327,6 +327,6 @@ def timing(outcome: Outcome) -> dict[str, Any]:
         "cycle_us": {
             str(p): round(1e6 * cycles[min(len(cycles) - 1, int(len(cycles) * p / 100))]) for p in (50, 90, 99)
         },
-        "step_us_mean": round(1e6 * rerun.timing.steps / len(cycles)),
+        "step_us_mean": round(1e6 * sum(rerun.timing.steps) / len(cycles)),
         "cycle_us_mean": round(1e6 * sum(cycles) / len(cycles)),
     }

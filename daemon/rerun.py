@@ -86,7 +86,7 @@ class Timing:
     """Measured seconds; the only thing about a replay that is not repeatable."""
 
     cycles: array[float] = field(default_factory=lambda: array("d"))
-    steps: float = 0.0
+    steps: array[float] = field(default_factory=lambda: array("d"))
 
 
 class Rerun:
@@ -234,7 +234,7 @@ class Rerun:
             self.ledger.settle(pipeline.keyframe_poses(self._state))
         begun = time.perf_counter()
         result = pipeline.step(self._state, records, limits)
-        self.timing.steps += time.perf_counter() - begun
+        self.timing.steps.append(time.perf_counter() - begun)
         return result
 
     def _keep(self, record: CycleRecord) -> None:

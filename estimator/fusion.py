@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from estimator import absolute, motion, se2
+from estimator.alike import agreement, beams_each
 from estimator.linear3 import invert3
 from estimator.records import Array, Scan
 from estimator.result import MatchResult, Reason
@@ -12,6 +15,8 @@ from estimator.state import State
 
 LEAST_NOISE_M = 0.004
 LEARNING = 0.02
+HELD, HELD_YAW = 100.0, 830.0
+"""Information with which a match holds a direction, or the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
 CAUCHY = 0.807
 """What the robust weights of the matcher leave of a Gaussian's variance."""
 
@@ -23,22 +28,64 @@ def fuse(state: State, match: MatchResult) -> None:
     """
     moving = state.fused
     if match.ok:
-        state.failures = 0
+        state.failures, state.t_match = 0, moving.t_mono
         learn_noise(state, match)
         T_pred, P_pred = moving.T_odom_base, moving.P
         moving.T_odom_base = match.T_odom_base
-        inflated = motion.learn(moving, match.correction, bool(match.known_axes.all()))
-        moving.P = invert3(invert3(P_pred * inflated) + match.information)
+        inflated = motion.learn(moving, match.correction, match.information, bool(match.known_axes.all()))
+        moving.P = updated(P_pred * inflated, match.information, moving.odometry)
         absolute.on_match(state, T_pred, P_pred, inflated)
         if state.t_scan > -np.inf:
             made = se2.between(state.T_odom_scan, moving.T_odom_base)
             moving.gyro.learn(float(made[2]), moving.t_mono - state.t_scan)
             motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * np.diag(moving.P), state.settings.noise)
+            guess(state, match.information, moving.t_mono - state.t_scan)
     elif match.reason is not Reason.NO_MAP:
-        state.failures += 1
+        state.failures += match.reason is not Reason.TOO_FEW_POINTS  # who sees nothing contradicts nothing
         if not moving.odometry:
             moving.velocity = 0.8 * moving.velocity  # a velocity that nothing confirms is let die
     state.t_scan, state.T_odom_scan = moving.t_mono, moving.T_odom_base
+
+
+def updated(P: Array, H: Array, odometry: bool) -> Array:
+    """Covariance (3, 3) of a prediction ``P`` after a match with information ``H``.
+
+    A direction that the match does not hold gets no surer by it. In a corridor what it does hold is not the same to a
+    hair from scan to scan; a tenth of a degree between two of them, forty times a second, would add up to centimetres
+    along an axis of which none has seen anything. Without ``odometry`` there is nothing else either: see :func:`guess`.
+    """
+    after = invert3(invert3(P) + H)
+    loose = loose_direction(H) if odometry else None
+    if loose is not None:
+        lost = float(loose @ (P[:2, :2] - after[:2, :2]) @ loose)
+        after[:2, :2] += max(0.0, lost) * np.outer(loose, loose)
+    if odometry and H[2, 2] < HELD_YAW:
+        after[2, 2] = max(float(P[2, 2]), float(after[2, 2]))
+    return after
+
+
+def loose_direction(H: Array) -> Array | None:
+    """Unit vector (x, y) along which information ``H`` (3, 3) does not hold the place, None where it holds all."""
+    S = H[:2, :2] - np.outer(H[:2, 2], H[:2, 2]) / max(float(H[2, 2]), 1e-9)
+    half = 0.5 * math.atan2(2.0 * float(S[0, 1]), float(S[0, 0] - S[1, 1]))
+    loose = np.array((-math.sin(half), math.cos(half)))
+    return loose if float(loose @ S @ loose) < HELD else None
+
+
+def guess(state: State, H: Array, dt: float) -> None:
+    """Without wheels, along a direction that the match does not hold the pose is a guess, and the stated place says so.
+
+    The velocity carries the pose on, and no match contradicts it. What it may be wrong by adds up with the way: the map
+    that is laid meanwhile is out of place for good, so it is the covariance of the place in the map that grows: at
+    walking pace, from half a second on. A silence of the laser has grown the prediction's own covariance already.
+    """
+    loose = loose_direction(H)
+    if state.fused.odometry or loose is None:
+        state.guessed_s = 0.0
+        return
+    before, state.guessed_s = state.guessed_s, state.guessed_s + min(max(dt, 0.0), motion.LONGEST_CARRY_S)
+    t0, t1 = max(0.0, before - motion.LONGEST_CARRY_S), max(0.0, state.guessed_s - motion.LONGEST_CARRY_S)
+    state.P_anchor[:2, :2] += float(motion.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
 
 
 def noise_of(state: State, scan: Scan) -> float:
@@ -53,6 +100,19 @@ def learn_noise(state: State, match: MatchResult) -> None:
     if state.noise_m > 0.0:
         square = (1.0 - LEARNING) * state.noise_m**2 + LEARNING * square
     state.noise_m = float(np.sqrt(square))
+
+
+def alike_of(state: State) -> float:
+    """How many beams tell as much as one independent beam, by what residuals have shown."""
+    return beams_each(*state.kinship.tolist())
+
+
+def learn_alike(state: State, points: Array) -> None:
+    """Follow how neighbouring residuals agree, from a scan that has just been matched: ``points`` (n, 4)."""
+    if state.local is not None:
+        gate = 3.0 * max(state.noise_m, LEAST_NOISE_M)
+        found = agreement(points, state.local.axis, state.local.lines, state.fused.T_odom_base, gate)
+        state.kinship = (1.0 - LEARNING) * state.kinship + LEARNING * found[:2]
 
 
 def covariance(state: State) -> Array:

@@ -36,6 +36,10 @@ SAMPLES = 400
 HIT = int(Beam.HIT)
 UNSEEN: Beams = (np.empty(0), np.empty(0), np.empty(0, np.uint8))
 
+WAVY = 0.03
+"""Radians by which the direction of a surface is never known better: walls, skirtings and doors are not flat, by the
+same in every scan. A corridor must not be told along its axis by the unevenness of its walls."""
+
 ALIKE = 0.94
 """Least cosine between the normals of elements that are merged: 20 deg."""
 
@@ -212,7 +216,7 @@ def lines_along(elements: Array, label: Ints, lines: Array) -> None:
     """Normal, slope and weight of the elements in the order of the axis; the weight as the share of a scan's noise."""
     for i in range(len(label)):
         j = label[i]
-        lines[i, 0], lines[i, 1], lines[i, 2] = elements[j, NX], elements[j, NY], elements[j, SLOPE]
+        lines[i, 0], lines[i, 1], lines[i, 2] = elements[j, NX], elements[j, NY], elements[j, SLOPE] + WAVY * WAVY
         lines[i, 3] = elements[j, WEIGHT] / (elements[j, WEIGHT] + 1.0)
 
 

@@ -19,6 +19,12 @@ from estimator.state import State
 PATIENCE = 3
 """Scans in a row that may fail to match before the local map is begun anew from the present one."""
 
+PATIENCE_S = 1.0
+"""With wheels it goes on for at least so long: they bridge it, and who steps in front of the robot steps away again."""
+
+NEAR = 0.4
+"""Keyframes nearer together than this, in steps, are not laid: a robot that stands and trembles lays none."""
+
 NOTHING = 1e-9 * np.eye(3)
 
 
@@ -28,10 +34,36 @@ def keyframe_due(state: State, points: ScanPoints, match: MatchResult) -> bool:
     if len(points.xy) < settings.matching.min_points:
         return False
     if state.local is None or not match.ok:
-        return state.local is None or state.failures >= PATIENCE
-    x, y, yaw = se2.between(state.T_odom_anchor, state.fused.T_odom_base).tolist()
+        return lost(state)
     changed = match.inliers < settings.keyframe_share * match.queries and state.since_keyframe >= PATIENCE
-    return changed or math.hypot(x, y) > settings.keyframe_m or abs(yaw) > settings.keyframe_rad
+    paces = math.floor(state.way)
+    due = changed or (paces != state.paces and away(state) > NEAR)
+    state.paces = paces if due else state.paces
+    return due
+
+
+def lost(state: State) -> bool:
+    """Whether there is no local map, or none of the scans that have seen something has fitted it for long enough."""
+    if state.local is None:
+        return True
+    waited = state.fused.t_mono - state.t_match
+    return state.failures >= PATIENCE and (not state.fused.odometry or waited >= PATIENCE_S)
+
+
+def away(state: State) -> float:
+    """How far the robot is from its newest keyframe, in keyframes: the larger one of its way and its turn."""
+    x, y, yaw = se2.between(state.T_odom_anchor, state.fused.T_odom_base).tolist()
+    return float(max(math.hypot(x, y) / state.settings.keyframe_m, abs(yaw) / state.settings.keyframe_rad))
+
+
+def walk(state: State) -> None:
+    """Count the way since the last scan, by the prediction.
+
+    Keyframes are laid where this count passes a whole number, and not at a distance from the last one: so a hair's
+    breadth in one match does not choose other scans for all keyframes to come, and with them another map.
+    """
+    x, y, yaw = se2.between(state.T_odom_scan, state.fused.T_odom_base).tolist()
+    state.way += math.hypot(x, y) / state.settings.keyframe_m + abs(yaw) / state.settings.keyframe_rad
 
 
 def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
@@ -56,9 +88,8 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
 def lay_anchor(state: State) -> None:
     """Without a laser there is nothing to keep; every stretch of the way still hangs on a place that light has told."""
     tie, T = state.absolute, state.fused.T_odom_base
-    x, y, yaw = se2.between(state.T_odom_anchor, T).tolist()
     settings = state.settings
-    near = math.hypot(x, y) <= settings.keyframe_m and abs(yaw) <= settings.keyframe_rad
+    near = away(state) <= 1.0
     if tie is None or not tie.placed or not absolute.blind(state) or near:
         return
     if settings.history:
@@ -75,10 +106,12 @@ def turned_back(state: State, P_map: Array) -> Array:
 def update_map(state: State, scan: Scan, points: ScanPoints) -> None:
     """Merge the newest keyframe into the local map, or begin a new one where the old one is lost."""
     newest = state.keyframes[state.anchor]
-    lost = state.local is None or state.failures >= PATIENCE
-    if lost and state.absolute is not None:
-        state.absolute.broken = True
-    local = localmap.empty(newest.T_odom_keyframe[:2]) if lost or state.local is None else state.local
+    local = state.local
+    if local is None or lost(state):
+        state.anew += local is not None
+        local = localmap.empty(newest.T_odom_keyframe[:2])
+        if state.absolute is not None:
+            state.absolute.broken = True
     state.local = localmap.update(local, newest, lines_of(points), state.settings.map, noise_of(state, scan))
     state.failures = 0
     retire(state, newest)

@@ -90,12 +90,14 @@ class View:
     Attributes:
         points: (n, 4) place and tangent in the base frame at the scan's end. T_base_lidar: mount.
         beams: the scan they came from, for what it says of free space. noise_m: range noise to reckon with.
+        alike: how many beams tell as much as one of them would, were their errors independent (`estimator.alike`).
     """
 
     points: Array
     T_base_lidar: Array
     beams: Beams
     noise_m: float
+    alike: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,7 +184,7 @@ def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: Match
     H, sums, trace = np.zeros((3, 3)), np.zeros(icp.SUMS), np.empty((cap, icp.TRACE))
     axis, noise = local.axis, view.noise_m
     coarse = settings.coarse if len(view.points) > settings.dense else 1
-    tail = (cap, settings.gate_m, settings.scale * noise, noise, settings.settled, coarse)
+    tail = (cap, settings.gate_m, settings.scale * noise, noise * math.sqrt(view.alike), settings.settled, coarse)
     how = np.array((view.T_base_lidar[0], view.T_base_lidar[1], *tail))
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
     T = prior.T - centre

@@ -9,11 +9,11 @@ import numpy as np
 
 from estimator import absolute, closing, grid, matchers, matching, motion, se2
 from estimator.commands import obey
-from estimator.fusion import covariance, fuse, noise_of
+from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
 from estimator.keyframe import unhung, unturned
 from estimator.linear3 import invert3
-from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map
+from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
 from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
 from estimator.records import Answer, Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
@@ -43,9 +43,12 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
             close_loops(state, record)
         if isinstance(record, Scan):
             points = nothing_of(record) if why else virtual_frame(state, record)
+            walk(state)
             match = match_scan(state, record, points, limits, why)
             fuse(state, match)
             if limits.update_map and keyframe_due(state, points, match):
+                if match.ok:
+                    learn_alike(state, oriented(points, limits.points))
                 keyframe = lay_keyframe(state, record, points)
                 update_map(state, record, points)
     look_for_lamps(state, limits)
@@ -116,7 +119,7 @@ def match_scan(
         result = matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
     else:
         beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-        view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan))
+        view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan), alike_of(state))
         prior = Prior(T_pred, invert3(state.fused.P))
         asked = (view, state.local, prior, limits.icp_iterations, state.settings.matching)
         if state.settings.matcher is Matcher.LINE:
@@ -160,6 +163,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
         jobs=state.atlas.take_jobs(),
+        anew=state.anew,
     )
 
 

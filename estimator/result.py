@@ -181,6 +181,8 @@ class StepResult:
         lights: of the `lights` filter, None where there is no photodiode. placed: light has told where the map lies;
             before that the map frame is the start pose's. gap: squared Mahalanobis distance (3 degrees of freedom)
             between T_map_base and the lights' own at the latest epoch, None where that cannot be said.
+        anew: how often the local map has been begun anew because nothing fitted the old one: since then the place in
+            the map is a guess.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
@@ -199,4 +201,5 @@ class StepResult:
     lights: LightsResult | None = None
     placed: bool = False
     gap: float | None = None
+    anew: int = 0
     jobs: tuple[Job, ...] = ()

@@ -78,8 +78,12 @@ class State:
         anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, covariance of its place in the map.
         next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
-        t_scan, T_odom_scan: instant and pose of the latest scan.
+        kinship: sums over neighbouring residuals, product and squares, that fade (`estimator.alike`).
+        guessed_s: how long the pose has been carried on by a guess, along a direction that nothing held.
+        way: metres driven, and turned as keyframes count turns, by the prediction; paces: of them, in keyframes.
+        t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
         t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
+        anew: how often the local map was begun anew because nothing fitted the old one.
         journal: is told of every match before it is fused, None: nobody asks.
     """
 
@@ -101,9 +105,15 @@ class State:
     next_key: int = 1
     since_keyframe: int = 0
     failures: int = 0
+    anew: int = 0
     jumps: int = 0
     noise_m: float = 0.0
+    kinship: Array = field(default_factory=lambda: np.zeros(2))
+    guessed_s: float = 0.0
+    way: float = 0.0
+    paces: int = 0
     t_scan: float = -math.inf
+    t_match: float = -math.inf
     T_odom_scan: Array = field(default_factory=se2.identity)
     t_newest_scan: float = -math.inf
     bearing_rad: Array | None = None

@@ -143,6 +143,22 @@ def test_a_loop_closure_tells_the_place() -> None:
     assert not watch.see(replace(step(match()), loop=Loop(1, 9, 2, 0.01))).guessed
 
 
+def test_a_map_begun_anew_is_a_guess_whatever_fits_it() -> None:
+    """Nothing fitted, so a new map was begun: with wheels or without, only something else can say where it lies."""
+    watch = Watch(odometry=True)
+    assert not watch.see(step(match())).guessed
+    begun = watch.see(replace(step(match()), anew=1))
+    assert begun.guessed
+    assert begun.match is not None
+    assert begun.match.known == (False, False, False)
+    later = watch.see(replace(step(match()), anew=1))
+    assert later.guessed
+    ordered = watch.see(replace(step(match()), anew=1), Command(0.0, Order.SET_POSE, np.zeros(3)))
+    assert not ordered.guessed
+    assert not watch.see(replace(step(match()), anew=1)).guessed
+    assert watch.see(replace(step(match()), anew=2)).guessed, "and begun once more"
+
+
 def test_no_keyframe_no_guess() -> None:
     """A robot that stands in a corridor, or loses its lidar for a while, finds the map as it was."""
     watch = Watch()

@@ -28,6 +28,9 @@ def test_intel_against_relations_found_by_hand(outcome_of: Replayed, log_root: P
     closed = evaluate(ledger.final().stamps, ledger.final().poses, relations)
     assert closed.translation_m.mean() <= 0.026
     assert closed.rotation_deg.mean() <= 0.60
+    alone = evaluate(ledger.final().stamps, ledger.odom(), relations).within(30.0)  # without loops: the front end
+    assert alone.translation_m.mean() <= 0.0165
+    assert alone.rotation_deg.mean() <= 0.385
 
 
 def test_the_metric_gives_the_published_figure_for_raw_odometry(log_root: Path) -> None:
