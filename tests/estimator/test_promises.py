@@ -65,7 +65,7 @@ def test_a_gap_that_nothing_witnessed_leaves_a_wide_uncertainty(silence: float) 
     later = step(state, [corridor(PERIOD * 10 + silence, 10)], UNLIMITED)
     along, across = np.sqrt(np.diag(later.covariance))[:2]
     assert along > 0.3 * (silence - 1.0), "a robot may have driven on at walking pace"
-    assert across < 0.05, "the walls say where it is across"
+    assert across < max(0.05, 2e-3 * along), "the walls say where it is across, a tenth of a degree left open"
     assert np.isfinite(later.T_odom_base).all()
 
 
