@@ -17,6 +17,8 @@ LEAST_NOISE_M = 0.004
 LEARNING = 0.02
 HELD, HELD_YAW = 100.0, 830.0
 """Information with which a match holds a direction, or the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
+BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE)
+"""Outcomes of a scan that has shown nothing: they do not speak against the map."""
 CAUCHY = 0.807
 """What the robust weights of the matcher leave of a Gaussian's variance."""
 
@@ -41,7 +43,7 @@ def fuse(state: State, match: MatchResult) -> None:
             motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * np.diag(moving.P), state.settings.noise)
             guess(state, match.information, moving.t_mono - state.t_scan)
     elif match.reason is not Reason.NO_MAP:
-        state.failures += match.reason is not Reason.TOO_FEW_POINTS  # who sees nothing contradicts nothing
+        state.failures += match.reason not in BLIND  # who sees nothing contradicts nothing
         if not moving.odometry:
             moving.velocity = 0.8 * moving.velocity  # a velocity that nothing confirms is let die
     state.t_scan, state.T_odom_scan = moving.t_mono, moving.T_odom_base
