@@ -32,8 +32,8 @@ GYRO_GATE = 5.0
 """Deviations beyond which a gyro is not believed: wrong units, or damaged. No robot gains speed like that."""
 
 DOUBT_LEARNING, SURPRISE_CAP, DOUBT_CAP = 0.03, 10.0, 100.0
-DOUBT_LEAST = 0.25
-"""Wheels that have been good for long may slip at any moment: never believed more than twice as much as stated."""
+DOUBT_LEAST = 1.0
+"""Wheels that have been good for long may slip at any moment: they are never believed more than is stated."""
 LEAST_EXPECTED = 0.3
 """A match that should correct the prediction by less than a tenth of what it could says little about it."""
 
@@ -224,8 +224,8 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
 def learn(motion: Motion, correction: Array, H: Array, known: bool) -> float:
     """Learn from a match how far the prediction can be trusted; returns the factor by which this one's was too sure.
 
-    Noise figures are cautious ones. ``doubt`` scales the noise of the predictions to come by what matches show: more
-    where wheels slip or stamps jitter, less where they are good. Of a prediction's own variance, a match with the
+    Noise figures are those of a good robot. Where wheels slip or stamps jitter, matches keep correcting the prediction
+    by more than its deviation says, and ``doubt`` scales the noise of the predictions to come. Of a prediction's own variance, a match with the
     information ``H`` (3, 3) corrects the part ``(L + H)^-1 H``; the square that it should have is that much.
     """
     L = invert3(motion.P)
