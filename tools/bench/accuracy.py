@@ -87,7 +87,7 @@ def consistency(room: str, scene: Scene) -> list[Figure]:
                 title = f"{room}, {beams} beams, sigma {100 * sigma:.0f} cm, map of {scans}: errors inside 95 %"
                 share, slack = found.inside, 2.0 * np.sqrt(0.05 * 0.95 / len(found.results))
                 text = f"within 0.03 of 0.95 (+-{slack:.3f} by chance)"
-                figures.append(Figure(title, share, "", text, abs(share - 0.95) <= 0.03 + slack, COMMAND))
+                figures.append(Figure(title, share, "", text, bool(abs(share - 0.95) <= 0.03 + slack), COMMAND))
     return figures
 
 
