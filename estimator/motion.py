@@ -225,8 +225,9 @@ def learn(motion: Motion, correction: Array, H: Array, known: bool) -> float:
     """Learn from a match how far the prediction can be trusted; returns the factor by which this one's was too sure.
 
     Noise figures are those of a good robot. Where wheels slip or stamps jitter, matches keep correcting the prediction
-    by more than its deviation says, and ``doubt`` scales the noise of the predictions to come. Of a prediction's own variance, a match with the
-    information ``H`` (3, 3) corrects the part ``(L + H)^-1 H``; the square that it should have is that much.
+    by more than its deviation says, and ``doubt`` scales the noise of the predictions to come. Of a prediction's own
+    variance, a match with the information ``H`` (3, 3) corrects the part ``(L + H)^-1 H``; the square that it should
+    have is that much.
     """
     L = invert3(motion.P)
     square = float(correction @ L @ correction)

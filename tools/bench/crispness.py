@@ -7,8 +7,9 @@ out, and a trajectory gains nothing from points that it spoils. The mean over al
 is better.
 
 Ours is T_odom_base as it was published: no loop closure, no hindsight. The peer matches every scan with the one before
-by point-to-line ICP on scipy's cKDTree, in full (`_peers.kdtree`), from the wheels' motion where there are wheels, else
-from its own last motion. Both take each beam at its own instant.
+by point-to-line ICP on scipy's cKDTree, in full (`_peers.kdtree`, normals from few and from many neighbours: the better
+one of each log counts), from the wheels' motion where there are wheels, else from its own last motion. Both take each
+beam at its own instant.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from estimator.scanpoints import points_of
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 from tools import convert
-from tools.bench._peers import kdtree
+from tools.bench._peers import MANY, NEIGHBOURS, Match, kdtree
 from tools.figures import Figure, bounded
 
 COMMAND: Final = "LUMILOOP_DATA=... python -m tools.bench crispness"
@@ -83,7 +84,7 @@ def run() -> list[Figure]:
     for name, source in LOGS.items():
         drive = load(Path(data) / source)
         ours = crispness(drive, drive.ours)
-        theirs = crispness(drive, scan_to_scan(drive))
+        theirs = best_peer(drive)
         text = f"{name}: mean nearest distance, "
         figures += [
             bounded(f"{text}ours", 1e3 * ours, "mm", f"<= {1e3 * theirs:.2f}", COMMAND),
@@ -124,8 +125,13 @@ def wheels_at(readings: Array, t: Array) -> Array:
     return np.column_stack([np.interp(t, readings[:, 0], row) for row in (readings[:, 1], readings[:, 2], yaw)])
 
 
-def scan_to_scan(drive: Drive) -> Array:
-    """Poses (n, 3) of the peer."""
+def best_peer(drive: Drive) -> float:
+    """Crispness of the peer, at the better of its two settings."""
+    return min(crispness(drive, scan_to_scan(drive, kdtree(count))) for count in (NEIGHBOURS, MANY))
+
+
+def scan_to_scan(drive: Drive, match: Match) -> Array:
+    """Poses (n, 3) of a peer."""
     poses, move = np.zeros((len(drive.scans), 3)), se2.identity()
     before = drive.cloud(0, move, drive.scans[0])
     for k in range(1, len(drive.scans)):
@@ -133,7 +139,7 @@ def scan_to_scan(drive: Drive) -> Array:
             move = se2.between(drive.wheels[k - 1], drive.wheels[k])
         points = drive.cloud(k, move, drive.scans[k])
         if min(len(points), len(before)) >= ENOUGH:
-            move = kdtree(before, points, move)
+            move = match(before, points, move)
         poses[k] = se2.compose(poses[k - 1], move)
         before = points
     return poses
