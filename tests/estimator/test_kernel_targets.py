@@ -55,10 +55,12 @@ def made_by(way: str) -> dict[str, Any]:
 def test_an_index_that_is_out_of_bounds_is_noticed() -> None:
     """The check is not only asked for, it is there, and in the usual way it is not."""
     code = (
-        "import numpy as np\nfrom estimator.lines import line_through\n"
-        "try:\n    line_through(np.zeros((3, 2)), 0, 0, 4)\nexcept IndexError:\n    print('noticed')"
+        "import numpy as np\nfrom tests.estimator.one_kernel import element\n"
+        "try:\n    element(np.zeros(3), 3)\nexcept IndexError:\n    print('noticed')"
     )
-    said = {way: child(way, "-c", code).stdout for way in WAYS}
+    done = {way: child(way, "-c", code) for way in WAYS}
+    assert [one.returncode for one in done.values()] == [0, 0, 0], [one.stderr[-500:] for one in done.values()]
+    said = {way: one.stdout for way, one in done.items()}
     assert said == {"as usual": "", "indices checked": "noticed\n", "generic processor": ""}
 
 

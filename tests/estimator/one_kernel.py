@@ -1,0 +1,12 @@
+"""A kernel that looks at one element, wherever it is told to: for the test of the index check."""
+
+from __future__ import annotations
+
+from estimator.kernel import kernel
+from estimator.records import Array
+
+
+@kernel("f8(f8[::1], i8)")
+def element(values: Array, i: int) -> float:
+    """One value of an array."""
+    return float(values[i])
