@@ -11,6 +11,7 @@ from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
 from estimator.keyframe import Keyframe, Submap
 from estimator.lines import lines_of
+from estimator.matchers import Matcher
 from estimator.records import Array, Scan
 from estimator.result import MatchResult
 from estimator.scanpoints import ScanPoints
@@ -36,6 +37,8 @@ def keyframe_due(state: State, points: ScanPoints, match: MatchResult) -> bool:
     if state.local is None or not match.ok:
         return lost(state)
     changed = match.inliers < settings.keyframe_share * match.queries and state.since_keyframe >= PATIENCE
+    if settings.matcher is not Matcher.LINE:  # the newest keyframe is all their map, and its error is kept for good
+        return changed or away(state) > 1.0
     paces = math.floor(state.way)
     due = changed or (paces != state.paces and away(state) > NEAR)
     state.paces = paces if due else state.paces
