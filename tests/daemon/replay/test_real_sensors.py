@@ -199,6 +199,12 @@ def over_pty(rover: convert.Scans, tmp_path_factory: pytest.TempPathFactory) -> 
     return through_pty(rover, URG_04LX_UG01, ROVER, tmp_path_factory.mktemp("pty") / "lidar")
 
 
+@pytest.fixture(scope="module")
+def of_log(rover: convert.Scans, tmp_path_factory: pytest.TempPathFactory) -> list[Array]:
+    """The replay that the recording over the pty is held against."""
+    return from_log(tmp_path_factory.mktemp("log") / "a.log", rover, ROVER)
+
+
 @pytest.mark.realtime
 @pytest.mark.slow
 def test_urg_over_a_real_pty_bit_by_bit_and_to_the_millisecond(rover: convert.Scans, over_pty: Played) -> None:
@@ -210,15 +216,24 @@ def test_urg_over_a_real_pty_bit_by_bit_and_to_the_millisecond(rover: convert.Sc
 
 @pytest.mark.realtime
 @pytest.mark.slow
-def test_urg_over_a_real_pty_gives_the_motions_of_the_log(
-    rover: convert.Scans, over_pty: Played, tmp_path: Path
-) -> None:
+@pytest.mark.xfail(
+    reason="scan matching turns a micrometre of odometry noise into decimetres on this log", strict=False
+)
+def test_urg_over_a_real_pty_gives_the_trajectory_of_the_log(over_pty: Played, of_log: list[Array]) -> None:
+    off_m, off_rad = largest_difference(over_pty, of_log)
+    assert off_m < 0.02
+    assert off_rad < 0.02
+
+
+@pytest.mark.realtime
+@pytest.mark.slow
+def test_urg_over_a_real_pty_gives_the_motions_of_the_log(over_pty: Played, of_log: list[Array]) -> None:
     """Scan for scan the motion of the replay; over the whole drive what such a sensor's drift leaves open.
 
     Half a millisecond of jitter is a third of a millimetre of motion. Of a sensor of 4 m and 1 cm, 46 m without closed
     loops, even a micrometre makes another map of the same quality: ends lie decimetres apart.
     """
-    log = np.array(from_log(tmp_path / "a.log", rover, ROVER))
+    log = np.array(of_log)
     live = np.array([over_pty.poses[scan.seq] for scan in over_pty.scans])
     assert len(live) == len(log)
     off = np.array([se2.between(*pair)[:2] for pair in zip(moves(live), moves(log), strict=True)])
