@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import socket
+from collections.abc import Callable
 from typing import Annotated
 
 import msgspec
@@ -51,6 +52,16 @@ def _is_address(text: str) -> bool:
             continue
         return True
     return False
+
+
+def _check_network(key: str, name: str, parse: Callable[[str], object]) -> None:
+    """Raise ValueError for a ``tcp://`` name that cannot be opened; a port may be left out, each kind has its own."""
+    from hal.errors import DeviceRefused
+
+    try:
+        parse(name)
+    except DeviceRefused:
+        raise ValueError(f"Expected tcp://host or tcp://host:port in `{key}`, got `{name}`") from None
 
 
 class Mount(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -98,6 +109,10 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
             raise ValueError(
                 f"Expected `auto`, `none`, a path such as /dev/ttyACM0 or tcp://host:port, got `{self.device}`"
             )
+        if self.device.startswith("tcp://"):
+            from hal.tcp_port import parse_tcp_name
+
+            _check_network("device", self.device, parse_tcp_name)
         if self.baud not in BAUDS:
             raise ValueError(f"Expected one of {', '.join(map(str, BAUDS))} in `baud`, got {self.baud}")
 
@@ -145,6 +160,10 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
             raise ValueError(
                 f"Expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port in `bus`, got `{self.bus}`"
             )
+        if self.bus.startswith("tcp://"):
+            from hal.i2c_remote import parse_address
+
+            _check_network("bus", self.bus, parse_address)
         try:
             name, address, channel = parse_chip(self.converter)
             chip = chip_named(name)

@@ -77,6 +77,9 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
             "[photodiode]\nbus = 'i2c-1'",
             "robot.toml:2: Expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port",
         ),
+        ("[lidar]\ndevice = 'tcp://robot:lidar'", "robot.toml:2: Expected tcp://host or tcp://host:port in `device`"),
+        ("[lidar]\ndevice = 'tcp://:10940'", "robot.toml:2: Expected tcp://host or tcp://host:port in `device`"),
+        ("[photodiode]\nbus = 'tcp://robot:70000'", "robot.toml:2: Expected tcp://host or tcp://host:port in `bus`"),
         (
             "[photodiode]\nconverter = 'mcp3221'",
             "robot.toml:2: Expected chip@address, as in mcp3221@0x4d, got `mcp3221`",
@@ -186,7 +189,7 @@ configs = st.builds(
     bind=st.sampled_from(["127.0.0.1", "0.0.0.0", "::1"]),
     lidar=st.builds(
         LidarConfig,
-        device=st.just("auto") | st.from_regex(r"(tcp://|/)[ -~]+", fullmatch=True),
+        device=st.just("auto") | st.from_regex(r"tcp://[a-z]{1,9}(:[1-9][0-9]{3})?|/[ -~]+", fullmatch=True),
         mount=st.builds(Mount, x=st.floats(-100, 100), y=st.floats(-100, 100), yaw=bearings, inverted=st.booleans()),
         mask=st.builds(
             Mask,
