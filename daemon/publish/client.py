@@ -18,7 +18,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from daemon.publish import lights, registers
-from daemon.publish.points import Value
+from daemon.publish.points import U16, Value
 from daemon.publish.snapshot import LightFix, LinkUse, State
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ _REQUEST: Final = struct.Struct(">HHHBBHH")
 _ANSWER: Final = struct.Struct(">HHHBBB")
 _READ_INPUT: Final = 4
 _ANY_HOST: Final = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
+_TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
 _CLEAR: Final = "\x1b[H\x1b[2J"
 
 Reading = dict[str, Value]
@@ -220,7 +221,7 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
         ("odom pose", _pose(reading, "odom")),
         ("speed", _triple(reading, ("v_x", "v_y", "yaw_rate"), "m/s", "/s")),
-        ("age", _number(reading["age"], "s")),
+        ("age", _bounded(reading["age"], "s")),
         ("map", f"id {reading['map_id']}, {reading['jumps']} jumps"),
         ("loops", _loops(reading)),
         *_lights(reading),
@@ -259,6 +260,14 @@ def _number(value: Value, unit: str, digits: int = 4) -> str:
     return "not known" if value is None else f"{value:.{digits}f} {unit}"
 
 
+def _bounded(value: Value, unit: str) -> str:
+    """An age, a sigma or a speed; a register at its largest value says that much or more.
+
+    Speeds have a coarser step and never read as just that.
+    """
+    return f"> {math.floor(10.0 * _TOP) / 10.0} {unit}" if value is not None and value >= _TOP else _number(value, unit)
+
+
 def _angle(value: Value) -> str:
     return "not known" if value is None else f"{math.degrees(value):.2f} deg"
 
@@ -267,7 +276,7 @@ def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) 
     x, y, yaw = (reading[name] for name in names)
     if x is None and y is None and yaw is None:
         return "not known"
-    return f"{_number(x, unit)}, {_number(y, unit)}, {_angle(yaw)}{per}"
+    return f"{_bounded(x, unit)}, {_bounded(y, unit)}, {_angle(yaw)}{per}"
 
 
 def _lights(reading: Reading) -> list[tuple[str, str]]:
@@ -280,7 +289,7 @@ def _lights(reading: Reading) -> list[tuple[str, str]]:
         return rows
     names = ("light_sigma_x", "light_sigma_y", "light_sigma_yaw")
     rows.append(
-        ("light fix", f"{_fix(reading)}, {reading['light_used']} used, age {_number(reading['light_age'], 's')}")
+        ("light fix", f"{_fix(reading)}, {reading['light_used']} used, age {_bounded(reading['light_age'], 's')}")
     )
     rows.append(("light pose", _pose(reading, "light")))
     rows.append(("", f"sigma {_triple(reading, names, 'm', '')}"))

@@ -291,6 +291,13 @@ def test_a_time_that_is_none_is_not_made_up() -> None:
     assert client.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
 
 
+def test_an_age_or_a_sigma_at_the_end_of_its_register_may_be_any_larger() -> None:
+    old = snapshot(reason=0, fault=0, t_sent=1300.0, covariance=(100.0, 0.0, 1e-4, 0.0, 0.0, 1e-4))
+    shown = client.as_table(registers.decode_block(registers.encode_block(old)), stalled=False)
+    assert "age        > 6.5 s\n" in shown
+    assert "sigma      > 6.5 m, 0.0100 m, 0.57 deg\n" in shown
+
+
 def test_a_state_of_a_newer_daemon_is_shown_by_number() -> None:
     reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0))) | {"state": 99}
     assert "unknown to this reader (99)" in client.as_table(reading, stalled=False)
