@@ -2,6 +2,7 @@
 
     python read_modbus.py [HOST [PORT [tcp]]]
 
+The lamps in view stand in a block of their own, see read_lights.py.
 Written from docs/modbus.md alone: it shares no code with the daemon, so it can be copied into any program.
 """
 

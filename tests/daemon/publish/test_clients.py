@@ -11,14 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish import registers
+from daemon.publish import lights, registers
+from daemon.publish.snapshot import LightFix, LinkUse
 from hal.clock import SystemClock
 from hal.imu import RawImu
 from hal.inputs import InputPort
 from hal.odometry import RawOdometry
 from tests.daemon.publish.network import publishing
+from tests.daemon.publish.test_lights import picture
 from tests.daemon.publish.test_registers import snapshot
-from tools.clients import read_modbus, send_odometry
+from tools.clients import read_lights, read_modbus, send_odometry
 
 CLIENTS = Path(read_modbus.__file__).parent
 
@@ -56,6 +58,47 @@ def test_modbus_reader_without_a_pose() -> None:
         read_modbus.decode(bytes(9) + block[:-1] + b"\x00")
     with pytest.raises(ValueError, match="exception 2"):
         read_modbus.decode(b"\x00\x01\x00\x00\x00\x03\x01\x84\x02")
+
+
+def test_lights_reader() -> None:
+    def read(port: int) -> dict[str, object]:
+        reader = read_lights.Reader("127.0.0.1", port)
+        try:
+            return reader.read()
+        finally:
+            reader.close()
+
+    async def run() -> tuple[dict[str, object], dict[str, object]]:
+        async with publishing() as publisher:
+            dark = await asyncio.to_thread(read, publisher.port)
+            publisher.publish(snapshot(light=picture(), links=3))
+            return dark, await asyncio.to_thread(read, publisher.port)
+
+    dark, reading = asyncio.run(run())
+    assert dark["fix"] is None
+    assert dark["links"] == []
+    told = lights.decode_lights(lights.encode_lights(snapshot(light=picture(), links=3)))
+    for name in ("x", "y", "yaw", "sigma_x", "sigma_y", "sigma_yaw", "used"):
+        assert reading[name] == told[f"light_{name}"]
+    assert reading["fix"] == "GOOD"
+    assert reading["links"] == [
+        {"code": 17, "lamp": 1017, "use": "ACCEPTED", "strength": 1.25e-6, "residual": -0.031},
+        {"code": 60, "lamp": None, "use": "TWIN", "strength": 0.5e-6, "residual": None},
+        {"code": 101, "lamp": 65_000, "use": "OCCLUDED", "strength": 3.1e-9, "residual": -3.2767},
+    ]
+
+
+def test_lights_reader_refuses_what_is_no_block_of_lights() -> None:
+    block = lights.encode_lights(snapshot(light=picture()))
+    with pytest.raises(ValueError, match="torn"):
+        read_lights.decode(bytes(9) + block[:-1] + bytes([block[-1] ^ 1]))
+    with pytest.raises(ValueError, match="exception 2"):
+        read_lights.decode(b"\x00\x01\x00\x00\x00\x03\x01\x84\x02")
+
+
+def test_the_lights_reader_knows_every_name_of_the_document() -> None:
+    assert tuple(fix.name for fix in LightFix) == read_lights.FIXES
+    assert tuple(use.name for use in LinkUse) == read_lights.USES
 
 
 def test_odometry_sender() -> None:
