@@ -30,6 +30,9 @@ CELL_M, KEPT = 3.0, 2
 MANY: Final = 3
 """Loops kept between the same two submaps."""
 
+LOST: Final = 100
+"""Keyframes after which a job that has not answered never will: one that failed does not."""
+
 LOOK, SOLVE, SETTLE = 3, 2, 1
 """Priorities of the jobs, lowest first."""
 
@@ -51,9 +54,15 @@ class Constraints:
     loop: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
 
     def add(self, a: int, b: int, T_a_b: Array, P: Array, is_loop: bool) -> None:
-        """Join two submaps; ``P`` is the covariance of T_a_b in b's axes. Of many loops of a pair the latest stay."""
-        same = np.flatnonzero(self.loop & (self.between == (a, b)).all(axis=1)) if is_loop else np.empty(0, np.int64)
-        if len(same) >= MANY:
+        """Join two submaps; ``P`` is the covariance of T_a_b in b's axes.
+
+        Of many loops of a pair the latest stay, and of many ways the surest one: what is kept is bounded by the submaps
+        that are, however often others are taken out between them.
+        """
+        same = np.flatnonzero((self.loop == is_loop) & (np.sort(self.between, axis=1) == sorted((a, b))).all(axis=1))
+        if len(same) >= (MANY if is_loop else 1):
+            if not is_loop and np.trace(self.seen_from(a, int(same[0]))[2]) <= np.trace(P):
+                return
             self.keep(np.arange(len(self.loop)) != same[0])
         H = invert3(P)
         self.between = np.vstack((self.between, (a, b)))
@@ -118,9 +127,10 @@ class Atlas:
         submaps: by key, oldest first. frames: keyframes of the newest one. constraints: between them.
         C: covariance (odom axes) of the newest keyframe's place relative to the newest submap's, T_odom_last its place.
         marginal: covariance (odom axes) of the newest submap's place in the map.
-        way_m: driven between keyframes. since_look: keyframes laid since the last look.
-        waiting: loops without support. jobs: to be handed out. asked: what to do with each answer, by job ID.
-        busy: whether a look or a solution is under way. stale: whether the graph has changed since it was solved.
+        way_m: driven between keyframes. laid: how many keyframes; since_look: since the last look.
+        waiting: loops without support. jobs: to be handed out. asked: when, in keyframes laid, and what to do with the
+            answer, by job ID. look, solution: IDs of the latest jobs of these kinds.
+        stale: whether the graph has changed since it was solved.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
@@ -131,13 +141,14 @@ class Atlas:
     T_odom_last: Array = field(default_factory=se2.identity)
     marginal: Array = field(default_factory=lambda: np.zeros((3, 3)))
     way_m: float = 0.0
+    laid: int = 0
     since_look: int = 0
     waiting: list[Waiting] = field(default_factory=list)
     jobs: list[Job] = field(default_factory=list)
-    asked: dict[int, Apply] = field(default_factory=dict)
+    asked: dict[int, tuple[int, Apply]] = field(default_factory=dict)
     next_job: int = 1
-    looking: bool = False
-    solving: bool = False
+    look: int = 0
+    solution: int = 0
     stale: bool = False
     closures: int = 0
     news: Loop | None = None
@@ -147,11 +158,29 @@ class Atlas:
         """The submap being driven through."""
         return next(reversed(self.submaps.values()), None)
 
-    def ask(self, priority: int, run: Callable[[], object], then: Apply) -> None:
-        """Hand out a job."""
-        self.jobs.append(Job(self.next_job, priority, run))
-        self.asked[self.next_job] = then
+    @property
+    def looking(self) -> bool:
+        """Whether a look is under way."""
+        return self.look in self.asked
+
+    @property
+    def solving(self) -> bool:
+        """Whether a solution of the graph is under way."""
+        return self.solution in self.asked
+
+    def ask(self, priority: int, run: Callable[[], object], then: Apply) -> int:
+        """Hand out a job; its ID."""
+        job_id = self.next_job
+        self.jobs.append(Job(job_id, priority, run))
+        self.asked[job_id] = self.laid, then
         self.next_job += 1
+        return job_id
+
+    def give_up(self) -> None:
+        """Wait no longer for jobs that must have failed; the graph is then still to be solved."""
+        for job_id in [job_id for job_id, (laid, _) in self.asked.items() if self.laid - laid > LOST]:
+            del self.asked[job_id]
+            self.stale |= job_id == self.solution
 
     def take_jobs(self) -> tuple[Job, ...]:
         """The jobs to be handed out now."""
@@ -170,7 +199,7 @@ class Atlas:
 
     def answer(self, answer: Answer) -> None:
         """Take an answer in; one that nobody waits for any more is dropped."""
-        then = self.asked.pop(answer.job_id, None)
+        _, then = self.asked.pop(answer.job_id, (0, None))
         if then is not None:
             then(answer.payload)
 
@@ -186,7 +215,9 @@ class Atlas:
             self._begin(frame, newest, sigma)
         frame.submap = next(reversed(self.submaps.values()))
         self.frames.append(frame)
+        self.laid += 1
         self.since_look += 1
+        self.give_up()
         if frame.virtual is not None:
             T_keyframe_submap = se2.between(T, frame.submap.T_odom_submap)
             P_map = se2.carry(frame.virtual.T_map_base, T_keyframe_submap, frame.virtual.covariance)
@@ -236,7 +267,7 @@ class Atlas:
         key, T, P = min(joined, key=lambda one: float(np.trace(one[2])))
         hub, A = self.submaps[key], se2.adjoint(T)
         self.constraints.reroute(submap.key, key, se2.inverse(T), A @ P @ A.T)
-        submap.into = hub, se2.between(hub.T_map_submap, submap.T_map_submap)
+        submap.hang_on(hub, se2.between(hub.T_map_submap, submap.T_map_submap))
         submap.settled = None
         del self.submaps[submap.key]
 

@@ -55,15 +55,14 @@ def look_back(state: State, told: LoopSettings, frame: Keyframe) -> None:
     asked = candidates(state, told, frame)
     if not asked:
         return
-    atlas.looking, atlas.since_look = True, 0
+    atlas.since_look = 0
 
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
-        atlas.looking = False
         for found in payload:
             found_again(atlas, told, frame, found)
 
-    atlas.ask(LOOK, lambda: look(frame, asked, told), then)
+    atlas.look = atlas.ask(LOOK, lambda: look(frame, asked, told), then)
 
 
 def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
@@ -137,17 +136,16 @@ def solve_graph(state: State, atlas: Atlas) -> None:
     """Hand out the graph, if it has changed and is not being solved."""
     if atlas.solving or not atlas.stale:
         return
-    atlas.solving, atlas.stale = True, False
+    atlas.stale = False
     submaps = tuple(atlas.submaps.values())
     graph = graph_of(state, atlas, submaps)
 
     def then(payload: object) -> None:
         assert isinstance(payload, Solution)
-        atlas.solving = False
         correct(state, atlas, submaps, graph.poses, payload)
 
     last = len(submaps) - 1
-    atlas.ask(SOLVE, lambda: optimise(graph, MOST, SETTLED, PHI, covariance_of=last), then)
+    atlas.solution = atlas.ask(SOLVE, lambda: optimise(graph, MOST, SETTLED, PHI, covariance_of=last), then)
 
 
 def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,7 @@ class Virtual:
     accepted: frozenset[int]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, weakref_slot=True)
 class Submap:
     """A stretch of the way, which corrections of the map move as one piece.
 
@@ -44,6 +45,7 @@ class Submap:
         way_m: driven until there. settled: what it consists of, once it is finished.
         light: its place by what light alone said at its surest keyframe, with the covariance; None without.
         into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
+        hung: those that lie in this one and that something still hangs on.
     """
 
     key: int
@@ -54,6 +56,18 @@ class Submap:
     settled: Settled | None = None
     light: tuple[Array, Array] | None = None
     into: tuple[Submap, Array] | None = None
+    hung: WeakSet[Submap] = field(default_factory=WeakSet)
+
+    def hang_on(self, hub: Submap, T_hub_submap: Array) -> None:
+        """Give up its place in the graph, and let what lies in it lie in ``hub`` at once.
+
+        Through years of laps each has taken the place of one before; none may be a link of a chain that only grows.
+        """
+        for other in (self, *self.hung):
+            T = T_hub_submap if other.into is None else se2.compose(T_hub_submap, other.into[1])
+            other.into = hub, T
+            hub.hung.add(other)
+        self.hung.clear()
 
     def place(self) -> Array:
         """``T_map_submap`` as corrected so far."""

@@ -10,7 +10,7 @@ import pytest
 
 from estimator import se2
 from estimator.absolute import Absolute
-from estimator.atlas import KEPT, Constraints, cell_of
+from estimator.atlas import KEPT, LOOK, LOST, MANY, SOLVE, Constraints, cell_of
 from estimator.closing import keyframe_laid, take_answer
 from estimator.commands import forget
 from estimator.keyframe import Virtual, keep
@@ -149,6 +149,35 @@ def test_what_is_kept_is_bounded_by_the_area_and_stays_in_place() -> None:
     assert len(cells) < 0.8 * len(truth) / SIZE
     places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
     assert np.hypot(*(places - truth)[:, :2].T).max() < 0.15  # those of submaps let go included
+
+
+def test_what_joins_the_submaps_is_bounded_however_many_laps_are_driven() -> None:
+    """The same way lap after lap: none of it may leave more behind than the lap before."""
+    state, _ = driven(laps=12.0, turn=0.0)
+    joined = state.atlas.constraints
+    pairs = [tuple(sorted(pair)) for pair in joined.between[~joined.loop].tolist()]
+    assert len(set(pairs)) == len(pairs)
+    pairs = [tuple(sorted(pair)) for pair in joined.between[joined.loop].tolist()]
+    assert max(pairs.count(pair) for pair in pairs) <= MANY
+    gone = [frame.submap for frame in state.keyframes.values() if frame.submap.into is not None]
+    assert len(gone) > 100
+    assert all(submap.into is not None and submap.into[0].into is None for submap in gone)
+
+
+def test_a_job_that_fails_does_not_end_the_search_for_loops() -> None:
+    state, truth = driven(laps=1.02)
+    rng, handed = np.random.default_rng(9), []
+    state.atlas.stale = True
+    take_answer(state, Answer(0.0, -1, None))  # nobody asked: only makes the graph be handed out
+    for key in range(1000, 1010 + LOST):
+        lay(state, state.fused.T_odom_base, truth[-1], paper_room(), rng, key)
+        handed.append([job.priority for job in state.atlas.take_jobs()])  # and none of them answers
+    kinds = [kind for kinds in handed for kind in kinds]
+    assert kinds.count(LOOK) == 2
+    assert kinds.count(SOLVE) == 1
+    take_answer(state, Answer(0.0, -1, None))
+    assert [job.priority for job in state.atlas.take_jobs()] == [SOLVE]
+    assert len(state.atlas.asked) < 2 + LOST / SIZE + 1
 
 
 def frame_at(scene: Scene, T: Array, seed: int = 0) -> tuple[Candidate, Array]:
