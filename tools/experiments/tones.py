@@ -18,7 +18,8 @@ import numpy as np
 from estimator.cdma_block import Sampled
 from estimator.cdma_kernels import invert
 from estimator.cdma_mains import basis, orthonormal
-from estimator.cdma_pieces import reduced, stacked
+from estimator.cdma_newton import reduce_rows
+from estimator.cdma_pieces import stacked
 from tools.experiments import vlp
 from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
 from tools.experiments.vlp import Array, Raw
@@ -54,7 +55,10 @@ def joint(y: Array, rows: Array, rate: float) -> Solved:
     q = orthonormal(basis(at, FLICKER_HZ / rate, MAINS_HARMONICS))[0]
     stack = stacked(Sampled(y, at, np.ones_like(y), q), len(rows))
     stack[: len(rows)] = rows
-    normal, right, power = reduced(stack, len(rows))
+    normal, right = np.empty((len(rows), len(rows))), np.empty(len(rows))
+    extent = np.zeros((2, len(stack)), np.int64)
+    extent[1] = len(y)
+    power = reduce_rows(stack, extent, len(rows), normal, right)
     normal[np.diag_indices(len(rows))] *= 1.0 + 1e-9
     invert(normal)
     found = normal @ right
