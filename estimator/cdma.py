@@ -85,6 +85,7 @@ def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
         decoder.odd = decoder.odd + 1 if flags & (BlockFlag.STALLED | BlockFlag.NOISY) else 0
         if decoder.odd != 1:  # what one block has left over may be a stall; if the next has it too, it is a lamp
             _offer(decoder, residual, t_middle)
+        _watch(decoder, flags)
     return _epoch(decoder, block, flags)
 
 
@@ -104,16 +105,24 @@ def _onward(decoder: Decoder, block: SampleBlock) -> bool:
 def search(decoder: Decoder, codes: int) -> None:
     """Look for further lamps, with as much work as it takes to try ``codes`` codes (6 us each with profile A).
 
-    What else there is to do counts as so many codes, or has a call of its own.
+    What else there is to do counts as so many codes, or has a call of its own. While nothing speaks for further lamps,
+    a small part of the effort is used: estimator/cdma_watch.py.
     """
+    allowed = decoder.watch.allow(codes)
+    decoder.watch.spend(allowed - _search(decoder, allowed))
+
+
+def _search(decoder: Decoder, codes: int) -> int:
+    """Returns what is left of the effort; what was begun is brought to an end, so it may be less than nothing."""
     while codes > 0:
         if decoder.found is not None:
             found, decoder.found = decoder.found, None
             codes -= _take(decoder, *found)
         elif decoder.search.idle and not _begin(decoder):
-            return
+            break
         else:
             codes = _sweep(decoder, codes)
+    return codes
 
 
 def _begin(decoder: Decoder) -> bool:
@@ -132,6 +141,7 @@ def _sweep(decoder: Decoder, codes: int) -> int:
     left, done = decoder.search.step(codes)
     if done is not None:
         decoder.barren += 1
+        decoder.watch.on_sweep(len(done[-1]))
         decoder.found = done if done[-1] else None
     return left
 
@@ -195,6 +205,15 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
     chips = profile.chip_rate / block.rate * (1.0 + decoder.clocks.clock)
     at: Array = np.arange(n, dtype=np.float64) - 0.5 * (n - 1)
     return Sampled(y, at * chips, mask, rows), flags
+
+
+def _watch(decoder: Decoder, flags: BlockFlag) -> None:
+    """Let the watch know what this block says for or against further lamps."""
+    tracks = decoder.tracks
+    lit = tracks.confirmed
+    odd = flags not in (BlockFlag.NONE, BlockFlag.CLIPPED) or len(lit) < len(tracks.slots)
+    ratio = decoder.noise / decoder.usual_noise if decoder.usual_noise else 0.0
+    decoder.watch.on_block(int(np.count_nonzero(~tracks.faint(lit))), ratio, odd)
 
 
 def _offer(decoder: Decoder, residual: Sampled, t_middle: float) -> None:

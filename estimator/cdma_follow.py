@@ -18,6 +18,7 @@ from estimator.cdma_solve import joint_fit
 from estimator.cdma_stall import judge, mend
 from estimator.cdma_template import Shape, pulse_energy
 from estimator.cdma_track import CLEAR, Clocks, Life, Tracks
+from estimator.cdma_watch import Watch
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -55,6 +56,7 @@ class Decoder:
         self.tracks = Tracks(profile)
         self.search = Search(profile)
         self.search.warm(round(profile.epoch_s * profile.sample_rate), self.clocks.clock)
+        self.watch = Watch(self.search.codes)
         self.offered: Job | None = None
         self.found: Outcome | None = None
         self.barren = 0

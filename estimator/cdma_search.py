@@ -114,6 +114,11 @@ class Search:
         self._limit = THRESHOLD
 
     @property
+    def codes(self) -> int:
+        """How many codes a sweep tries."""
+        return len(self._codes)
+
+    @property
     def idle(self) -> bool:
         """Whether a new job would be taken."""
         return self._job is None
@@ -134,6 +139,9 @@ class Search:
         job = self._job
         if job is None:
             return 0, None
+        self._fit_size(len(job.y))
+        if len(self._spectrum) != self._cache.shape[1]:  # meanwhile a block of another length was followed
+            self._spectrum = _spectrum(job.y, self._size)
         trial, first = divmod(self._next, len(self._codes))
         last = min(first + codes, len(self._codes))
         cost = 1
