@@ -232,11 +232,12 @@ class Cycle:
         if not records:
             return None
         parts = self.parts
-        limits = parts.budget.limits(self.budget_us)
+        light = any(isinstance(record, SampleBlock) for record in records)
+        limits = parts.budget.limits(self.budget_us, light)
         self.result = parts.step(records, limits)
         step_us = stages.lap("step")
         if parts.stopwatch is not None:
-            parts.budget.learn(step_us, limits, self.result)
+            parts.budget.learn(step_us, limits, self.result, light)
         parts.worker.submit(self.result.jobs)
         if any(isinstance(record, Command) and record.order is Order.RESET for record in records):
             self._painter.map_id = (self._painter.map_id + 1) % 2**32

@@ -58,7 +58,7 @@ class ReplayBudget(FixedBudget):
         super().__init__()
         self.now = UNLIMITED
 
-    def limits(self, budget_us: float) -> Limits:
+    def limits(self, budget_us: float, light: bool = False) -> Limits:
         """The caps in force."""
         return self.now
 

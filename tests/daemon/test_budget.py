@@ -10,6 +10,7 @@ from daemon.budget import (
     FEWEST_ITERATIONS,
     FEWEST_POINTS,
     LONGEST_MAP_WAIT,
+    PLAIN_AGO,
     SEARCH_SHARE,
     SEARCH_US,
     FixedBudget,
@@ -114,6 +115,31 @@ def test_steps_without_a_match_teach_nothing() -> None:
     budget.learn(1e6, UNLIMITED, step(matched=False))
     budget.learn(1e6, UNLIMITED, step(iterations=0))
     assert budget.limits(10.0) == UNLIMITED
+
+
+def test_light_is_taken_from_the_budget_and_thins_no_scan_before_its_time() -> None:
+    """What a block costs to decode, 4 ms here, is not the iterations' doing."""
+    budget = MeasuredBudget()
+    for _ in range(40):
+        budget.learn(8 * 300.0, UNLIMITED, step())
+        budget.learn(8 * 300.0 + 4000.0, UNLIMITED, step(), light=True)
+    assert budget.limits(12_500.0).icp_iterations == 41, "300 us each"
+    assert budget.limits(12_500.0).points == budget.limits(12_500.0, light=True).points == UNLIMITED.points
+    assert budget.limits(12_500.0, light=True).icp_iterations == 28, "8.5 ms are left"
+    assert budget.limits(7_000.0, light=True).points < 1000 < budget.limits(7_000.0).points
+    budget.learn(8 * 300.0 + 9000.0, UNLIMITED, step(keyframe=1), light=True)
+    assert budget.limits(9_000.0).update_map, "map work without light: 5 ms"
+    assert not budget.limits(9_000.0, light=True).update_map
+
+
+def test_where_every_step_has_light_it_is_counted_with_the_iterations() -> None:
+    budget = MeasuredBudget()
+    for _ in range(PLAIN_AGO + 60):
+        budget.learn(8 * 300.0 + 4000.0, UNLIMITED, step(), light=True)
+    assert budget.limits(9_600.0, light=True).icp_iterations == 12
+    assert budget.limits(8_000.0, light=True).points < 1000, "a machine too slow for both is not left uncapped"
+    budget.learn(8 * 300.0, UNLIMITED, step())
+    assert budget.limits(9_600.0, light=True).points >= 1000
 
 
 def test_replay_uses_the_recorded_caps_in_order() -> None:
