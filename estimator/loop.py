@@ -1,8 +1,8 @@
 """Scan to map (Sect. 4.3): whether a keyframe has been at the place of an earlier submap before, and how sure that is.
 
 A loop is accepted on overlap (the share of beams that fit), on what speaks against it (beams that look through the
-map, points that hang in free space), on rank (no axis may be left open) and on the residual. A wide search sees how
-many places fit: where there are two, nothing is closed.
+map, points that hang in free space), on rank (no axis may be left open) and on the residual. Where the pose is vague a
+wide search offers several places: if two of them are accepted, nothing is closed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class LoopSettings:
         reach_m: how near, beyond three deviations, a submap must be to be looked at; most_m: however uncertain.
         candidates: submaps looked at for one keyframe. every: a look for every so many keyframes.
         sure_m, sure_rad: deviations of the expected place up to which the matcher finds it by itself.
-        points: of a scan, at most. unlike: largest ratio of the second place's score to the first's.
+        points: of a scan, at most. places: that a wide search may offer; two of them that fit close nothing.
         supported_m, supported_rad: a loop that moves the pose by more than this waits for a second one that agrees as
             well as this.
     """
@@ -53,7 +53,7 @@ class LoopSettings:
     sure_m: float = 0.5
     sure_rad: float = 0.15
     points: int = 180
-    unlike: float = 0.9
+    places: int = 3
     supported_m: float = 0.3
     supported_rad: float = 0.1
 
@@ -98,18 +98,28 @@ def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Fo
     points = points_of_frame(frame, sigma)
     if len(points.xy) < MatchSettings().min_points or len(candidate.submap.elements) < MatchSettings().min_points:
         return None
-    start = candidate.T_submap_keyframe
+    starts = [candidate.T_submap_keyframe]
     deviation = np.sqrt(np.diag(candidate.P))
     if float(np.hypot(*deviation[:2])) > settings.sure_m or deviation[2] > settings.sure_rad:
-        guess = wide(frame, points.xy, candidate, settings)
-        if guess is None:
-            return None
-        start = guess
+        starts += wide(frame, points.xy, candidate, settings)
     local = candidate.submap.local()
     view = View(oriented(points, settings.points), frame.T_base_lidar, frame.beams(), sigma)
     loose = np.diag((settings.sure_m**-2, settings.sure_m**-2, settings.sure_rad**-2))
-    result = match(view, local, Prior(start, loose), 60, MatchSettings())
-    return judged(view, local, result, candidate, settings)
+    results = [match(view, local, Prior(start, loose), 60, MatchSettings()) for start in starts]
+    return the_one([judged(view, local, result, candidate, settings) for result in results], settings)
+
+
+def the_one(judgements: list[Found | None], settings: LoopSettings) -> Found | None:
+    """The best of several that fit, None where two of them are different places: which one cannot be told."""
+    fit = [found for found in judgements if found is not None]
+    if not fit:
+        return None
+    best = max(fit, key=lambda found: found.share)
+    for other in fit:
+        x, y, yaw = se2.between(best.T_submap_keyframe, other.T_submap_keyframe).tolist()
+        if np.hypot(x, y) > settings.supported_m or abs(yaw) > settings.supported_rad:
+            return None
+    return best
 
 
 def judged(
@@ -133,17 +143,14 @@ def judged(
     return Found(candidate.key, T, P, share, against, result.residual_m, moved)
 
 
-def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> Array | None:
-    """The one place within three deviations where a scan fits, None where there are none or several."""
+def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> list[Array]:
+    """The places within three deviations where a scan fits best."""
     deviation = 3.0 * np.sqrt(np.diag(candidate.P))
     at = se2.compose(candidate.T_submap_keyframe, frame.T_base_lidar)
     reach = min(float(deviation[:2].max()), settings.most_m), min(float(deviation[2]), np.pi)
     around = Around(at, *reach)
     seen = se2.apply(se2.inverse(frame.T_base_lidar), points)
     field = field_of(candidate.submap.elements[:, :2].astype(np.float64), 0.1, 0.1, 0.5, around)
-    asked = SearchSettings(least=0.5, hits=2, nodes=400_000, points=settings.points, around=around)
-    outcome = search(field, seen, asked)
-    hits = outcome.hits
-    if not hits or not outcome.complete or (len(hits) > 1 and hits[1].score > settings.unlike * hits[0].score):
-        return None
-    return se2.compose(hits[0].T_map_lidar, se2.inverse(frame.T_base_lidar))
+    asked = SearchSettings(least=0.4, hits=settings.places, nodes=400_000, points=settings.points, around=around)
+    lidar_base = se2.inverse(frame.T_base_lidar)
+    return [se2.compose(hit.T_map_lidar, lidar_base) for hit in search(field, seen, asked).hits]

@@ -21,7 +21,7 @@ from estimator.records import Answer, Array, Job
 from estimator.state import State, new_state
 from estimator.submap import SIZE, settle
 from tests.estimator.world import scan_in
-from tools.bench._scenes import Scene, bearings, office, paper_room, round_room
+from tools.bench._scenes import Scene, bearings, box, office, paper_room, round_room
 
 HALF = bearings(181, 180.0)
 SMALL = np.diag((0.004**2, 0.004**2, 0.002**2))
@@ -180,13 +180,13 @@ def test_a_job_that_fails_does_not_end_the_search_for_loops() -> None:
     assert len(state.atlas.asked) < 2 + LOST / SIZE + 1
 
 
-def frame_at(scene: Scene, T: Array, seed: int = 0) -> tuple[Candidate, Array]:
+def frame_at(scene: Scene, T: Array, seed: int = 0, wide: bool = False) -> tuple[Candidate, Array]:
     """A submap of keyframes about ``T`` (three of them), with the guess that a robot at ``T`` is at its origin."""
     rng = np.random.default_rng(seed)
     frames = []
     for key, dx in enumerate((-0.2, 0.0, 0.2), 1):
         T_k = se2.compose(T, np.array((dx, 0.0, 0.0)))
-        frames.append(keep(key, T_k, T_k, scan_in(scene, T_k, HALF, rng), 0.0))
+        frames.append(keep(key, T_k, T_k, scan_in(scene, T_k, bearings(361, 359.0) if wide else HALF, rng), 0.0))
     return Candidate(1, settle(frames, T, 0.01), np.zeros(3), np.diag((0.3**2, 0.3**2, 0.1**2))), T
 
 
@@ -203,7 +203,7 @@ def test_a_place_is_known_again_and_another_is_not() -> None:
 
 
 @pytest.mark.jit
-def test_a_far_place_is_found_by_search_and_two_alike_are_none() -> None:
+def test_a_far_place_is_found_by_search_and_a_round_room_has_none() -> None:
     candidate, T = frame_at(office(), np.array((3.0, 6.0, 0.3)))
     unsure = replace(candidate, P=np.diag((0.8**2, 0.8**2, 0.4**2)))
     away = se2.compose(T, np.array((0.9, -0.3, 0.5)))
@@ -215,6 +215,17 @@ def test_a_far_place_is_found_by_search_and_two_alike_are_none() -> None:
     candidate, T = frame_at(room, np.array((0.1, 0.0, 0.0)))
     frame = keep(9, T, T, scan_in(room, T, HALF, np.random.default_rng(5)), 0.0)
     assert look_in(frame, candidate, TOLD) is None  # no heading in a round room
+
+
+def test_two_places_that_fit_close_nothing() -> None:
+    """A square room looks the same from four places: known to a quarter turn it is found, else it is not."""
+    scene = Scene(np.array(box(-3, -3, 3, 3), dtype=np.float64), (-2, -2), (2, 2))
+    candidate, T = frame_at(scene, np.array((1.0, 0.5, 0.2)), wide=True)
+    frame = keep(9, T, T, scan_in(scene, T, bearings(361, 359.0), np.random.default_rng(5)), 0.0)
+    known = look_in(frame, replace(candidate, P=np.diag((0.3**2, 0.3**2, 0.3**2))), TOLD)
+    assert known is not None
+    np.testing.assert_allclose(known.T_submap_keyframe, np.zeros(3), atol=0.02)
+    assert look_in(frame, replace(candidate, P=np.diag((1.5**2, 1.5**2, 1.5**2))), TOLD) is None
 
 
 def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:
