@@ -104,7 +104,9 @@ def _probe(parser: argparse.ArgumentParser) -> None:
 def _replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="LOG", help="CARMEN log (.gz too), or a recording's directory")
     parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the results")
-    parser.add_argument("--journal", metavar="N[,N..]", help="write these matches, from 1, in full; or: failed")
+    parser.add_argument(
+        "--journal", metavar="N[,N..]", help="write these matches in full, counted from 1; or: failed; or failed,5"
+    )
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
     _config_arguments(parser)
     parser.set_defaults(body=_later("daemon.replay", "main"))

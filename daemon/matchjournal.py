@@ -44,7 +44,7 @@ class BadChoice(Exception):
 
 @dataclass(slots=True)
 class Choice:
-    """Which matches are wanted, counted from 1 in the order of the scans.
+    """Which matches are wanted, counted from 1 in the order in which they were made.
 
     Attributes:
         numbers: these. seconds: the first at or after each of these, since the log's first event. failed: those that
@@ -74,6 +74,27 @@ def choice_of(words: str | None, seconds: float | None) -> Choice:
     return Choice(frozenset(int(part) for part in numbers), times, FAILED in parts)
 
 
+@dataclass(frozen=True, slots=True)
+class Named:
+    """What a match is called.
+
+    Attributes:
+        match: its number. seconds: of its scan, since the log's first event. pose, stamp: number of its pose among
+            those of ``trajectory.tum``, from 1, and the stamp there; None where its cycle gave no pose.
+    """
+
+    match: int
+    seconds: float
+    pose: int | None
+    stamp: float | None
+
+    def __str__(self) -> str:
+        """For people."""
+        if self.pose is None:
+            return f"match {self.match} (no pose)"
+        return f"match {self.match} (pose {self.pose} of trajectory.tum, stamp {self.stamp:.6f})"
+
+
 @dataclass(slots=True)
 class MatchJournal:
     """Keeps the wanted matches of a run; a few references each, told only when they are written.
@@ -81,12 +102,15 @@ class MatchJournal:
     Attributes:
         choice: what is wanted. kept: by number, with seconds since the log's first event. matches: how many there were.
         failed: how many of them were no result; those beyond :data:`MOST_FAILED` are not kept.
+        rows: the ledger's row of each that is kept and gave a pose; light alone gives poses too, so not the number.
     """
 
     choice: Choice
     kept: dict[int, tuple[float, Entry]] = field(default_factory=dict)
     matches: int = 0
     failed: int = 0
+    rows: dict[int, int] = field(default_factory=dict)
+    _told: int = 0
     _t_first: float = math.nan
     _before: float = -math.inf
 
@@ -104,6 +128,12 @@ class MatchJournal:
         """The log's first event was at this instant."""
         self._t_first = t_mono
 
+    def gave(self, row: int | None) -> None:
+        """The cycle has ended, and its pose has this row of the ledger; None: it gave no pose."""
+        if self.matches > self._told and self.matches in self.kept and row is not None:
+            self.rows[self.matches] = row
+        self._told = self.matches
+
     def wants(self, t_mono: float, result: MatchResult) -> bool:
         """Count a match, and say whether it is to be kept."""
         self.matches += 1
@@ -115,12 +145,27 @@ class MatchJournal:
         wanted = self.choice.failed and failed and self.failed <= MOST_FAILED
         return wanted or timed or self.matches in self.choice.numbers
 
-    def files(self) -> Iterator[tuple[str, bytes]]:
-        """``match-N.json`` and, with matplotlib, ``match-N.png`` of each, one at a time."""
-        for number, (seconds, entry) in sorted(self.kept.items()):
+    def named(self, stamps: Array) -> list[Named]:
+        """Those that are kept, by number, with what they are called in ``trajectory.tum``.
+
+        ``stamps``: of the poses, in the order in which they came; the file has them in ascending order.
+        """
+        line = np.empty(len(stamps), np.int64)
+        line[np.argsort(stamps, kind="stable")] = 1 + np.arange(len(stamps))
+        found = []
+        for number, (seconds, _) in sorted(self.kept.items()):
+            row = self.rows.get(number)
+            known = (None, None) if row is None else (int(line[row]), round(float(stamps[row]), 6))
+            found.append(Named(number, seconds, *known))
+        return found
+
+    def files(self, stamps: Array) -> Iterator[tuple[str, bytes]]:
+        """``match-N.json`` and, with matplotlib, ``match-N.png`` of each, one at a time; ``stamps`` as for `named`."""
+        for name in self.named(stamps):
+            number, entry = name.match, self.kept[name.match][1]
             told = journal.tell(entry)
-            yield f"match-{number}.json", (json.dumps(document(number, seconds, entry, told)) + "\n").encode()
-            picture = matchplot.draw(number, entry, told)
+            yield f"match-{number}.json", (json.dumps(document(name, entry, told)) + "\n").encode()
+            picture = matchplot.draw(str(name), entry, told)
             if picture is not None:
                 yield f"match-{number}.png", picture
 
@@ -143,7 +188,7 @@ class MatchJournal:
         return f"; the first {MOST_FAILED} of them are in the journal" if self.failed > MOST_FAILED else ""
 
 
-def document(number: int, seconds: float, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any]:
+def document(name: Named, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any]:
     """Everything about one match, ready for JSON."""
     scan, result = entry.scan, entry.result
     return {
@@ -151,8 +196,7 @@ def document(number: int, seconds: float, entry: Entry, told: tuple[Told, ...]) 
         "version": VERSION,
         "units": UNITS,
         "frames": FRAMES,
-        "match": number,
-        "seconds": seconds,
+        **asdict(name),
         "scan": {"seq": scan.seq, "t_begin": scan.t_begin, "t_end": scan.t_end, "beams": len(scan.bearing_rad)},
         "result": {
             "ok": result.ok,

@@ -21,14 +21,14 @@ def available() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def draw(number: int, entry: Entry, told: tuple[Told, ...]) -> bytes | None:
-    """PNG of one match, None without matplotlib."""
+def draw(name: str, entry: Entry, told: tuple[Told, ...]) -> bytes | None:
+    """PNG of one match, called ``name``; None without matplotlib."""
     if not available():
         return None
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=_INCHES, dpi=100, layout="constrained")
-    canvas.suptitle(_title(number, entry, told))
+    canvas.suptitle(_title(name, entry, told))
     if entry.asked is None:
         _plain(canvas.add_subplot(), entry)
     else:
@@ -46,13 +46,13 @@ def draw(number: int, entry: Entry, told: tuple[Told, ...]) -> bytes | None:
     return out.getvalue()
 
 
-def _title(number: int, entry: Entry, told: tuple[Told, ...]) -> str:
+def _title(name: str, entry: Entry, told: tuple[Told, ...]) -> str:
     result, second = entry.result, ", with a second opinion" if len(told) > 1 else ""
     x, y, yaw = result.correction.tolist()
     moved = f"prediction corrected by {1e3 * np.hypot(x, y):.1f} mm, {np.degrees(yaw):.2f} deg"
     fit = f"{result.inliers} of {result.queries} points fit, residual {1e3 * result.residual_m:.1f} mm"
     line = f"{result.iterations} iterations{second}; {moved}; {fit}" if told else f"{result.queries} points"
-    return f"match {number}: {result.reason.value}\n{line}"
+    return f"{name}: {result.reason.value}\n{line}"
 
 
 def _chosen(entry: Entry, told: tuple[Told, ...]) -> Told:

@@ -240,7 +240,7 @@ def _write_all(folder: Folder, outcome: Outcome) -> None:
     try:
         folder.write_each(files)
         if outcome.journal is not None:
-            folder.write_each(outcome.journal.files())
+            folder.write_each(outcome.journal.files(ledger.online().stamps))
     finally:
         outcome.seconds["write"] = time.perf_counter() - begun
         folder.write("timing.json", _json(timing(outcome)))

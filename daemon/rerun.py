@@ -239,4 +239,7 @@ class Rerun:
 
     def _keep(self, record: CycleRecord) -> None:
         self._kept.append(record)
+        rows = len(self.ledger)
         self.ledger.take(record, *self._latest)
+        if self._journal is not None:
+            self._journal.gave(rows if len(self.ledger) > rows else None)

@@ -15,8 +15,9 @@ from daemon.matchjournal import MOST, MOST_FAILED, BadChoice, Choice, MatchJourn
 from estimator import matching
 from estimator.result import Reason
 from tests.daemon.replay.room import Drive, carmen, drive, read_tum
-from tests.daemon.replay.test_recorded_lights import calm, record
+from tests.daemon.replay.test_recorded_lights import Recorded, calm, record
 from tests.daemon.replay.test_replay import RESULTS
+from tests.daemon.test_lights import LIDAR
 
 SCANS = 40
 
@@ -72,12 +73,55 @@ def test_a_match_is_all_there(out: Path) -> None:
         assert one["inliers"] <= one["pairs"] <= len(first["points"])
 
 
-def test_the_number_is_the_line_of_the_trajectory(out: Path) -> None:
+def same_pose(folder: Path, number: int) -> dict[str, Any]:
+    """A match, once its pose and stamp have been found in the trajectory."""
+    match = written(folder, number)
+    lines = (folder / "trajectory.tum").read_text().splitlines()[1:]
+    assert lines[match["pose"] - 1].startswith(f"{match['stamp']:.6f} ")
+    return match
+
+
+def test_a_match_names_its_line_of_the_trajectory(out: Path) -> None:
     stamps, poses = read_tum(out / "online.tum")
-    for number in (12, 32):
-        match = written(out, number)
+    for number in (1, 12, 32):
+        match = same_pose(out, number)
+        assert match["pose"] == number  # here every pose has a match, and the stamps ascend
         assert stamps[number - 1] - stamps[0] == pytest.approx(match["seconds"], abs=1e-5)
         np.testing.assert_allclose(poses[number - 1, :2], match["result"]["T_odom_base"][:2], atol=1e-5)
+
+
+def test_where_stamps_step_back_the_line_is_that_of_the_stamp(tmp_path: Path) -> None:
+    run = drive(20)
+    stamps = run.stamps.copy()
+    stamps[[9, 10]] = stamps[[10, 9]]
+    log = carmen(tmp_path / "room.log", Drive(run.truth, run.odometry, run.ranges, stamps))
+    assert cli.main(["replay", str(log), "--out", str(tmp_path / "out"), "--journal", "9,10,11"]) == cli.OK
+    assert [same_pose(tmp_path / "out", number)["pose"] for number in (9, 10, 11)] == [9, 11, 10]
+
+
+async def lidar_away(bench: Recorded) -> None:
+    """Light alone holds the pose while the lidar is unplugged."""
+    await calm(bench)
+    bench.opener.unplug(LIDAR)
+    await bench.drive(2.0)
+    bench.opener.plug(LIDAR, bench.device)
+    await bench.drive(4.0)
+
+
+def test_poses_that_light_alone_has_held_have_no_match(tmp_path: Path) -> None:
+    record(tmp_path / "rec", lidar_away, lidar=True)
+    folder = tmp_path / "out"
+    words = ",".join(str(number) for number in range(1, 100, 14))
+    assert cli.main(["replay", str(tmp_path / "rec"), "--out", str(folder), "--journal", words]) == cli.OK
+    numbers = sorted(int(file.stem.split("-")[1]) for file in folder.glob("match-*.json"))
+    poses = [same_pose(folder, number)["pose"] for number in numbers]
+    assert poses[-1] > numbers[-1], "poses without a match lie between"
+    assert poses == sorted(set(poses))
+    stamps, _ = read_tum(folder / "trajectory.tum")
+    for number, pose in zip(numbers, poses, strict=True):
+        match = written(folder, number)
+        took = match["scan"]["t_end"] - written(folder, 1)["scan"]["t_end"]
+        assert stamps[pose - 1] - stamps[poses[0] - 1] == pytest.approx(took, abs=1e-5)
 
 
 def test_the_first_scan_has_nothing_to_match(out: Path) -> None:
