@@ -97,7 +97,13 @@ def main() -> int:
     parser.add_argument("relations", type=Path)
     parser.add_argument("--split", type=float, default=SPLIT_S, help="seconds apart that part local from global")
     args = parser.parse_args()
-    errors = evaluate(*read_tum(args.trajectory), read_relations(args.relations))
+    for path in (args.trajectory, args.relations):
+        if not path.is_file():
+            parser.error(f"{path}: no such file")
+    try:
+        errors = evaluate(*read_tum(args.trajectory), read_relations(args.relations))
+    except (OSError, ValueError, IndexError) as error:
+        parser.error(f"cannot compare {args.trajectory} with {args.relations}: {error}")
     print(errors.line("all"))
     print(errors.within(args.split).line("local"))
     print(errors.beyond(args.split).line("global"))

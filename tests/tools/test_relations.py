@@ -82,3 +82,17 @@ def test_the_command_prints_all_local_and_global(
     assert said[0].startswith("all        n=    4   0.1000 +- 0.0000 m   0.000 +- 0.000 deg")
     assert said[1].startswith("local      n=    2   0.1000")
     assert said[3] == "missing    n=    0"
+
+
+def test_a_missing_or_foreign_file_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, foreign = tmp_path / "here.tum", tmp_path / "foreign.relations"
+    here.write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    foreign.write_text("not a number\n")
+    for other, said in ((tmp_path / "nowhere", "nowhere: no such file"), (foreign, "foreign.relations: ")):
+        monkeypatch.setattr("sys.argv", ["relations", str(here), str(other)])
+        with pytest.raises(SystemExit) as stopped:
+            relations.main()
+        assert stopped.value.code == 2
+        assert said in capsys.readouterr().err

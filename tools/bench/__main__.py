@@ -21,6 +21,13 @@ def names() -> list[str]:
     return sorted(m.name for m in pkgutil.iter_modules(tools.bench.__path__) if not m.name.startswith("_"))
 
 
+def reason(error: Exception) -> str:
+    """An error as text: what our own messages say, and the kind of any other, which its text alone may not tell."""
+    return (
+        str(error) if isinstance(error, (OSError, RuntimeError)) and str(error) else f"{type(error).__name__}: {error}"
+    )
+
+
 def main() -> int:
     """Run what was asked for; exit status 1 when a benchmark could not run at all."""
     parser = argparse.ArgumentParser(prog="python -m tools.bench", description=__doc__)
@@ -36,7 +43,7 @@ def main() -> int:
         try:
             figures = importlib.import_module(f"tools.bench.{name}").run()
         except Exception as error:  # noqa: BLE001  one broken benchmark must not hide the others' figures
-            print(f"{name} could not run: {error!r}")
+            print(f"{name} could not run: {reason(error)}")
             failed = True
             continue
         print(table(figures))
