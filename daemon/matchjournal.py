@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from daemon import matchplot
-from estimator import icp, journal
+from daemon.results import OutputRefused
+from estimator import icp, journal, matching
 from estimator.journal import Entry, LightSaid, Pairs, Told
 from estimator.matching import Asked
 from estimator.records import Array, Scan
@@ -29,6 +32,8 @@ MOST: Final = 100
 MOST_FAILED: Final = 20
 """Matches without a result that are written; the others are counted."""
 FAILED: Final = "failed"
+OURS: Final = re.compile(r"match-[1-9][0-9]*\.(json|png)")
+"""Names of the files that are written."""
 
 UNITS: Final = {"length": "m", "angle": "rad", "time": "s", "information": "1/m^2, 1/(m rad), 1/rad^2"}
 FRAMES: Final = {
@@ -102,6 +107,7 @@ class MatchJournal:
     Attributes:
         choice: what is wanted. kept: by number, with seconds since the log's first event. matches: how many there were.
         failed: how many of them were no result; those beyond :data:`MOST_FAILED` are not kept.
+        removed: files of an earlier run.
         rows: the ledger's row of each that is kept and gave a pose; light alone gives poses too, so not the number.
     """
 
@@ -110,6 +116,7 @@ class MatchJournal:
     matches: int = 0
     failed: int = 0
     rows: dict[int, int] = field(default_factory=dict)
+    removed: int = 0
     _told: int = 0
     _t_first: float = math.nan
     _before: float = -math.inf
@@ -169,9 +176,28 @@ class MatchJournal:
             if picture is not None:
                 yield f"match-{number}.png", picture
 
+    def clear(self, folder: Path) -> None:
+        """Remove the matches that an earlier run has left in ``folder``; nothing else is touched.
+
+        Raises:
+            OutputRefused: one of them may not be removed.
+        """
+        for path in sorted(folder.iterdir()):
+            if not (OURS.fullmatch(path.name) and path.is_file()):
+                continue
+            try:
+                path.unlink()
+            except OSError as error:
+                raise OutputRefused(f"cannot remove {path} of an earlier run: {error.strerror}") from error
+            self.removed += 1
+
+    def missed(self) -> bool:
+        """Whether matches were asked for by number or time and none at all was found."""
+        return not self.kept and bool(self.choice.numbers or self.choice.seconds)
+
     def sentences(self) -> list[str]:
-        """What a person should know of what was not written."""
-        said = []
+        """What a person should know of what was written and what was not."""
+        said = [f"matches written: {len(self.kept)}" + self._cleared()]
         missing = sorted(n for n in self.choice.numbers if n > self.matches)
         if missing:
             said.append(f"no match {', '.join(map(str, missing))}: the log has {self.matches}")
@@ -183,6 +209,9 @@ class MatchJournal:
         if self.kept and not matchplot.available():
             said.append("no pictures of matches: matplotlib is not installed (pip install 'lumiloop[plot]')")
         return said
+
+    def _cleared(self) -> str:
+        return f"; files of an earlier run removed: {self.removed}" if self.removed else ""
 
     def _beyond(self) -> str:
         return f"; the first {MOST_FAILED} of them are in the journal" if self.failed > MOST_FAILED else ""
@@ -211,10 +240,27 @@ def document(name: Named, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any
             "iterations": result.iterations,
             "residual_m": result.residual_m,
         },
+        "refusal": _refusal(entry, told),
         "points": _rounded(entry.points.xy),
         "asked": None if entry.asked is None else _asked(entry.asked),
         "attempts": [_attempt(one) for one in told],
         "light": None if entry.light is None else _light(entry.light),
+    }
+
+
+def _refusal(entry: Entry, told: tuple[Told, ...]) -> dict[str, Any] | None:
+    """What the place that was rejected showed, and what was asked of it; None for other outcomes."""
+    judged = [one.attempt for one in told if one.attempt.demand is not None]
+    if entry.asked is None or entry.result.reason is not Reason.REJECTED or not judged:
+        return None
+    best, local = judged[-1], entry.asked[1]
+    assert best.demand is not None
+    return {
+        "share": best.share,
+        "against": best.against(local),
+        "held": matching.held(best, local, entry.asked[4]),
+        "ways": [{"least_share": share, "most_against": most} for share, most in best.demand.ways],
+        "least_held": best.demand.held,
     }
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from estimator import icp, localmap, se2
 from estimator.journal import Entry, Iteration, LightSaid, Told
 from estimator.records import Array
+from estimator.result import Reason
 
 _INCHES: Final = (14.0, 10.5)
 _MARGIN_M: Final = 0.5
@@ -49,7 +50,10 @@ def draw(name: str, entry: Entry, told: tuple[Told, ...]) -> bytes | None:
 def _title(name: str, entry: Entry, told: tuple[Told, ...]) -> str:
     result, second = entry.result, ", with a second opinion" if len(told) > 1 else ""
     x, y, yaw = result.correction.tolist()
-    moved = f"prediction corrected by {1e3 * np.hypot(x, y):.1f} mm, {np.degrees(yaw):.2f} deg"
+    off, turn = np.hypot(x, y), f"{np.degrees(yaw):.2f} deg"
+    moved = f"prediction corrected by {1e3 * off:.1f} mm, {turn}"
+    if result.reason is Reason.REJECTED:
+        moved = f"would have moved the prediction by {off:.2f} m, {turn}; refused"
     fit = f"{result.inliers} of {result.queries} points fit, residual {1e3 * result.residual_m:.1f} mm"
     line = f"{result.iterations} iterations{second}; {moved}; {fit}" if told else f"{result.queries} points"
     return f"{name}: {result.reason.value}\n{line}"

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -219,6 +219,8 @@ def _verdict(outcome: Outcome) -> int:
     if rerun.comparison.differ:
         first = rerun.comparison.first
         sys.stderr.write(f"replay: {rerun.comparison.differ} cycles differ from the recorded run; {first}\n")
+    if outcome.journal is not None and outcome.journal.missed():
+        return cli.fail("none of the matches asked for is in the log; the other results are written")
     log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
     speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
     sys.stderr.write(f"replay: {len(rerun.ledger)} poses, {speed}\n")
@@ -240,6 +242,7 @@ def _write_all(folder: Folder, outcome: Outcome) -> None:
     try:
         folder.write_each(files)
         if outcome.journal is not None:
+            outcome.journal.clear(folder.path)
             folder.write_each(outcome.journal.files(ledger.online().stamps))
     finally:
         outcome.seconds["write"] = time.perf_counter() - begun
@@ -287,7 +290,8 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
             "matched": ledger.matched,
             "outcomes": dict(ledger.outcomes),
             "states": dict(ledger.states),
-            "loops": len(ledger.loops),
+            "loops": ledger.loops[-1][1].counter if ledger.loops else 0,
+            "steps_with_loops": len(ledger.loops),
         },
         "motion": {
             "driven_m": driven_m,
@@ -300,11 +304,19 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
             "match_largest_correction_rad": ledger.corrected_rad,
             "T_map_odom_jumps": ledger.jumps,
         },
+        "matches": _matches(outcome),
         "map": {"resolution_m": grid.resolution, "columns": columns, "rows": rows},
         "recorded_run": _recorded(outcome),
         "config": msgspec.to_builtins(outcome.config),
         "versions": versions(),
     }
+
+
+def _matches(outcome: Outcome) -> list[dict[str, Any]] | None:
+    """The matches that are written; None where none were asked for."""
+    if outcome.journal is None:
+        return None
+    return [asdict(name) for name in outcome.journal.named(outcome.rerun.ledger.online().stamps)]
 
 
 def _recorded(outcome: Outcome) -> dict[str, Any] | None:

@@ -142,8 +142,12 @@ def test_pictures_are_pictures(out: Path) -> None:
 
 def test_a_journal_changes_no_result_and_is_the_same_twice(log: Path, out: Path, tmp_path: Path) -> None:
     assert cli.main(["replay", str(log), "--out", str(tmp_path / "plain")]) == cli.OK
-    for name in RESULTS - {"timing.json"}:
+    for name in RESULTS - {"timing.json", "summary.json"}:
         assert (tmp_path / "plain" / name).read_bytes() == (out / name).read_bytes(), name
+    plain, journalled = (json.loads((folder / "summary.json").read_text()) for folder in (tmp_path / "plain", out))
+    assert plain.pop("matches") is None
+    assert [match["match"] for match in journalled.pop("matches")] == [1, 12, 32]
+    assert plain == journalled
     assert cli.main(["replay", str(log), "--out", str(tmp_path / "again"), "--journal", "12"]) == cli.OK
     for kind in ("json", "png"):
         assert (tmp_path / "again" / f"match-12.{kind}").read_bytes() == (out / f"match-12.{kind}").read_bytes()
@@ -163,7 +167,7 @@ def test_failures_are_bounded(capsys: pytest.CaptureFixture[str]) -> None:
     failed = matching.no_match(np.zeros(3), 0, Reason.REJECTED)
     wanted = [kept.wants(float(k), failed) for k in range(MOST_FAILED + 5)]
     assert sum(wanted) == MOST_FAILED
-    assert kept.sentences() == [
+    assert kept.sentences()[1:] == [
         f"{MOST_FAILED + 5} matches were no result; the first {MOST_FAILED} of them are in the journal"
     ]
 
@@ -177,6 +181,29 @@ def test_numbers_and_times_that_the_log_has_not_are_said(
     assert f"no match 900: the log has {SCANS}" in said
     assert "no match at or after 77 s" in said
     assert (tmp_path / "match-2.json").exists()
+    assert "matches written: 1\n" in said
+    (tmp_path / "match-notes.json").write_text("a person's own")
+    assert cli.main(["replay", str(log), "--out", str(tmp_path), "--journal", "99999"]) == cli.FAILED
+    said = capsys.readouterr().err
+    assert "matches written: 0; files of an earlier run removed: 2" in said
+    assert "none of the matches asked for is in the log" in said
+    assert {file.name for file in tmp_path.glob("match*")} == {"match-notes.json"}
+
+
+def test_a_rejected_match_says_what_it_showed_and_what_was_asked(tmp_path: Path) -> None:
+    run = drive(SCANS)
+    ranges = run.ranges.copy()
+    ranges[30] = np.random.default_rng(5).uniform(0.5, 7.0, ranges.shape[1])  # walls of no room
+    log = carmen(tmp_path / "room.log", Drive(run.truth, run.odometry, ranges, run.stamps))
+    assert cli.main(["replay", str(log), "--out", str(tmp_path / "out"), "--journal", "30,31"]) == cli.OK
+    assert written(tmp_path / "out", 30)["refusal"] is None
+    match = written(tmp_path / "out", 31)
+    assert match["result"]["reason"] == "REJECTED"
+    refusal = match["refusal"]
+    ways = refusal["ways"]
+    met = any(refusal["share"] >= way["least_share"] and refusal["against"] <= way["most_against"] for way in ways)
+    assert not met or refusal["held"] < refusal["least_held"]
+    assert refusal["share"] == pytest.approx(match["result"]["inliers"] / match["result"]["queries"])
 
 
 @pytest.mark.parametrize("words", ["0", "-1", "x", "1,,2", "1.5", "faild", "", ",".join(["1"] * (MOST + 1))])
