@@ -43,6 +43,12 @@ def fail(message: str, code: int = FAILED) -> int:
     return code
 
 
+def say(text: str) -> None:
+    """One line on stderr, at once."""
+    sys.stderr.write(f"lumiloop: {text}\n")
+    sys.stderr.flush()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="lumiloop",
@@ -109,7 +115,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
     _config_arguments(parser)
-    parser.set_defaults(body=_later("daemon.replay", "main"))
+    parser.set_defaults(body=_estimating("daemon.replay", "main"))
 
 
 def _status(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +132,7 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("log", type=Path, metavar="LOG", help="a log or a recording to take the map from")
     export.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the files")
     _config_arguments(export)
-    export.set_defaults(body=_later("daemon.export", "main"))
+    export.set_defaults(body=_estimating("daemon.export", "main"))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:
@@ -137,14 +143,14 @@ def _calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lidar-mount", action="store_true", help="where the lidar sits, instead of lights")
     other = "with --odometry or --lidar-mount the configuration, lumiloop-calibrated.toml"
     _written(parser, f"survey to write, default lights-calibrated.toml; {other}")
-    parser.set_defaults(body=_later("daemon.calibrate", "main"))
+    parser.set_defaults(body=_estimating("daemon.calibrate", "main", "warm-teach"))
 
 
 def _survey(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="REC", help="recording of a drive under the lamps")
     parser.add_argument("--height", type=float, metavar="M", help="of the lamps above the floor; default: estimated")
     _written(parser, "survey to write; default: lights.toml", Path("lights.toml"))
-    parser.set_defaults(body=_later("daemon.survey", "main"))
+    parser.set_defaults(body=_estimating("daemon.survey", "main", "warm-teach"))
 
 
 def _written(parser: argparse.ArgumentParser, what: str, default: Path | None = None) -> None:
@@ -163,6 +169,21 @@ def _codes(parser: argparse.ArgumentParser) -> None:
 def _later(module: str, name: str) -> Body:
     """A body that resolves the configuration (``args.settings``: `daemon.config.Config`) and then loads its module."""
     return _configured(_loaded(module, name))
+
+
+def _estimating(module: str, name: str, what: str = "warm") -> Body:
+    """As `_later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
+
+    def body(args: argparse.Namespace) -> int:
+        from daemon import warmup
+
+        try:
+            warmup.load_aloud(say, what, lambda: (warmup.load(), import_module(module)))
+        except warmup.CannotLoad as error:
+            return fail(str(error))
+        return _loaded(module, name)(args)
+
+    return _configured(body)
 
 
 def _loaded(module: str, name: str) -> Body:

@@ -13,12 +13,13 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from daemon import cli
+from daemon import cli, warmup
 from daemon.config import Config, Mount
 from daemon.ledger import Ledger
 from daemon.lights import Lights, SurveyError, from_header, load_lights, lost_residuals
@@ -81,7 +82,7 @@ def command(
         keys = tuple(override.partition("=")[0].strip() for override in args.set)
         outcome = replay(args.log, args.settings, Given(args.config is not None, keys), journal)
         write(folder, outcome)
-    except (HalError, OutputRefused) as error:
+    except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return cli.fail(str(error))
     if outcome.stopped:
         return cli.fail(f"{outcome.stopped}; what was computed until then is in {folder.path}", _code(outcome))
@@ -104,7 +105,10 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: Ma
     _say(f"replay: reading {path}")
     source = open_log(path)
     used = config_for(source, config, given)
-    outcome = Outcome(source, used, Rerun(source, used, lights_for(source, used, given), journal), journal)
+    lights = lights_for(source, used, given)
+    if lights is not None:
+        warmup.load_aloud(cli.say, "warm-lights", partial(warmup.load, lights))
+    outcome = Outcome(source, used, Rerun(source, used, lights, journal), journal)
     outcome.seconds["read"] = time.perf_counter() - begun
     begun = time.perf_counter()
     try:

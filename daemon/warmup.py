@@ -118,14 +118,48 @@ def load(lights: Lights | None = None) -> Warmth:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
 
 
+def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]) -> None:
+    """Do ``work``, which loads ``what`` of the estimator, and ``say`` before and after that kernels are compiled.
+
+    Nothing is done and nothing said where an earlier start has left them.
+
+    Raises:
+        CannotLoad: as for :func:`load`.
+    """
+    try:
+        mark = _mark(what)
+        if mark.exists():
+            return
+        begun, before = time.monotonic(), _compiled()
+        say("first start of this version: its kernels are being compiled, which takes a minute or more")
+        work()
+        mark.touch()
+    except (OSError, RuntimeError) as error:
+        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
+    count = len(_compiled() - before)
+    say(f"{count} kernels compiled in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
+
+
+def _compiled() -> set[Path]:
+    from estimator.kernel import CACHE_DIR
+
+    return set(CACHE_DIR.rglob("*.nbc"))
+
+
+def _mark(what: str) -> Path:
+    """The file that says that an earlier start has compiled all that this one needs."""
+    from estimator.kernel import CACHE_DIR
+
+    # the directory is named by the sources' content; numba also keys by the path they were loaded from
+    return CACHE_DIR / f"{what}-{hashlib.sha256(str(ROOM).encode()).hexdigest()[:16]}"
+
+
 def _load_locked(begun: float, lights: Lights | None) -> Warmth:
     from estimator.kernel import CACHE_DIR
 
     with (CACHE_DIR / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        # the directory is named by the sources' content; numba also keys by the path they were loaded from
-        what = "warm" if lights is None else "warm-lights"
-        mark = CACHE_DIR / f"{what}-{hashlib.sha256(str(ROOM).encode()).hexdigest()[:16]}"
+        mark = _mark("warm" if lights is None else "warm-lights")
         cold = not mark.exists()
         if cold:
             count = kernel_count(lights is not None)

@@ -183,3 +183,31 @@ def test_a_start_without_a_photodiode_loads_nothing_of_light() -> None:
 
 def test_kernels_of_light_are_counted_only_where_there_is_a_photodiode() -> None:
     assert kernel_count() < kernel_count(lights=True)
+
+
+def test_a_command_says_once_that_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warmup, "_mark", lambda what: tmp_path / what)
+    said: list[str] = []
+    done: list[int] = []
+
+    def work() -> None:
+        assert len(said) == 1, "said before it is done"
+        done.append(1)
+
+    for _ in range(2):
+        warmup.load_aloud(said.append, "warm", work)
+    assert len(done) == 1
+    assert said[0].startswith("first start of this version: its kernels are being compiled")
+    assert said[1].startswith("0 kernels compiled in 0 s")
+    assert len(said) == 2
+
+
+def test_a_command_that_cannot_load_leaves_no_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warmup, "_mark", lambda what: tmp_path / what)
+
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(warmup.CannotLoad, match="No space left"):
+        warmup.load_aloud(lambda text: None, "warm", full)
+    assert not (tmp_path / "warm").exists()
