@@ -39,7 +39,7 @@ check: venv  ## formatting, lint, strict types
 test: check  ## everything quick (no root, <= 12 minutes)
 	@mkdir -p out; rm -f .coverage .coverage.plain
 	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run --data-file=.coverage.plain -m pytest -q -p no:cacheprovider \
-		-m "not jit and not slow" tests/estimator > out/plain.txt 2>&1 & plain=$$!; trap "kill $$plain" INT TERM; \
+		-m "not jit and not slow and not system" tests/estimator > out/plain.txt 2>&1 & plain=$$!; trap "kill $$plain" INT TERM; \
 	$(BIN)/python -m coverage run -m pytest -q -m "not system and not slow" $(ARGS); compiled=$$?; \
 	wait $$plain; interpreted=$$?; echo "kernels without compiler:"; \
 	if [ $$interpreted = 0 ]; then tail -n 1 out/plain.txt; else cat out/plain.txt; fi; \
@@ -52,7 +52,7 @@ test-system: venv  ## real processes, real ttys, real time, fault and fuzz sampl
 
 test-all: check  ## all of it, the long ones included
 	$(BIN)/python -m coverage run -m pytest -q $(ARGS)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m "not jit and not slow" tests/estimator
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m "not jit and not slow and not system" tests/estimator
 	$(BIN)/python -m tools.floors
 
 $(PEERS): $(STAMP) requirements/bench.lock
