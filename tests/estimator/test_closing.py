@@ -142,6 +142,7 @@ def test_a_map_moved_while_its_graph_was_solved_is_solved_again() -> None:
     assert np.hypot(*(places - truth)[:, :2].T - np.array(((5.0,), (0.0,)))).max() < 0.15
 
 
+@pytest.mark.jit
 def test_what_is_kept_is_bounded_by_the_area_and_stays_in_place() -> None:
     state, truth = driven(laps=4.0)
     cells = [cell_of(submap) for submap in state.atlas.submaps.values()]
@@ -151,6 +152,7 @@ def test_what_is_kept_is_bounded_by_the_area_and_stays_in_place() -> None:
     assert np.hypot(*(places - truth)[:, :2].T).max() < 0.15  # those of submaps let go included
 
 
+@pytest.mark.jit
 def test_what_joins_the_submaps_is_bounded_however_many_laps_are_driven() -> None:
     """The same way lap after lap: none of it may leave more behind than the lap before."""
     state, _ = driven(laps=12.0, turn=0.0)
