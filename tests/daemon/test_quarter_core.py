@@ -26,7 +26,8 @@ from estimator.lamps import Survey
 from tests.daemon.heldback import PERIOD_US, cpu_s, held_back
 from tests.daemon.test_process import ROOT, Running, running
 
-pytestmark = [pytest.mark.realtime, pytest.mark.system]
+# real time without slack: for a machine that does nothing else, so not among the quick system tests
+pytestmark = [pytest.mark.realtime, pytest.mark.system, pytest.mark.slow]
 
 SHARE = 0.25
 SCAN_S = 0.02505
