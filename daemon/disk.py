@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
+from daemon.wholefile import sync_folder
 from hal.errors import DeviceRefused
 from hal.replay.recording import LONGEST, Kind, pack_frame, pack_head, segment_name
 
@@ -152,7 +153,7 @@ class SegmentWriter:
         self._good = 0
         _write_all(self._file, head)
         self._good = len(head)
-        _sync_folder(self.folder)
+        sync_folder(self.folder)
 
     def _close(self) -> None:
         """Cut off a record that was written in part, sync, close; a segment without a whole head is removed."""
@@ -174,15 +175,6 @@ def _write_all(file: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(file, view) :]
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a new file's name survive a power cut, too."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _new_folder(parent: Path, name: str) -> Path:

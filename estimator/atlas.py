@@ -203,15 +203,19 @@ class Atlas:
         if then is not None:
             then(answer.payload)
 
-    def add(self, frame: Keyframe, P: Array, sigma: float) -> None:
-        """Hang a keyframe, with its covariance relative to the one before (odom axes), on the newest submap."""
+    def add(self, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
+        """Hang a keyframe, with its covariance relative to the one before (odom axes), on the newest submap.
+
+        ``sigma``: range noise. ``anew``: the laser had lost its map before it, so that the two may lie anywhere in a
+        common submap: it begins its own.
+        """
         newest, T = self.newest, frame.T_odom_keyframe
         x, y, _ = (T - self.T_odom_last).tolist()
         F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
         self.C = F @ self.C @ F.T + P + FLOOR
         self.way_m += math.hypot(x, y) if newest is not None else 0.0
         self.T_odom_last = T
-        if newest is None or len(self.frames) >= SIZE:
+        if newest is None or anew or len(self.frames) >= SIZE:
             self._begin(frame, newest, sigma)
         frame.submap = next(reversed(self.submaps.values()))
         self.frames.append(frame)

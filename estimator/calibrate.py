@@ -164,7 +164,3 @@ def _unit(name: str) -> str:
         if part in name:
             return unit
     return "m"
-
-
-GAINS_ONLY: Final = Priors(order=0.0, slope=0.0, floor=0.0, rx_order=0.0, rx_slope=0.0, lever=0.0)
-"""Priors of a quick update: the common gain, each lamp's own, and nothing else."""

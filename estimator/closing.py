@@ -41,10 +41,10 @@ def take_answer(state: State, answer: Answer) -> None:
     solve_graph(state, state.atlas)
 
 
-def keyframe_laid(state: State, frame: Keyframe, P: Array, sigma: float) -> None:
-    """Hang a new keyframe on the map and look whether this place is known; ``P``, ``sigma`` as in `Atlas.add`."""
+def keyframe_laid(state: State, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
+    """Hang a new keyframe on the map and look whether this place is known; arguments as of `Atlas.add`."""
     atlas, told = state.atlas, state.settings.loops
-    atlas.add(frame, P, sigma)
+    atlas.add(frame, P, sigma, anew)
     if told is not None and not atlas.looking and atlas.since_look >= told.every:
         look_back(state, told, frame)
 
@@ -69,7 +69,8 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
     """The nearest submaps that may be where the keyframe is, and were not left only just now."""
     T, atlas = frame.T_map_keyframe, state.atlas
     near = []
-    P = turned(state, atlas.spread(frame.T_odom_keyframe))
+    tie = state.absolute
+    P = turned(state, tie.P if tie is not None and tie.placed else atlas.spread(frame.T_odom_keyframe))
     reach = min(told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])), told.most_m)
     for submap in atlas.submaps.values():
         x, y, _ = submap.T_map_submap.tolist()
@@ -82,6 +83,11 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
         R = se2.rotation(-submap.T_map_submap[2])
         made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T))
     return tuple(made)
+
+
+def lit(state: State) -> bool:
+    """Whether light has told where the map lies, and so holds the pose in it."""
+    return state.absolute is not None and state.absolute.placed
 
 
 def turned(state: State, P_odom: Array) -> Array:
@@ -154,8 +160,7 @@ def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
     keys = np.array([submap.key for submap in submaps])
     poses = np.array([submap.T_map_submap for submap in submaps])
     edges = np.searchsorted(keys, joined.between)
-    tie = state.absolute
-    if tie is None or not tie.placed:
+    if not lit(state):
         return Graph(poses, edges, joined.T, joined.information, joined.loop)
     anchored, at, certainty = told_by_light(state, atlas, keys)
     return Graph(poses, edges, joined.T, joined.information, joined.loop, anchored, at, certainty)
@@ -186,22 +191,19 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
     A solution of what has been moved meanwhile is thrown away, and the graph is solved once more.
     """
     newest = atlas.newest
-    lit, last = state.absolute is not None and state.absolute.placed, submaps[-1]
-    same = all(
-        np.array_equal(submap.T_map_submap, T)
-        for submap, T in zip(submaps, before, strict=True)
-        if submap.into is None and not (lit and submap is last)
-    )
+    held, last = lit(state), submaps[-1]
+    counts = np.array([submap.into is None and not (held and submap is last) for submap in submaps])
+    same = np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
     if newest is None or not same or not np.isfinite(solution.poses).all():
         atlas.stale |= not same
         return
     moved = se2.compose(solution.poses[-1], se2.inverse(last.T_map_submap))
     first = se2.compose(solution.poses[0], se2.inverse(submaps[0].T_map_submap))
     for submap, T in zip(submaps, solution.poses, strict=True):
-        if not (lit and submap is last):
+        if not (held and submap is last):
             submap.T_map_submap = T
     state.T_map_start = se2.compose(first, state.T_map_start)
-    if lit:
+    if held:
         return
     for submap in atlas.submaps.values():
         if submap.key > last.key:

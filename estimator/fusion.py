@@ -87,7 +87,9 @@ def guess(state: State, H: Array, dt: float) -> None:
         return
     before, state.guessed_s = state.guessed_s, state.guessed_s + min(max(dt, 0.0), motion.LONGEST_CARRY_S)
     t0, t1 = max(0.0, before - motion.LONGEST_CARRY_S), max(0.0, state.guessed_s - motion.LONGEST_CARRY_S)
-    state.P_anchor[:2, :2] += float(motion.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
+    more = float(motion.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
+    state.P_anchor[:2, :2] += more
+    state.atlas.C[:2, :2] += more  # of the way between submaps as well, or no loop could bring them together again
 
 
 def noise_of(state: State, scan: Scan) -> float:

@@ -135,11 +135,6 @@ CACHE_DIR: Final = _choose_cache()
 _numba_config.CACHE_DIR = str(CACHE_DIR)
 
 
-def cache_is_warm() -> bool:
-    """Whether an earlier start has left compiled kernels of this room (tools keep theirs in the same directory)."""
-    return any(CACHE_DIR.glob(f"{Path(__file__).parent.name}_*/*.nbc"))
-
-
 def kernel(signature: str, inline: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
 

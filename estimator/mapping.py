@@ -82,7 +82,7 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
     if state.absolute is not None:
         state.absolute.X = np.zeros((3, 3))
         frame.virtual = absolute.virtual(state)
-    keyframe_laid(state, frame, P, noise_of(state, scan))
+    keyframe_laid(state, frame, P, noise_of(state, scan), lost(state))
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key

@@ -28,9 +28,8 @@ VAGUE = 4.0
 ASIDE = 0.05
 """Share of the squared displacement that is reckoned with in all directions."""
 
-LX, LY, SLOPE, SPACING = range(4)
-"""Columns of a surface: normal, (0, 0) where there is none; variance of its direction (rad^2); distance of the points
-beside it (m)."""
+SLOPE = 2
+"""Variance of its direction (rad^2): third column of a surface, behind its normal; (0, 0) where there is none."""
 
 Pairs = tuple[Array, Array, Ints]
 """Rows of the axis, surface of each row, and the row of each new point's partner, -1 where it has none."""

@@ -11,7 +11,7 @@ import pytest
 from estimator import se2
 from estimator.absolute import Absolute
 from estimator.atlas import KEPT, LOOK, LOST, MANY, SOLVE, Constraints, cell_of
-from estimator.closing import keyframe_laid, take_answer
+from estimator.closing import candidates, keyframe_laid, take_answer
 from estimator.commands import forget
 from estimator.keyframe import Virtual, keep
 from estimator.loop import Candidate, LoopSettings, look, look_in
@@ -52,11 +52,11 @@ def run_jobs(state: State) -> list[Job]:
     return done
 
 
-def lay(state: State, T_odom: Array, T_true: Array, scene: Scene, rng: np.random.Generator, key: int) -> None:
-    scan = scan_in(scene, T_true, HALF, rng)
+def lay(state: State, T_odom: Array, T_true: Array, rng: np.random.Generator, key: int, anew: bool = False) -> None:
+    scan = scan_in(paper_room(), T_true, HALF, rng)
     state.fused.T_odom_base = state.T_odom_anchor = T_odom
     frame = keep(key, se2.compose(state.T_map_odom, T_odom), T_odom, scan, 0.0)
-    keyframe_laid(state, frame, SMALL, 0.01)
+    keyframe_laid(state, frame, SMALL, 0.01, anew)
     state.keyframes[key] = frame
 
 
@@ -67,7 +67,7 @@ def driven(laps: float = 1.3, settings: LoopSettings | None = TOLD, turn: float 
     rng = np.random.default_rng(2)
     state.fused.T_odom_base = state.T_map_start = truth[0]
     for key, (T_odom, T_true) in enumerate(zip(drifted(truth, 1.004, turn), truth, strict=True), 1):
-        lay(state, T_odom, T_true, paper_room(), rng, key)
+        lay(state, T_odom, T_true, rng, key)
         run_jobs(state)
     return state, truth
 
@@ -118,7 +118,7 @@ def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
     state, truth = driven(laps=1.02)
     rng = np.random.default_rng(9)
     for key in range(1000, 1000 + 2 * SIZE):
-        lay(state, state.fused.T_odom_base + np.array((0.05, 0.0, 0.0)), truth[-1], paper_room(), rng, key)
+        lay(state, state.fused.T_odom_base + np.array((0.05, 0.0, 0.0)), truth[-1], rng, key)
     late = [Answer(0.0, job.job_id, job.run()) for job in state.atlas.take_jobs()]
     assert late
     forget(state)
@@ -172,7 +172,7 @@ def test_a_job_that_fails_does_not_end_the_search_for_loops() -> None:
     state.atlas.stale = True
     take_answer(state, Answer(0.0, -1, None))  # nobody asked: only makes the graph be handed out
     for key in range(1000, 1010 + LOST):
-        lay(state, state.fused.T_odom_base, truth[-1], paper_room(), rng, key)
+        lay(state, state.fused.T_odom_base, truth[-1], rng, key)
         handed.append([job.priority for job in state.atlas.take_jobs()])  # and none of them answers
     kinds = [kind for kinds in handed for kind in kinds]
     assert kinds.count(LOOK) == 2
@@ -251,6 +251,28 @@ def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:
     off = np.array([se2.between(truth[submap.first - 1], submap.T_map_submap) for submap in firsts])
     drift = np.array([se2.between(truth[submap.first - 1], submap.T_odom_submap) for submap in firsts])
     assert np.hypot(*off[:-2, :2].T).mean() < 0.6 * np.hypot(*drift[:-2, :2].T).mean()
+
+
+def test_light_tells_where_to_look_and_how_far() -> None:
+    """The odom frame's own covariance grows with the way; a pose that light holds is looked for where light has it."""
+    state, _ = driven(laps=1.02, settings=None)
+    frame = next(reversed(state.keyframes.values()))
+    state.atlas.marginal = np.diag((9.0, 9.0, 1.0))
+    state.absolute = Absolute(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
+    near = candidates(state, TOLD, frame)
+    assert near
+    assert all(np.trace(candidate.P) < 0.01 for candidate in near)
+    state.absolute.placed = False
+    assert all(np.trace(candidate.P) > 10.0 for candidate in candidates(state, TOLD, frame))
+
+
+def test_a_map_begun_anew_begins_a_submap() -> None:
+    """What was laid before and after the laser lost its map must not be merged into one shape."""
+    state, truth = driven(laps=0.1)
+    before = state.atlas.newest
+    lay(state, state.fused.T_odom_base, truth[-1], np.random.default_rng(1), 500, anew=True)
+    assert state.atlas.newest is not before
+    assert [frame.key for frame in state.atlas.frames] == [500]
 
 
 def random_graph(rng: np.random.Generator, n: int = 7) -> tuple[Constraints, Array]:
