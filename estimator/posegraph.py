@@ -37,6 +37,7 @@ class Graph:
         edges: (m, 2) poses i, j. between: (m, 3) T_i_j. information: (m, 6), upper triangle by rows. doubtful: (m,)
             whether the constraint may be false.
         anchored: (p,) poses known absolutely. at: (p, 3). certainty: (p, 6); these may always be false.
+        held: (n,) poses that never move; empty: none.
     """
 
     poses: Array
@@ -47,6 +48,7 @@ class Graph:
     anchored: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     at: Array = field(default_factory=lambda: np.empty((0, 3)))
     certainty: Array = field(default_factory=lambda: np.empty((0, 6)))
+    held: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +59,8 @@ class Solution:
         poses: (n, 3). chi2: of all constraints as weighted. iterations: of Gauss-Newton.
         converged: not stopped by the cap.
         trust: (m,) weight of each constraint, 1 where it is not doubted, near 0 where it was voted out.
-        parts: number of parts of the graph that no constraint joins; each keeps its first pose unless it is anchored.
+        parts: number of parts of the graph that no constraint joins; each keeps its first pose unless one of its poses
+            is held or anchored.
         covariance: (3, 3) of the pose that was asked for, in the map's axes: its own, all the others let go. Zeros for
             one that is held, or if none was asked for.
     """
@@ -89,10 +92,10 @@ def optimise(
     check(graph)
     n = len(graph.poses)
     part = parts_of(n, graph.edges)
-    free = np.ones(n, np.bool_)
-    held = np.unique(part[graph.anchored]) if len(graph.anchored) else np.empty(0, np.int64)
+    free = ~graph.held if len(graph.held) else np.ones(n, np.bool_)
+    fixed = np.concatenate((part[graph.anchored], part[~free]))
     roots = np.flatnonzero(part == np.arange(n))
-    free[np.setdiff1d(roots, held)] = False
+    free[np.setdiff1d(roots, fixed)] = False
     label = np.where(free, np.cumsum(free) - 1, -1)
     edges = np.ascontiguousarray(label[graph.edges])
     first, near = adjacency(int(free.sum()), edges)
@@ -121,6 +124,8 @@ def check(graph: Graph) -> None:
     for name, index in (("edges", graph.edges), ("anchored", graph.anchored)):
         if len(index) and (index.min() < 0 or index.max() >= n):
             raise ValueError(f"{name}: a constraint names pose {index.min()} or {index.max()}, there are 0 to {n - 1}")
+    if len(graph.held) not in (0, n):
+        raise ValueError(f"held: {len(graph.held)} rows for {n} poses")
     for name, values in (
         ("poses", graph.poses), ("between", graph.between), ("information", graph.information), ("at", graph.at),
         ("certainty", graph.certainty),

@@ -206,6 +206,38 @@ def test_parts_that_nothing_joins_stay_where_they_are() -> None:
         np.testing.assert_allclose(se2.between(one, two), 0.0, atol=1e-3)
 
 
+def test_poses_that_are_held_never_move_and_hold_the_others() -> None:
+    """A stored map stays to the last bit; what was laid today comes to it by its loops, wherever it began."""
+    truth, graph = walk(60, 3, 60)
+    shift = np.array((2.0, 1.0, 0.4))
+    graph.poses[:30] = [se2.compose(shift, T) for T in truth[:30]]
+    graph.held = np.arange(60) < 30
+    begun = graph.poses.copy()
+    found = optimise(graph)
+    np.testing.assert_array_equal(found.poses[:30], begun[:30])
+    expected = np.array([se2.compose(shift, T) for T in truth[30:]])
+    assert np.hypot(*(found.poses[30:] - expected)[:, :2].T).max() < 0.3
+    assert not optimise(graph, covariance_of=3).covariance.any()
+    assert np.all(np.diag(optimise(graph, covariance_of=40).covariance) > 0.0)
+
+
+def test_a_held_pose_holds_its_own_part_only() -> None:
+    _, graph = walk(30, 2, 20)
+    twice = Graph(*(np.concatenate(two) for two in (
+        (graph.poses, graph.poses), (graph.edges, graph.edges + 30), (graph.between, graph.between),
+        (graph.information, graph.information), (graph.doubtful, graph.doubtful))))  # fmt: skip
+    twice.held = np.arange(60) == 7
+    found = optimise(twice)
+    np.testing.assert_array_equal(found.poses[[7, 30]], twice.poses[[7, 30]])
+    assert np.abs(found.poses[0] - twice.poses[0]).max() > 1e-6
+
+
+def test_a_graph_that_is_held_altogether_stays() -> None:
+    _, graph = walk(10, 0, 3)
+    graph.held = np.ones(10, bool)
+    np.testing.assert_array_equal(optimise(graph).poses, graph.poses)
+
+
 def test_the_cost_is_the_sum_of_potentials() -> None:
     _, graph = walk(20, 1, 10)
     given_ = (graph.edges, graph.between, graph.information, np.zeros(len(graph.edges), bool))
@@ -221,6 +253,7 @@ def test_the_cost_is_the_sum_of_potentials() -> None:
         (lambda g: g.edges.__setitem__((0, 1), 99), "edges: a constraint names pose"),
         (lambda g: g.poses.__setitem__((3, 0), np.nan), "poses: not finite in row 3"),
         (lambda g: g.information.__setitem__((2, 0), np.inf), "information: not finite in row 2"),
+        (lambda g: setattr(g, "held", np.ones(3, bool)), "held: 3 rows for 10 poses"),
     ],
 )
 def test_what_is_no_graph_is_refused(change, message: str) -> None:  # type: ignore[no-untyped-def]
