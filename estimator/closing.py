@@ -8,6 +8,7 @@ goes into ``T_map_odom``; with light that has placed the map, it moves what was 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,7 +21,7 @@ from estimator.loop import Candidate, Found, LoopSettings, look
 from estimator.mapframe import move_map
 from estimator.posegraph import UPPER, Graph, Solution, optimise
 from estimator.records import Answer, Array
-from estimator.result import Loop
+from estimator.result import Loop, LoopReason
 from estimator.state import State
 
 PHI: Final = 25.0
@@ -110,7 +111,8 @@ def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found)
             return
         atlas.waiting = [other for other in atlas.waiting if other not in friends]
         for other in friends:
-            join(atlas, other.frame, other.found)
+            join(atlas, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
+        found = replace(found, reason=LoopReason.SUPPORTED)
     join(atlas, frame, found)
 
 
@@ -134,7 +136,8 @@ def join(atlas: Atlas, frame: Keyframe, found: Found) -> None:
     P = A @ R @ found.P @ R.T @ A.T
     atlas.constraints.add(found.key, frame.submap.key, se2.compose(found.T_submap_keyframe, T_keyframe_submap), P, True)
     atlas.closures += 1
-    atlas.news = Loop(atlas.closures, frame.key, atlas.submaps[found.key].first, found.residual_m)
+    first = atlas.submaps[found.key].first
+    atlas.news = Loop(atlas.closures, frame.key, first, found.residual_m, found.reason)
     atlas.stale = True
 
 

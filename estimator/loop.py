@@ -7,7 +7,7 @@ wide search offers several places: if two of them are accepted, nothing is close
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from estimator.linear3 import invert3
 from estimator.localmap import LocalMap, contradicted
 from estimator.matching import MatchSettings, Prior, View, match
 from estimator.records import Array
-from estimator.result import MatchResult
+from estimator.result import LoopReason, MatchResult
 from estimator.scanpoints import oriented
 from estimator.submap import Settled, points_of_frame
 
@@ -74,7 +74,7 @@ class Found:
 
     Attributes:
         T_submap_keyframe: where; P: covariance (3x3, axes of the submap). share, against, residual_m: how well.
-        moved: (x, y, yaw) from where it was expected, in the keyframe's axes.
+        moved: (x, y, yaw) from where it was expected, in the keyframe's axes. reason: which conditions it passed.
     """
 
     key: int
@@ -84,6 +84,7 @@ class Found:
     against: float
     residual_m: float
     moved: Array
+    reason: LoopReason = LoopReason.NEAR
 
 
 def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
@@ -106,7 +107,8 @@ def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Fo
     view = View(oriented(points, settings.points), frame.T_base_lidar, frame.beams(), sigma)
     loose = np.diag((settings.sure_m**-2, settings.sure_m**-2, settings.sure_rad**-2))
     results = [match(view, local, Prior(start, loose), 60, MatchSettings()) for start in starts]
-    return the_one([judged(view, local, result, candidate, settings) for result in results], settings)
+    found = the_one([judged(view, local, result, candidate, settings) for result in results], settings)
+    return found if found is None or len(starts) == 1 else replace(found, reason=LoopReason.SEARCHED)
 
 
 def the_one(judgements: list[Found | None], settings: LoopSettings) -> Found | None:

@@ -77,14 +77,30 @@ class MatchResult:
         return np.asarray(vector[:, value > 1.0].T)
 
 
+class LoopReason(Enum):
+    """Which witnesses and conditions closed a loop. The order is published: further ones go to the end."""
+
+    NEAR = "laser: the scan fits the map where it was expected"
+    SEARCHED = "laser: the scan fits the map in one place of all that were possible"
+    SUPPORTED = "laser, twice: two keyframes from different places agree on it"
+    LIT = "light and laser: the same lamps are seen from the same place, and the scan fits the map there"
+    PLACED = "found in the whole map: the one place that fits all that was seen since the place was lost"
+
+
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """An accepted loop closure between two keyframes."""
+    """An accepted loop closure between two keyframes.
+
+    Attributes:
+        counter: loops accepted so far. keyframe_new, keyframe_old: the latter begins the submap that was found.
+        residual_m: root mean square distance of the beams that fit. reason: what closed it.
+    """
 
     counter: int
     keyframe_new: int
     keyframe_old: int
     residual_m: float
+    reason: LoopReason = LoopReason.NEAR
 
 
 class LinkState(Enum):

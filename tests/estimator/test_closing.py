@@ -18,6 +18,7 @@ from estimator.loop import Candidate, LoopSettings, look, look_in
 from estimator.mapframe import shift_map
 from estimator.posegraph import UPPER, Graph, optimise
 from estimator.records import Answer, Array, Job
+from estimator.result import Loop, LoopReason
 from estimator.state import State, new_state
 from estimator.submap import SIZE, settle
 from tests.estimator.world import scan_in
@@ -60,8 +61,13 @@ def lay(state: State, T_odom: Array, T_true: Array, rng: np.random.Generator, ke
     state.keyframes[key] = frame
 
 
-def driven(laps: float = 1.3, settings: LoopSettings | None = TOLD, turn: float = 0.0008) -> tuple[State, Array]:
-    """A state after the circuit with drift, all jobs done as they came; and the true poses."""
+def driven(
+    laps: float = 1.3,
+    settings: LoopSettings | None = TOLD,
+    turn: float = 0.0008,
+    news: list[Loop | None] | None = None,
+) -> tuple[State, Array]:
+    """A state after the circuit with drift, all jobs done as they came; and the true poses. Loops go to ``news``."""
     state, truth = new_state(), circuit(laps=laps)
     state.settings = replace(state.settings, loops=settings)
     rng = np.random.default_rng(2)
@@ -69,6 +75,8 @@ def driven(laps: float = 1.3, settings: LoopSettings | None = TOLD, turn: float 
     for key, (T_odom, T_true) in enumerate(zip(drifted(truth, 1.004, turn), truth, strict=True), 1):
         lay(state, T_odom, T_true, rng, key)
         run_jobs(state)
+        if news is not None:
+            news.append(state.atlas.take_news())
     return state, truth
 
 
@@ -110,8 +118,12 @@ def test_a_large_loop_waits_for_a_second_that_agrees() -> None:
     state, _ = driven(settings=replace(TOLD, supported_m=0.0, supported_rad=0.0))
     assert state.atlas.closures == 0  # no two agree better than by nothing
     assert len(state.atlas.waiting) > 3
-    state, _ = driven(settings=replace(TOLD, supported_m=0.2))
+    news: list[Loop | None] = []
+    state, _ = driven(settings=replace(TOLD, supported_m=0.2), news=news)
     assert state.atlas.closures >= 2
+    reasons = [loop.reason for loop in news if loop is not None]
+    assert reasons[0] is LoopReason.SUPPORTED
+    assert reasons[-1] is LoopReason.NEAR
 
 
 def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
@@ -198,6 +210,7 @@ def test_a_place_is_known_again_and_another_is_not() -> None:
     away = se2.compose(T, np.array((0.15, -0.1, 0.08)))
     frame = keep(9, away, away, scan_in(scene, away, HALF, np.random.default_rng(5)), 0.0)
     (found,) = look(frame, (candidate,), TOLD)
+    assert found.reason is LoopReason.NEAR
     np.testing.assert_allclose(found.T_submap_keyframe, se2.between(T, away), atol=0.02)
     other = np.array((12.5, 9.0, -1.2))
     stranger = keep(9, other, other, scan_in(scene, other, HALF, np.random.default_rng(5)), 0.0)
@@ -212,6 +225,7 @@ def test_a_far_place_is_found_by_search_and_a_round_room_has_none() -> None:
     frame = keep(9, away, away, scan_in(office(), away, HALF, np.random.default_rng(5)), 0.0)
     found = look_in(frame, unsure, TOLD)
     assert found is not None
+    assert found.reason is LoopReason.SEARCHED
     np.testing.assert_allclose(found.T_submap_keyframe, se2.between(T, away), atol=0.03)
     room = round_room()
     candidate, T = frame_at(room, np.array((0.1, 0.0, 0.0)))
