@@ -20,6 +20,7 @@ from daemon.budget import Budget
 from daemon.evidence import EARLY, Observer
 from daemon.inbox import Inbox, Taken
 from daemon.lampwatch import LampWatch
+from daemon.logs import of_state
 from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
@@ -254,7 +255,8 @@ class Cycle:
         before, self.verdict = self.verdict, judge(self.verdict, evidence)
         if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
             meaning, remedy = REASONS[self.verdict.reason]
-            log.info("%s: %s%s", self.verdict.state.name, meaning, f" ({remedy})" if remedy else "")
+            told, said = self.verdict.state.name, f" ({remedy})" if remedy else ""
+            log.info("%s: %s%s", told, meaning, said, extra=of_state(told, meaning, remedy))
         return self.verdict
 
     def _facts(self, t_mono: float) -> Facts:

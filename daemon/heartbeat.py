@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Final
 
 from daemon.health import ADC_NOUNS, WINDOW_S, Fault, Vitals, assess, describe
+from daemon.logs import of_fault
 from daemon.notify import notify
 
 log = logging.getLogger(__name__)
@@ -71,8 +72,8 @@ class Heartbeat:
         """Each fault is said once when it comes and once when it has gone."""
         for fault in faults:
             if fault not in self.faults and fault not in SAID_BY_DRIVER:
-                log.warning("%s", describe(fault))
+                log.warning("%s", describe(fault), extra=of_fault(fault))
         for fault in self.faults:
             if fault not in faults and fault not in SAID_BY_DRIVER:
-                log.info("over: %s", describe(fault))
+                log.info("over: %s", describe(fault), extra=of_fault(fault, over=True))
         self.faults = faults

@@ -9,10 +9,8 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
-import os
 import secrets
 import signal
-import sys
 import time
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
@@ -29,6 +27,7 @@ from daemon.cycle import Cycle, Pacemaker, Parts, Sink, Step
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.lights import Lights, SurveyError, load_lights, new_state
+from daemon.logs import start_log
 from daemon.network import Feeds, Network
 from daemon.notify import notify
 from daemon.photodiode import AdcMaker, BlockWatch, make_adc
@@ -58,7 +57,6 @@ EXTEND_US: Final = 30_000_000
 """Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
 """States in which there is a pose to speak of."""
-TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
 
 
 class LidarMaker(Protocol):
@@ -328,30 +326,3 @@ async def _run_until_signal(settings: Config, world: World, recorder: Recorder |
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     await Daemon(settings, world, recorder).run(stop)
-
-
-def start_log() -> None:
-    """Log to stderr: with the journal's priorities where the journal reads it, else with the time of day."""
-    handler = logging.StreamHandler(sys.stderr)
-    formatter = _JournalFormat("%(message)s") if _to_journal() else logging.Formatter(TERMINAL_FORMAT)
-    handler.setFormatter(formatter)
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
-
-
-def _to_journal() -> bool:
-    """Whether stderr is the journal's own stream and not redirected (systemd.exec(5), JOURNAL_STREAM)."""
-    try:
-        at = os.fstat(sys.stderr.fileno())
-    except (OSError, ValueError):
-        return False
-    return os.environ.get("JOURNAL_STREAM") == f"{at.st_dev}:{at.st_ino}"
-
-
-class _JournalFormat(logging.Formatter):
-    """Lines as sd-daemon(3) wants them: priority first, on every line of a message."""
-
-    PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
-
-    def format(self, record: logging.LogRecord) -> str:
-        prefix = f"<{self.PRIORITY.get(record.levelno, 6)}>"
-        return "\n".join(prefix + line for line in super().format(record).splitlines())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 import subprocess
 import sys
 import time
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon import main as module
+from daemon.logs import start_log
 from daemon.vitals import process_age_s, resident_mb
 
 ROOT = Path(__file__).parents[2]
@@ -34,33 +33,11 @@ def test_resident_memory_counts_what_is_touched() -> None:
     assert 45.0 < resident_mb() - before < 60.0
 
 
-@pytest.mark.parametrize("journal", [False, True])
-def test_log_lines_carry_a_priority_only_where_the_journal_reads_them(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, journal: bool
-) -> None:
-    root = logging.getLogger()
-    monkeypatch.setattr(root, "handlers", [])
-    with (tmp_path / "log").open("w+") as stream:
-        at = os.fstat(stream.fileno())
-        monkeypatch.setenv("JOURNAL_STREAM", f"{at.st_dev}:{at.st_ino}" if journal else "1:2")
-        monkeypatch.setattr(sys, "stderr", stream)
-        module.start_log()
-        logging.getLogger("daemon").warning("first line\nsecond line")
-        logging.getLogger("daemon").info("said")
-        stream.seek(0)
-        lines = stream.read().splitlines()
-    if journal:
-        assert lines == ["<4>first line", "<4>second line", "<6>said"]
-    else:
-        assert lines[0].endswith("WARNING first line")
-        assert len(lines) == 3
-
-
 def test_a_stream_without_a_descriptor_is_logged_to_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    module.start_log()
+    start_log()
     logging.getLogger("daemon").info("said")
     assert stream.getvalue().endswith("said\n")
