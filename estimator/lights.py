@@ -18,7 +18,8 @@ from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
-from estimator.lights_links import Sight, distrust, forget, judge, relearn, settled, sights, table, view_of
+from estimator.lights_links import Sight, distrust, forget, judge, relearn, sights, table, view_of
+from estimator.lights_memory import fresh_gains
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3, positive_part
@@ -108,7 +109,7 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
     """
     if not (np.isfinite(T_map_base).all() and np.isfinite(covariance).all()):
         return
-    old = lights.tracks[0] if lights.tracks else None
+    old = lights.tracks[0] if lights.tracks else lights.before
     keep_gains(lights)
     lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old)]
     lights.t_lost, lights.t_odd, lights.lost = math.inf, math.inf, False
@@ -116,7 +117,7 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
 
 def reset(lights: Lights) -> None:
     """Forget the place and everything learned about lamps; those that described themselves stay known."""
-    lights.tracks, lights.gains, lights.absent = [], {}, {}
+    lights.tracks, lights.gains, lights.absent, lights.before = [], {}, {}, None
     lights.t_lost, lights.t_odd, lights.lost, lights.result = math.inf, math.inf, False, None
 
 
@@ -188,14 +189,7 @@ def fits_prior(track: Track, place: Place) -> bool:
 
 def keep_gains(lights: Lights) -> None:
     """Remember the lamps' gains beyond the hypothesis that learned them, if it was worth believing."""
-    if len(lights.tracks) != 1 or not settled(lights.tracks[0]):
-        return
-    track = lights.tracks[0]
-    doubt = np.array((0.03, 0.01, 0.01)) ** 2
-    for lamp_id, slot in track.slots.items():
-        at = ekf.FIRST + ekf.OWN * slot
-        fresh = np.array((lights.catalogue.by_id[lamp_id].sigma_ln, *[lights.settings.model.lean] * 2)) ** 2
-        lights.gains[lamp_id] = track.x[at : at + 3].copy(), np.minimum(np.diag(track.P)[at : at + 3] + doubt, fresh)
+    lights.gains.update(fresh_gains(lights))
 
 
 def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:

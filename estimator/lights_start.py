@@ -126,7 +126,7 @@ def grid(x: float, y: float, reach: float) -> Array:
 
 def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> None:
     """Put up one hypothesis for every place and heading; what is known of gains and sensor errors is kept."""
-    old = lights.tracks[0] if lights.tracks else None
+    old = lights.tracks[0] if lights.tracks else lights.before
     lights.tracks = []
     for place in found:
         for yaw in yaws.tolist():

@@ -213,6 +213,7 @@ class Lights:
         absent: by lamp ID, (instant, way) since which it should be received but is not.
         corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
         lost: the last start was made necessary by a contradiction.
+        before: what an earlier run knew of the sensors, for the first hypothesis.
     """
 
     survey: Survey
@@ -232,4 +233,5 @@ class Lights:
     corrections: Corrections | None = None
     lean: tuple[float, float] = (0.0, 0.0)
     lost: bool = False
+    before: Track | None = None
     result: LightsResult | None = None

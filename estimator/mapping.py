@@ -15,7 +15,7 @@ from estimator.matchers import Matcher
 from estimator.records import Array, Scan
 from estimator.result import MatchResult
 from estimator.scanpoints import ScanPoints
-from estimator.state import State
+from estimator.state import Place, State
 
 PATIENCE = 3
 """Scans in a row that may fail to match before the local map is begun anew from the present one."""
@@ -122,8 +122,7 @@ def update_map(state: State, scan: Scan, points: ScanPoints) -> None:
 
 def retire(state: State, newest: Keyframe) -> None:
     """Bound what is kept per area: of the keyframes of one place and heading, the newest few stay."""
-    x, y, yaw = newest.T_map_keyframe.tolist()
-    place = (math.floor(2.0 * x), math.floor(2.0 * y), math.floor((yaw + math.pi) * 4.0 / math.pi) % 8)
+    place = square_of(newest.T_map_keyframe)
     here = [key for key in state.places.get(place, ()) if key in state.keyframes]
     here.append(newest.key)
     while len(here) > state.settings.keep:
@@ -131,3 +130,9 @@ def retire(state: State, newest: Keyframe) -> None:
         if state.settings.history:
             state.retired[gone.key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)
     state.places[place] = here
+
+
+def square_of(T_map_keyframe: Array) -> Place:
+    """Half metre square and eighth of a turn."""
+    x, y, yaw = T_map_keyframe.tolist()
+    return math.floor(2.0 * x), math.floor(2.0 * y), math.floor((yaw + math.pi) * 4.0 / math.pi) % 8

@@ -1,0 +1,71 @@
+"""What the `lights` filter has learned that outlasts a hypothesis, and the process: gains, sensors, lamps by their word."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator import ekf
+from estimator.lamps import Lamp
+from estimator.lights_links import settled
+from estimator.lights_state import Lights, Track
+from estimator.records import Array
+
+Learned = dict[int, tuple[Array, Array]]
+"""By lamp ID: means and variances of (ln gain, lean x, lean y)."""
+
+SENSORS = slice(ekf.SCALE, ekf.FIRST)
+"""States of motion sensing, receiver and floor, which are the same wherever the robot is."""
+
+DOUBT = np.array((0.03, 0.01, 0.01)) ** 2
+"""What a lamp's gain and lean lose by being remembered."""
+AGED = np.array((0.05, 0.02, 0.02)) ** 2
+"""What they lose from one run to the next: lamps age, and gather dust, while the robot is off."""
+
+
+def fresh_gains(lights: Lights) -> Learned:
+    """What the one hypothesis knows of its lamps, if it is worth believing."""
+    if len(lights.tracks) != 1 or not settled(lights.tracks[0]):
+        return {}
+    track, learned = lights.tracks[0], {}
+    for lamp_id, slot in track.slots.items():
+        at = ekf.FIRST + ekf.OWN * slot
+        P = np.diag(track.P)[at : at + 3] + DOUBT
+        learned[lamp_id] = track.x[at : at + 3].copy(), np.minimum(P, new_variance(lights, lamp_id))
+    return learned
+
+
+def new_variance(lights: Lights, lamp_id: int) -> Array:
+    """Of a lamp of which nothing has been learned."""
+    lean = lights.settings.model.lean
+    return np.array((lights.catalogue.by_id[lamp_id].sigma_ln, lean, lean)) ** 2
+
+
+def gains_known(lights: Lights) -> Learned:
+    """All that is known of the lamps' gains."""
+    return {**lights.gains, **fresh_gains(lights)}
+
+
+def sensors_known(lights: Lights) -> tuple[Array, Array] | None:
+    """Means and variances of :data:`SENSORS`, None while nothing worth keeping is known."""
+    known = lights.tracks[0] if len(lights.tracks) == 1 and settled(lights.tracks[0]) else lights.before
+    if known is None:
+        return None
+    return known.x[SENSORS].copy(), np.diag(known.P)[SENSORS].copy()
+
+
+def recall(lights: Lights, gains: Learned, sensors: tuple[Array, Array] | None, lamps: tuple[Lamp, ...]) -> None:
+    """Begin with what an earlier run has learned. The survey wins over what a lamp said of itself then.
+
+    A lamp known by its own word is not among those that may be let go until it is heard again.
+    """
+    catalogue = lights.catalogue
+    for lamp in lamps:
+        if lamp.lamp_id not in catalogue.by_id:
+            catalogue.add(lamp)
+    for lamp_id, (mean, variance) in gains.items():
+        if lamp_id in catalogue.by_id:
+            lights.gains[lamp_id] = mean.copy(), np.minimum(variance + AGED, new_variance(lights, lamp_id))
+    if sensors is not None:
+        mean, variance = sensors
+        lights.before = Track()
+        lights.before.x[SENSORS], lights.before.P[SENSORS, SENSORS] = mean, np.diag(variance)
