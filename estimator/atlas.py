@@ -132,6 +132,7 @@ class Atlas:
             answer, by job ID. look, solution: IDs of the latest jobs of these kinds.
         stale: whether the graph has changed since it was solved.
         closures: loops accepted so far. news: the latest, until it was reported.
+        adrift: key of the first submap whose place in the map is not known, with all later ones; None: all are known.
     """
 
     submaps: dict[int, Submap] = field(default_factory=dict)
@@ -152,6 +153,7 @@ class Atlas:
     stale: bool = False
     closures: int = 0
     news: Loop | None = None
+    adrift: int | None = None
 
     @property
     def newest(self) -> Submap | None:

@@ -1,6 +1,8 @@
-"""What the `lights` filter has learned that outlasts a hypothesis, and the process: gains, sensors, lamps by their word."""
+"""What the `lights` filter has learned that outlasts a hypothesis, and the process."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,7 +12,7 @@ from estimator.lights_links import settled
 from estimator.lights_state import Lights, Track
 from estimator.records import Array
 
-Learned = dict[int, tuple[Array, Array]]
+Learned = Mapping[int, tuple[Array, Array]]
 """By lamp ID: means and variances of (ln gain, lean x, lean y)."""
 
 SENSORS = slice(ekf.SCALE, ekf.FIRST)
@@ -26,7 +28,8 @@ def fresh_gains(lights: Lights) -> Learned:
     """What the one hypothesis knows of its lamps, if it is worth believing."""
     if len(lights.tracks) != 1 or not settled(lights.tracks[0]):
         return {}
-    track, learned = lights.tracks[0], {}
+    track = lights.tracks[0]
+    learned = {}
     for lamp_id, slot in track.slots.items():
         at = ekf.FIRST + ekf.OWN * slot
         P = np.diag(track.P)[at : at + 3] + DOUBT
