@@ -224,6 +224,15 @@ class ModbusConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     write: Annotated[bool, Meta(description="true to accept writes (commands, odometry)")] = False
 
 
+class IntegrityConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """The bound on the position error that is published with every pose, and what it may be."""
+
+    alert_m: Annotated[
+        float,
+        Meta(ge=0.0, le=60.0, description="metres; an alert is raised while the position error may be larger; 0: none"),
+    ] = 0.0
+
+
 class PoseConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """UDP pose datagrams, one per cycle."""
 
@@ -254,6 +263,7 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     cycle: CycleConfig = CycleConfig()
     modbus: ModbusConfig = ModbusConfig()
     pose: PoseConfig = PoseConfig()
+    integrity: IntegrityConfig = IntegrityConfig()
 
     def __post_init__(self) -> None:
         if not _is_address(self.bind):

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+from daemon.alarm import Alarm
 from daemon.bridge import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
 from daemon.budget import Budget
 from daemon.evidence import EARLY, Observer
@@ -24,8 +25,8 @@ from daemon.logs import of_state
 from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
-from daemon.publish.snapshot import Snapshot
-from daemon.state import REASONS, SILENT_PERIODS, Memory, judge
+from daemon.publish.snapshot import Snapshot, Trust
+from daemon.state import REASONS, SILENT_PERIODS, Evidence, Memory, bounded, judge
 from daemon.worker import Worker
 from estimator.records import Command, LightEpoch, Limits, Order, Record, SampleBlock
 from estimator.result import StepResult
@@ -89,6 +90,7 @@ class Parts:
         budget_us: time budget of a cycle, 0: half of the scan period.
         stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
         fault: number of the gravest present fault. map_id: identity of the map frame.
+        alert_m: limit of the position error above which an alert is raised, 0: none.
     """
 
     clock: Clock
@@ -107,6 +109,7 @@ class Parts:
     tap: Tap | None = None
     fault: Callable[[], int] = int
     map_id: int = 0
+    alert_m: float = 0.0
 
 
 class Cycle:
@@ -116,6 +119,7 @@ class Cycle:
         cycles, overruns: so far. cycle_us: duration of the latest. failing: numbers of the sinks that raise.
         verdict: what is said about the pose. result: of the latest step.
         blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
+        alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -134,6 +138,8 @@ class Cycle:
         self.failing: set[int] = set()
         self.blocks = 0
         self.lamps = LampWatch()
+        self.alarm = Alarm(parts.alert_m)
+        self.trust = Trust(limit_m=parts.alert_m or None, alert=self.alarm.on)
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
@@ -253,11 +259,31 @@ class Cycle:
         """What may be said about the pose; a change goes to the log."""
         evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
         before, self.verdict = self.verdict, judge(self.verdict, evidence)
+        self.trust = self._trust(t_mono, evidence)
         if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
             meaning, remedy = REASONS[self.verdict.reason]
             told, said = self.verdict.state.name, f" ({remedy})" if remedy else ""
             log.info("%s: %s%s", told, meaning, said, extra=of_state(told, meaning, remedy))
         return self.verdict
+
+    def _trust(self, t_mono: float, evidence: Evidence) -> Trust:
+        """The bound on the error of the pose, as far as the state lets it stand, and whether it is above its limit."""
+        result, limit_m = self.result, self.alarm.limit_m or None
+        gap = None if result is None else result.gap
+        protection = None if result is None else result.protection
+        if protection is None or not bounded(self.verdict, evidence):
+            return Trust(limit_m=limit_m, alert=self.alarm.take(t_mono, None), gap=gap, places=evidence.places)
+        return Trust(
+            horizontal_m=protection.horizontal_m,
+            yaw_rad=protection.yaw_rad,
+            limit_m=limit_m,
+            alert=self.alarm.take(t_mono, protection.horizontal_m),
+            laser=protection.laser,
+            light=protection.light,
+            wheels=protection.wheels,
+            gap=gap,
+            places=evidence.places,
+        )
 
     def _facts(self, t_mono: float) -> Facts:
         parts, alive = self.parts, self.lidar_ok(t_mono)
@@ -277,6 +303,7 @@ class Cycle:
             blocks_lost=self.blocks_lost(),
             odometry_ok=self.observer.odometry_ok(t_mono),
             fault=parts.fault(),
+            trust=self.trust,
         )
 
     def _publish(self, snapshot: Snapshot) -> None:

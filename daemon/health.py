@@ -45,6 +45,7 @@ class Fault(IntEnum):
     ODOMETRY_SILENT = 201
     ODOMETRY_JUMPS = 202
     ODOMETRY_DISAGREES = 203
+    PROTECTION_ALERT = 251
     LOOP_STALLED = 301
     OVERRUNS = 302
     WORKER_FAILED = 303
@@ -131,6 +132,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "odometry and laser disagree",
         "wheel slip; if it lasts, check odometry scale and lidar mount",
     ),
+    Fault.PROTECTION_ALERT: (
+        "the position error may be above the limit that is set, `integrity.alert_m`",
+        "read state and reason; drive to where the pose is known, or set a limit that the place allows",
+    ),
     Fault.LOOP_STALLED: ("the process did not get to run for two scan periods", "take load off the computer"),
     Fault.OVERRUNS: ("more than 5 % of the cycles exceed their budget", "take load off the computer"),
     Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
@@ -162,6 +167,7 @@ class Vitals:
         blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked beyond the decoder's reach.
         lamps: what is wrong with lamps and survey.
         cycles, overruns, jobs_failed: counters. lateness: worst lateness of the loop lately, seconds.
+        alert: the bound on the position error is above the limit that is set, and was not before.
         failed: names of parts that are down at the moment.
     """
 
@@ -189,6 +195,7 @@ class Vitals:
     overruns: int = 0
     jobs_failed: int = 0
     lateness: float = 0.0
+    alert: bool = False
     failed: frozenset[str] = frozenset()
 
 
@@ -264,6 +271,8 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.ODOMETRY_JUMPS
     if now.disagree:
         yield Fault.ODOMETRY_DISAGREES
+    if now.alert:
+        yield Fault.PROTECTION_ALERT
 
 
 def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:

@@ -160,6 +160,7 @@ class Daemon:
                 stopwatch=world.stopwatch,
                 tap=None if recorder is None else recorder.on_cycle,
                 map_id=world.draw_map_id(),
+                alert_m=settings.integrity.alert_m,
             )
         )
         self.pacemaker = Pacemaker(self.cycle)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from daemon.publish.lights import ROWS
-from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot
+from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
 from daemon.state import Memory
 from estimator import se2
 from estimator.records import Array
-from estimator.result import Fix, Link, LinkState, StepResult
+from estimator.result import Fix, Link, LinkState, Loop, StepResult
 
 Triple = tuple[float, float, float]
 
@@ -39,6 +39,7 @@ class Facts:
     blocks_lost: int = 0
     odometry_ok: bool | None = None
     fault: int = 0
+    trust: Trust = Trust()
 
 
 @dataclass(slots=True)
@@ -51,14 +52,15 @@ class Painter:
 
     map_id: int = 0
     _seq: int = 0
-    _loop: tuple[int, int | None, int | None] = (0, None, None)
+    _loop: Loop | None = None
     _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
 
     def paint(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
         """One snapshot of this moment."""
         self._seq += 1
         if result is not None and result.loop is not None:
-            self._loop = (result.loop.counter, result.loop.keyframe_new, result.loop.keyframe_old)
+            self._loop = result.loop
+        loop = self._loop
         estimate = None if result is None or not math.isfinite(result.t_mono) else result
         received = _received(result, facts)
         return Snapshot(
@@ -76,9 +78,11 @@ class Painter:
             known=verdict.known,
             jumps=0 if estimate is None else estimate.jumps,
             map_id=self.map_id,
-            loop_counter=self._loop[0],
-            loop_new=self._loop[1],
-            loop_old=self._loop[2],
+            loop_counter=0 if loop is None else loop.counter,
+            loop_new=None if loop is None else loop.keyframe_new,
+            loop_old=None if loop is None else loop.keyframe_old,
+            loop_reason=None if loop is None else LOOPS[loop.reason],
+            loop_residual=None if loop is None else loop.residual_m,
             links=None if facts.adc_ok is None else len(received),
             light_id=received[0].lamp_id if received else None,
             light=None if facts.adc_ok is None else _light(result, facts, self._shown(result)),
@@ -90,6 +94,7 @@ class Painter:
             adc_ok=facts.adc_ok,
             odometry_ok=facts.odometry_ok,
             fault=facts.fault,
+            trust=facts.trust,
         )
 
     def _shown(self, result: StepResult | None) -> tuple[LightLink, ...]:

@@ -32,6 +32,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         overruns=cycle.overruns,
         jobs_failed=parts.worker.failed,
         lateness=lateness,
+        alert=cycle.alarm.said,
         failed=frozenset(failed) | (frozenset(["publisher"]) if cycle.failing else frozenset()),
     )
 

@@ -179,6 +179,21 @@ class LightsResult:
     t_pose: float = -math.inf
 
 
+@dataclass(frozen=True, slots=True)
+class Protection:
+    """Bound on the error of T_map_base at the stated risk, if the place is not in doubt (`estimator/protection.py`).
+
+    Attributes:
+        horizontal_m, yaw_rad: the bounds. laser, light, wheels: what they rest on; the wheels are shared by both.
+    """
+
+    horizontal_m: float
+    yaw_rad: float
+    laser: bool
+    light: bool
+    wheels: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StepResult:
     """The estimate after one `step`.
@@ -199,6 +214,7 @@ class StepResult:
             between T_map_base and the lights' own at the latest epoch, None where that cannot be said.
         anew: how often the local map has been begun anew because nothing fitted the old one: since then the place in
             the map is a guess.
+        protection: bound on the error of T_map_base; None: none can be given.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
@@ -218,4 +234,5 @@ class StepResult:
     placed: bool = False
     gap: float | None = None
     anew: int = 0
+    protection: Protection | None = None
     jobs: tuple[Job, ...] = ()

@@ -13,11 +13,11 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from daemon.publish import lights, registers
+from daemon.publish import integrity, lights, registers
 from daemon.publish.points import U16, Value
 from daemon.publish.snapshot import LightFix, LinkUse, State
 
@@ -86,19 +86,26 @@ class Reader:
                     "right HOST:PORT"
                 ) from error
             reading = self._reading(answer)
-            return reading if reading["links"] is None else reading | self._lights()
+            reading |= self._block(integrity.ADDRESS, integrity.BLOCK_WORDS, integrity.decode_integrity)
+            if reading["links"] is not None:
+                reading |= self._block(lights.ADDRESS, lights.BLOCK_WORDS, lights.decode_lights)
+            return reading
         raise NoAnswer(
             f"{self._where}: no answer within {_TRIES * _TIMEOUT_S:g} s; check that the daemon runs, that its `bind` "
             "is not the loopback address of another computer, and that no firewall drops UDP"
         )
 
-    def _lights(self) -> Reading:
-        """The block of lights; nothing where the daemon is of a version without it."""
+    def _block(self, address: int, words: int, decode: Callable[[bytes], Reading]) -> Reading:
+        """A block beside the first one; nothing where the daemon is of a version without it."""
         for _ in range(_TRIES):
-            with contextlib.suppress(OSError, ValueError):
-                reading = lights.decode_lights(self._ask(lights.ADDRESS, lights.BLOCK_WORDS)[_ANSWER.size :])
-                del reading["seq"]
-                return reading
+            with contextlib.suppress(OSError):
+                answer = self._ask(address, words)
+                if len(answer) == _ANSWER.size and answer[7] & 0x80:
+                    return {}  # no such block
+                with contextlib.suppress(ValueError):
+                    reading = decode(answer[_ANSWER.size :])
+                    del reading["seq"]
+                    return reading
         return {}
 
     def _ask(self, address: int, count: int) -> bytes:
@@ -192,6 +199,8 @@ def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
         "devices": registers.decode_bits(registers.DEVICES, reading["devices"]),
         "stalled": stalled,
     }
+    if "witnesses" in reading:
+        spelled |= {"witnesses": registers.decode_bits(integrity.WITNESSES, reading["witnesses"])}
     if "light_fix" in reading:
         spelled |= {"light_fix": _fix(reading), "light_links": [dict(link) for link in _links(reading)]}
     return {key: value for key, value in reading.items() if not key.startswith("link_")} | spelled
@@ -219,6 +228,7 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("fault", _meaning("fault", reading["fault"])),
         ("map pose", _pose(reading, "map") + _unknown_axes(flags)),
         ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
+        *_trust(reading),
         ("odom pose", _pose(reading, "odom")),
         ("speed", _triple(reading, ("v_x", "v_y", "yaw_rate"), "m/s", "/s")),
         ("age", _bounded(reading["age"], "s")),
@@ -279,6 +289,23 @@ def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) 
     return f"{_bounded(x, unit)}, {_bounded(y, unit)}, {_angle(yaw)}{per}"
 
 
+def _trust(reading: Reading) -> list[tuple[str, str]]:
+    """The bound on the error, what it rests on, and whether it is above the limit that is set."""
+    if "witnesses" not in reading:
+        return []
+    bits = registers.decode_bits(integrity.WITNESSES, reading["witnesses"])
+    if reading["protection"] is None:
+        text = "none"
+    else:
+        names = {"laser_bounds": "laser", "light_bounds": "light", "wheels_bound": "wheels"}
+        rests = ", ".join(name for bit, name in names.items() if bits[bit])
+        text = f"{_number(reading['protection'], 'm', 3)}, {_angle(reading['protection_yaw'])} ({rests})"
+    limit = reading["alert_limit"]
+    alert = "" if limit is None else f"{'  ALERT' if bits['alert'] else ''}, limit {limit:.3f} m"
+    places = reading["places"]
+    return [("bound", text + alert), *([] if places is None else [("places", f"{places:g} fit")])]
+
+
 def _lights(reading: Reading) -> list[tuple[str, str]]:
     """How many lamps, what lights alone say, and a line for every link."""
     if reading["links"] is None:
@@ -318,7 +345,8 @@ def _unknown_axes(flags: dict[str, bool]) -> str:
 def _loops(reading: Reading) -> str:
     if reading["loop_new"] is None:
         return f"{reading['loop_counter']}"
-    return f"{reading['loop_counter']}, latest: keyframe {reading['loop_new']} to {reading['loop_old']}"
+    fits = f", residual {_number(reading['loop_residual'], 'm')}" if reading.get("loop_residual") is not None else ""
+    return f"{reading['loop_counter']}, latest: keyframe {reading['loop_new']} to {reading['loop_old']}{fits}"
 
 
 def _devices(word: Value) -> str:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.health import FAULTS
-from daemon.publish import holding, lights, modbus, registers, requests
+from daemon.publish import holding, integrity, lights, modbus, registers, requests
 from daemon.publish.points import Layout, Point, Rule
-from daemon.publish.snapshot import LightFix, LinkUse, State
+from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
 from daemon.state import REASONS
 from hal import input_codec, inputs
 
@@ -151,6 +151,7 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 {table(("address", "name", "type", "unit", "meaning"), mirror)}
 
 {_lights()}
+{_integrity()}
 {_writing()}
 ## Limits
 
@@ -208,6 +209,33 @@ begins at {start} + {width} (k - 1), and the table shows the first.
 """
 
 
+_LOOPS: Final[dict[LoopReason, str]] = {
+    LoopReason.OTHER: "something that this version does not know",
+}
+
+
+def _integrity() -> str:
+    first = integrity.ADDRESS
+    last = first + integrity.BLOCK_WORDS - 1
+    block = [
+        (str(first), "`magic`", "uint16", "", "", f"0x{integrity.MAGIC:04X} (\"LP\")."),
+        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {integrity.VERSION}."),
+        *_rows(integrity.BLOCK, integrity.BODY_ADDRESS, 1),
+        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
+    ]  # fmt: skip
+    return f"""## Integrity: input registers {first} to {last}
+
+How far the pose can be trusted; what a protection level is, and at which risk it holds, says
+[Integrity](integrity.md). Read **{integrity.BLOCK_WORDS} registers from address {first} in one request**.
+
+{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+
+{table(("bit of `witnesses`", "name", "set when"), _bit_rows(integrity.WITNESSES))}
+
+{table(("`loop_reason`", "name", "meaning"), [(str(why.value), why.name, _LOOPS[why]) for why in LoopReason])}
+"""
+
+
 def _capital(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
@@ -258,9 +286,11 @@ def udp_page() -> str:
         ("0", "`magic`", "4 bytes", "", "", f'"{registers.DATAGRAM_MAGIC.decode()}".'),
         ("4", "`version`", "uint16", "", "", f"{registers.VERSION}."),
         ("6", "`length`", "uint16", "", "", f"Bytes of the whole datagram, {registers.DATAGRAM_SIZE} or more; "
-         f"{registers.SMALLEST_DATAGRAM} from programs that knew no lights, which sent no more than `devices`."),
+         f"{registers.SMALLEST_DATAGRAM} from programs that knew no lights, which sent no more than `devices`; "
+         f"{registers.TRUST_OFFSET + 4} from those that sent no more than `light_age`."),
         *_rows(registers.BODY, registers.BODY_OFFSET, 2),
         *_rows(lights.TAIL, registers.TAIL_OFFSET, 2),
+        *_rows(integrity.TAIL, registers.TRUST_OFFSET, 2),
         ("length - 4", "`crc`", "uint32", "", "", f"CRC-32 of all bytes before it (at {crc} in this version)."),
     ]  # fmt: skip
     return f"""{_NOTICE}
@@ -277,7 +307,7 @@ reader in C is `tools/clients/listen_pose.c`.
 
 {table(("byte", "name", "type", "step", "not known", "meaning"), rows)}
 
-States, reasons, faults, the numbers of `light_fix` and the bits of `flags` and `devices` are those of
+States, reasons, faults, the numbers of `light_fix` and the bits of `flags`, `devices` and `witnesses` are those of
 [Modbus](modbus.md), where every single link can be read too.
 
 ## Odometry and IMU datagrams

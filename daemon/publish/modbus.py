@@ -21,6 +21,7 @@ from typing import Final
 
 from daemon.publish import registers
 from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
+from daemon.publish.integrity import encode_integrity
 from daemon.publish.lights import encode_lights
 from daemon.publish.requests import MAX_FRAME, Responder, frame_size
 from daemon.publish.snapshot import Snapshot, State
@@ -312,8 +313,8 @@ class ModbusPublisher:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; never waits."""
-        make_mirror, make_lights = partial(registers.encode_mirror, snapshot), partial(encode_lights, snapshot)
-        self._responder.show(registers.encode_block(snapshot), make_mirror, make_lights)
+        encoders = (registers.encode_mirror, encode_lights, encode_integrity)
+        self._responder.show(registers.encode_block(snapshot), *[partial(encode, snapshot) for encode in encoders])
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:
         """Tell the client what became of its command."""

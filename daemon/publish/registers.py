@@ -4,10 +4,11 @@ The points of :data:`BODY` are the same, in the same order and scale, in both fo
 around them differ::
 
     Modbus    magic u16, version u16 | BODY, big-endian, high word first  | seq_end u32        64 registers at 0
-    datagram  "LUMI",    version u16, length u16 | BODY, TAIL, little-endian | CRC-32          156 bytes
+    datagram  "LUMI",    version u16, length u16 | BODY, two tails, little-endian | CRC-32     172 bytes
     mirror    seq u32 | float32 of every scaled point, covariance | seq_end u32                at 100
 
-TAIL, and a block of registers with every link, are in :mod:`daemon.publish.lights`.
+The tails are TAIL of :mod:`daemon.publish.lights` and of :mod:`daemon.publish.integrity`; each has a block of registers
+of its own.
 
 Every 32- and 64-bit point is naturally aligned in the datagram. The contract: a point never moves and never changes its
 meaning under the same version number (a frozen copy of the layout is compared in the tests). A datagram may grow at its
@@ -23,7 +24,7 @@ from collections.abc import Callable
 from operator import attrgetter
 from typing import Final
 
-from daemon.publish.lights import TAIL
+from daemon.publish import integrity, lights
 from daemon.publish.points import I16, I32, U16, U32, U64, FloatPoint, Layout, Point, Rule, Value
 from daemon.publish.snapshot import Snapshot, State
 
@@ -105,6 +106,8 @@ FLAGS: Final[tuple[Bit, ...]] = (
         "at least one loop closure since the start; `loop_counter` tells each",
         lambda s: s.loop_counter > 0,
     ),
+    ("bounded", "there is a bound on the error of the map pose: `protection`", lambda s: s.trust.horizontal_m is not None),
+    ("alert", "the bound is above the limit that is set, or there is none", lambda s: s.trust.alert),
 )
 DEVICES: Final[tuple[Bit, ...]] = (
     ("lidar_fitted", "a lidar is configured", lambda s: s.lidar_ok is not None),
@@ -210,9 +213,11 @@ _DATAGRAM_HEAD: Final = struct.Struct("<4sHH")
 _CRC: Final = struct.Struct("<I")
 BODY_OFFSET: Final = _DATAGRAM_HEAD.size
 TAIL_OFFSET: Final = BODY_OFFSET + BODY.little.size
+TRUST_OFFSET: Final = TAIL_OFFSET + lights.TAIL.little.size
 SMALLEST_DATAGRAM: Final = TAIL_OFFSET + _CRC.size
 """Without a tail, as the first programs of this version sent it."""
-DATAGRAM_SIZE: Final = SMALLEST_DATAGRAM + TAIL.little.size
+DATAGRAM_SIZE: Final = TRUST_OFFSET + integrity.TAIL.little.size + _CRC.size
+_TAILS: Final = ((TAIL_OFFSET, lights.TAIL), (TRUST_OFFSET, integrity.TAIL))
 
 
 def encode_block(snapshot: Snapshot) -> bytes:
@@ -230,7 +235,8 @@ def encode_mirror(snapshot: Snapshot) -> bytes:
 def encode_datagram(snapshot: Snapshot) -> bytes:
     """The UDP pose datagram (little-endian, CRC-32 of everything before it at the end)."""
     head = _DATAGRAM_HEAD.pack(DATAGRAM_MAGIC, VERSION, DATAGRAM_SIZE)
-    data = head + BODY.little.pack(*BODY.raw(snapshot)) + TAIL.little.pack(*TAIL.raw(snapshot))
+    tails = b"".join([tail.little.pack(*tail.raw(snapshot)) for _, tail in _TAILS])
+    data = head + BODY.little.pack(*BODY.raw(snapshot)) + tails
     return data + _CRC.pack(zlib.crc32(data))
 
 
@@ -288,8 +294,9 @@ def decode_datagram(data: bytes) -> dict[str, Value]:
     if crc != zlib.crc32(data[: length - _CRC.size]):
         raise ValueError("damaged datagram: CRC-32 differs")
     values = BODY.values(BODY.little.unpack_from(data, BODY_OFFSET))
-    if length >= DATAGRAM_SIZE:
-        values |= TAIL.values(TAIL.little.unpack_from(data, TAIL_OFFSET))
+    for offset, tail in _TAILS:
+        if length >= offset + tail.little.size + _CRC.size:
+            values |= tail.values(tail.little.unpack_from(data, offset))
     return values
 
 

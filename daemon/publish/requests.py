@@ -29,7 +29,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterResponse,
 )
 
-from daemon.publish import lights
+from daemon.publish import integrity, lights
 from daemon.publish.holding import Holding, Refused
 from daemon.publish.registers import MIRROR_ADDRESS, MIRROR_WORDS
 
@@ -45,6 +45,14 @@ MAX_WRITE: Final = 123
 _READ: Final = struct.Struct(">HHHBBHH")
 _READ_ANSWER: Final = struct.Struct(">HHHBBB")
 _FIXED_BODY: Final = 5  # function, address, count or value
+
+Make = Callable[[], bytes]
+_BESIDE: Final = (
+    (MIRROR_ADDRESS, MIRROR_WORDS),
+    (lights.ADDRESS, lights.BLOCK_WORDS),
+    (integrity.ADDRESS, integrity.BLOCK_WORDS),
+)
+"""First address and size of the blocks beside the first one, in the order in which they are shown."""
 
 
 def frame_size(data: bytes | bytearray) -> int:
@@ -68,20 +76,17 @@ class Responder:
         self._holding = holding
         self._framer = FramerSocket(DecodePDU(is_server=True))
         self._block = b""
-        self._make: tuple[Callable[[], bytes], Callable[[], bytes]] = (bytes, bytes)
-        self._mirror: bytes | None = None
-        self._lights: bytes | None = None
+        self._make: tuple[Make, ...] = ()
+        self._made: dict[int, bytes] = {}
 
-    def show(
-        self, block: bytes, make_mirror: Callable[[], bytes] = bytes, make_lights: Callable[[], bytes] = bytes
-    ) -> None:
+    def show(self, block: bytes, *beside: Make) -> None:
         """Put all blocks in place at once: no answer ever mixes two snapshots.
 
-        ``make_mirror`` and ``make_lights`` make the blocks of the same snapshot that few clients read; they are called
-        when those are read.
+        ``beside`` make the blocks of the same snapshot that few clients read (float mirror, lights, integrity); they
+        are called when those are read.
         """
         self._block = block
-        self._make, self._mirror, self._lights = (make_mirror, make_lights), None, None
+        self._make, self._made = beside, {}
 
     def answer(self, frame: bytes) -> bytes:
         """The answer to one whole frame, which :func:`frame_size` has found good."""
@@ -132,12 +137,11 @@ class Responder:
 
     def _registers(self, address: int, count: int, holding: bool) -> bytes:
         start, memory = 0, self._block
-        if lights.ADDRESS <= address < lights.ADDRESS + lights.BLOCK_WORDS:
-            self._lights = self._lights if self._lights is not None else self._make[1]()
-            start, memory = lights.ADDRESS, self._lights
-        elif MIRROR_ADDRESS <= address < MIRROR_ADDRESS + MIRROR_WORDS:
-            self._mirror = self._mirror if self._mirror is not None else self._make[0]()
-            start, memory = MIRROR_ADDRESS, self._mirror
+        for (first, words), make in zip(_BESIDE, self._make, strict=False):
+            if first <= address < first + words:
+                if first not in self._made:
+                    self._made[first] = make()
+                start, memory = first, self._made[first]
         if 2 * (address - start + count) <= len(memory):
             return memory[2 * (address - start) : 2 * (address - start + count)]
         if holding and self._holding is not None:

@@ -49,6 +49,12 @@ class LinkUse(IntEnum):
     PAUSED = 9  # clear, but not among those that are used (Link_n)
 
 
+class LoopReason(IntEnum):
+    """Why a loop closure was accepted (`estimator.result.Loop`). Numbers are part of the contract."""
+
+    OTHER = 0  # something that this version does not know
+
+
 @dataclass(frozen=True, slots=True)
 class LightLink:
     """One lamp in view.
@@ -90,6 +96,29 @@ class LightPicture:
 
 
 @dataclass(frozen=True, slots=True)
+class Trust:
+    """How far the pose can be trusted; None: not known.
+
+    Attributes:
+        horizontal_m, yaw_rad: protection level, a bound on the error of the map pose (docs/integrity.md); None: none.
+        limit_m: alert limit that is set; None: none. alert: the bound is above it, or there is none.
+        laser, light, wheels: what the bound rests on.
+        gap: squared Mahalanobis distance between the pose and the one from light alone.
+        places: how many places fit while the place is looked for; None: it is known.
+    """
+
+    horizontal_m: float | None = None
+    yaw_rad: float | None = None
+    limit_m: float | None = None
+    alert: bool = False
+    laser: bool = False
+    light: bool = False
+    wheels: bool = False
+    gap: float | None = None
+    places: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """What is published after one cycle. SI units, `T_map_base` unless said otherwise; None: not known.
 
@@ -102,12 +131,13 @@ class Snapshot:
         known: (x, y, yaw) whether the axis is observed.
         reason: index into the table of reasons (daemon/state.py), 0: none.
         jumps: how often T_map_odom jumped. map_id: identity of the map frame, 0: not known.
-        loop_counter: accepted loop closures; loop_new, loop_old: keyframe IDs of the latest, None before the first.
+        loop_counter: accepted loop closures; loop_new, loop_old: keyframe IDs of the latest, None before the first;
+            loop_reason (:class:`LoopReason`), loop_residual (m): likewise.
         links: lights in view; None where no photodiode is configured. light_id: the strongest's lamp ID.
         light: what lights alone say; None where no photodiode is configured.
         scan_rate: scans per second. missed: scans lost. overruns: cycles over budget. cycle_us: last cycle's duration.
         lidar_ok, adc_ok, odometry_ok: None where not configured.
-        fault: number of the gravest present fault, 0: none.
+        fault: number of the gravest present fault, 0: none. trust: how far the pose can be trusted.
     """
 
     seq: int
@@ -138,3 +168,6 @@ class Snapshot:
     adc_ok: bool | None = None
     odometry_ok: bool | None = None
     fault: int = 0
+    trust: Trust = Trust()
+    loop_reason: int | None = None
+    loop_residual: float | None = None

@@ -1,0 +1,60 @@
+"""The alert: raised while the bound on the position error is above the limit that is set, or there is none."""
+
+from __future__ import annotations
+
+import logging
+from typing import Final
+
+CLEAR_S: Final = 1.0
+"""The bound has to be within the limit for this long before the alert is over: it must not chatter."""
+
+log = logging.getLogger(__name__)
+
+
+class Alarm:
+    """Compares the bound with the limit, cycle by cycle; what changes goes to the log, once.
+
+    Args:
+        limit_m: metres, 0: no alert is ever raised.
+
+    Attributes:
+        on: the alert is raised. With a limit it is raised until the first bound says otherwise: who knows nothing does
+            not say that all is well. said: it has gone to the log.
+    """
+
+    def __init__(self, limit_m: float = 0.0) -> None:
+        self.limit_m = limit_m
+        self.on = limit_m > 0.0
+        self.said = False
+        self._within_since: float | None = None
+        self._was_within = False
+
+    def take(self, t_mono: float, bound_m: float | None) -> bool:
+        """Take one cycle's bound (None: there is none) and say whether the alert is raised."""
+        if self.limit_m <= 0.0:
+            return False
+        if bound_m is None or not bound_m <= self.limit_m:
+            self._within_since = None
+            self._raise(bound_m)
+        else:
+            self._within_since = t_mono if self._within_since is None else self._within_since
+            if t_mono - self._within_since >= CLEAR_S:
+                self._clear(bound_m)
+        return self.on
+
+    def _raise(self, bound_m: float | None) -> None:
+        self.on = True
+        if self._was_within and not self.said:  # before the first bound there is nothing to be alarmed about
+            said = "there is no bound on it" if bound_m is None else f"it may be {bound_m:.2f} m"
+            log.warning(
+                "alert: the position error may be above the limit of %.2f m that `integrity.alert_m` sets: %s; stop or "
+                "go slow, read state and reason, and drive to where the pose is known",
+                self.limit_m,
+                said,
+            )
+            self.said = True
+
+    def _clear(self, bound_m: float) -> None:
+        if self.said:
+            log.info("alert over: the position error is below %.2f m, the limit is %.2f m", bound_m, self.limit_m)
+        self.on, self.said, self._was_within = False, False, True
