@@ -5,10 +5,22 @@ from __future__ import annotations
 import logging
 from typing import Final
 
+from daemon.state import HELD, Evidence, Memory
+
 CLEAR_S: Final = 1.0
 """The bound has to be within the limit for this long before the alert is over: it must not chatter."""
 
 log = logging.getLogger(__name__)
+
+
+def bounded(memory: Memory, evidence: Evidence) -> bool:
+    """Whether a bound on the error of the pose can stand: the place is not in doubt.
+
+    A bound assumes that the pose is about right and says how wrong it may be. Of a place that is being looked for, was
+    lost, was laid upon a guess, or that light contradicts, nothing of that kind can be said.
+    """
+    in_doubt = memory.doubt or evidence.guessed or evidence.places is not None or memory.odd_since is not None
+    return memory.state in HELD and not in_doubt
 
 
 class Alarm:

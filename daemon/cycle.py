@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from daemon.alarm import Alarm
+from daemon.alarm import Alarm, bounded
 from daemon.bridge import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
 from daemon.budget import Budget
 from daemon.evidence import EARLY, Observer
@@ -26,7 +26,7 @@ from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot, Trust
-from daemon.state import REASONS, SILENT_PERIODS, Evidence, Memory, bounded, judge
+from daemon.state import REASONS, SILENT_PERIODS, Evidence, Memory, judge
 from daemon.worker import Worker
 from estimator.records import Command, LightEpoch, Limits, Order, Record, SampleBlock
 from estimator.result import StepResult

@@ -12,12 +12,15 @@ from daemon.state import Memory
 from estimator import se2
 from estimator.records import Array
 from estimator.result import Fix, Link, LinkState, Loop, StepResult
+from estimator.result import LoopReason as Why
 
 Triple = tuple[float, float, float]
 
 UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
 """Links that are listed and not received."""
+NO_TRUST: Final = Trust()
 USES: Final = {state: LinkUse.__members__.get(state.name, LinkUse.OTHER) for state in LinkState}
+LOOPS: Final = {why: LoopReason.__members__.get(why.name, LoopReason.OTHER) for why in Why}
 LONGEST_CARRY_PERIODS: Final = 3.0
 """A velocity is not carried further than this many scan periods; beyond, nothing is predicted."""
 
@@ -39,7 +42,7 @@ class Facts:
     blocks_lost: int = 0
     odometry_ok: bool | None = None
     fault: int = 0
-    trust: Trust = Trust()
+    trust: Trust = NO_TRUST
 
 
 @dataclass(slots=True)

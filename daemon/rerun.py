@@ -129,6 +129,7 @@ class Rerun:
             blocks=None if lights is None else BlockWatch(AdcStatus(), lights.profile),
             budget_us=1e3 * config.cycle.budget_ms,
             tap=self._keep,
+            alert_m=config.integrity.alert_m,
         )
 
     @property

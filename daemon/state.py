@@ -239,16 +239,6 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
     return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt)
 
 
-def bounded(memory: Memory, evidence: Evidence) -> bool:
-    """Whether a bound on the error of the pose can stand: the place is not in doubt.
-
-    A bound assumes that the pose is about right and says how wrong it may be. Of a place that is being looked for, was
-    lost, was laid upon a guess, or that light contradicts, nothing of that kind can be said.
-    """
-    in_doubt = memory.doubt or evidence.guessed or evidence.places is not None or memory.odd_since is not None
-    return memory.state in HELD and not in_doubt
-
-
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The table, gravest first."""
     if evidence.silence is None or evidence.silence >= SILENT_PERIODS:

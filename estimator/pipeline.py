@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, closing, grid, matchers, matching, motion, se2
+from estimator import absolute, closing, grid, matchers, matching, motion, protection, se2
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
@@ -164,6 +164,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         gap=None if state.absolute is None else state.absolute.gap,
         jobs=state.atlas.take_jobs(),
         anew=state.anew,
+        protection=protection.bound(state),
     )
 
 

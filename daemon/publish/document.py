@@ -211,6 +211,11 @@ begins at {start} + {width} (k - 1), and the table shows the first.
 
 _LOOPS: Final[dict[LoopReason, str]] = {
     LoopReason.OTHER: "something that this version does not know",
+    LoopReason.NEAR: "laser: the scan fits the map where it was expected",
+    LoopReason.SEARCHED: "laser: the scan fits the map in one place of all that were possible",
+    LoopReason.SUPPORTED: "laser, twice: two keyframes from different places agree on it",
+    LoopReason.LIT: "light and laser: the same lamps are seen from the same place, and the scan fits the map there",
+    LoopReason.PLACED: "found in the whole map: the one place that fits all that was seen since the place was lost",
 }
 
 

@@ -106,7 +106,11 @@ FLAGS: Final[tuple[Bit, ...]] = (
         "at least one loop closure since the start; `loop_counter` tells each",
         lambda s: s.loop_counter > 0,
     ),
-    ("bounded", "there is a bound on the error of the map pose: `protection`", lambda s: s.trust.horizontal_m is not None),
+    (
+        "bounded",
+        "there is a bound on the error of the map pose: `protection`",
+        lambda s: s.trust.horizontal_m is not None,
+    ),
     ("alert", "the bound is above the limit that is set, or there is none", lambda s: s.trust.alert),
 )
 DEVICES: Final[tuple[Bit, ...]] = (

@@ -50,9 +50,14 @@ class LinkUse(IntEnum):
 
 
 class LoopReason(IntEnum):
-    """Why a loop closure was accepted (`estimator.result.Loop`). Numbers are part of the contract."""
+    """Why a loop closure was accepted (`estimator.result.LoopReason`). Numbers are part of the contract."""
 
     OTHER = 0  # something that this version does not know
+    NEAR = 1  # laser: the scan fits the map where it was expected
+    SEARCHED = 2  # laser: the scan fits the map in one place of all that were possible
+    SUPPORTED = 3  # laser, twice: two keyframes from different places agree on it
+    LIT = 4  # light and laser: the same lamps are seen from the same place, and the scan fits the map there
+    PLACED = 5  # found in the whole map: the one place that fits all that was seen since the place was lost
 
 
 @dataclass(frozen=True, slots=True)

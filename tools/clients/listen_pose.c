@@ -10,7 +10,7 @@
 #include <string.h>
 #include <sys/socket.h>
 
-enum { SMALLEST = 132, LARGEST = 512 };
+enum { SMALLEST = 132, WITH_BOUND = 172, LARGEST = 512 };
 
 static uint32_t u32(const uint8_t *p) {
     return p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24;
@@ -43,7 +43,7 @@ static const char *fault(const uint8_t *d, size_t size) {
     return NULL;
 }
 
-static void show(const uint8_t *d) {
+static void show(const uint8_t *d, size_t size) {
     static const char *const states[] = {"STARTING", "NO_LIDAR",  "MAPPING", "TRACKING",
                                          "DEGRADED", "AMBIGUOUS", "LOST",    "RELOCATING"};
     uint16_t state = u16(d + 12);
@@ -52,8 +52,10 @@ static void show(const uint8_t *d) {
         printf(" no pose\n");
         return;
     }
-    printf(" x %.4f y %.4f yaw %.6f age %.4f sigma %.4f %.4f %.4f\n", i32(d + 40) / 1e4, i32(d + 44) / 1e4,
+    printf(" x %.4f y %.4f yaw %.6f age %.4f sigma %.4f %.4f %.4f", i32(d + 40) / 1e4, i32(d + 44) / 1e4,
            i32(d + 48) / 1e6, u16(d + 22) / 1e4, u16(d + 76) / 1e4, u16(d + 78) / 1e4, u16(d + 80) / 1e4);
+    if (size >= WITH_BOUND && u16(d + 152) != 0xFFFF) printf(" bound %.3f", u16(d + 152) / 1e3);
+    printf("%s\n", u16(d + 18) >> 7 & 1 ? " ALERT" : "");
 }
 
 int main(int argc, char **argv) {
@@ -73,7 +75,7 @@ int main(int argc, char **argv) {
         ssize_t size = recv(sock, data, sizeof data, 0);
         const char *wrong = size < 0 ? "cannot receive" : fault(data, (size_t)size);
         if (wrong) fprintf(stderr, "dropped: %s\n", wrong);
-        else show(data);
+        else show(data, (size_t)size);
         fflush(stdout);
     }
     return 0;

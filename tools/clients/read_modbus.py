@@ -2,7 +2,7 @@
 
     python read_modbus.py [HOST [PORT [tcp]]]
 
-The lamps in view stand in a block of their own, see read_lights.py.
+The lamps in view stand in a block of their own, see read_lights.py; the bound on the error in another, at 340.
 Written from docs/modbus.md alone: it shares no code with the daemon, so it can be copied into any program.
 """
 
@@ -78,6 +78,7 @@ def decode(answer: bytes) -> dict[str, float | int | str | None]:
     return {
         "seq": seq, "state": STATES[state] if state < len(STATES) else str(state), "reason": reason, "fault": fault,
         "x_known": flags >> 2 & 1, "y_known": flags >> 3 & 1, "yaw_known": flags >> 4 & 1, "age": scaled(age, 10_000),
+        "bounded": flags >> 6 & 1, "alert": flags >> 7 & 1,
         "x": scaled(x, 10_000, INT32), "y": scaled(y, 10_000, INT32), "yaw": scaled(yaw, 1_000_000, INT32),
         "sigma_x": scaled(sigma_x, 10_000), "sigma_y": scaled(sigma_y, 10_000), "sigma_yaw": scaled(sigma_yaw, 10_000),
     }  # fmt: skip

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.publish import lights, registers
-from daemon.publish.snapshot import LightFix, LinkUse
+from daemon.publish.snapshot import LightFix, LinkUse, Trust
 from hal.clock import SystemClock
 from hal.imu import RawImu
 from hal.inputs import InputPort
@@ -46,7 +46,8 @@ def test_modbus_reader(tcp: bool) -> None:
     for reading in asyncio.run(run()):
         assert reading == {
             "seq": 70_000, "state": "TRACKING", "reason": 7, "fault": 9, "x_known": 1, "y_known": 0, "yaw_known": 1,
-            "age": 0.025, "x": 1.2345, "y": -2.3456, "yaw": 3.0, "sigma_x": 0.02, "sigma_y": 0.01, "sigma_yaw": 0.01,
+            "bounded": 0, "alert": 0, "age": 0.025, "x": 1.2345, "y": -2.3456, "yaw": 3.0,
+            "sigma_x": 0.02, "sigma_y": 0.01, "sigma_yaw": 0.01,
         }  # fmt: skip
 
 
@@ -136,7 +137,8 @@ def test_listener_in_c(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    good, blind = registers.encode_datagram(snapshot()), registers.encode_datagram(snapshot(pose=None, seq=2))
+    good = registers.encode_datagram(snapshot(trust=Trust(0.25, 0.1, 0.2, alert=True)))
+    blind = registers.encode_datagram(snapshot(pose=None, seq=2))
     rubbish = [b"", b"LUMI", good[:-1] + bytes([good[-1] ^ 1]), good[:4] + b"\x02" + good[5:], good + b"\x00"]
     with (
         subprocess.Popen(
@@ -152,7 +154,8 @@ def test_listener_in_c(tmp_path: Path) -> None:
         finally:
             listener.kill()
     assert out.splitlines() == [
-        "seq 70000 t_mono 1234.500000 TRACKING x 1.2345 y -2.3456 yaw 3.000000 age 0.0250 sigma 0.0200 0.0100 0.0100",
+        "seq 70000 t_mono 1234.500000 TRACKING x 1.2345 y -2.3456 yaw 3.000000 age 0.0250 sigma 0.0200 0.0100 0.0100"
+        " bound 0.250 ALERT",
         "seq 2 t_mono 1234.500000 TRACKING no pose",
     ]
     words = ("not a pose datagram", "not a pose datagram", "damaged", "another version", "wrong length")

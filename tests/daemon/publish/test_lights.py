@@ -109,7 +109,7 @@ def test_the_wrong_size_is_refused() -> None:
 
 def test_the_end_of_the_datagram_by_hand() -> None:
     data = registers.encode_datagram(snapshot(light=picture()))
-    assert len(data) == 156
+    assert len(data) == 172
     assert struct.unpack_from("<HHiii", data, 128) == (2, 5, -12_345, 72_500, round(1e6 * (3.5 - math.tau)))
     assert struct.unpack_from("<4H", data, 144) == (211, 300, 100, 500)
     assert registers.decode_datagram(data)["light_y"] == 7.25

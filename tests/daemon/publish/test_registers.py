@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.publish import lights, registers
+from daemon.publish import integrity, lights, registers
 from daemon.publish.points import I16, U16, U32, U64, Point, Rule
-from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State
+from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
 
 FROZEN = Path(__file__).parent / "frozen"
 
@@ -52,6 +52,20 @@ snapshots = st.builds(
     adc_ok=maybe_bool,
     odometry_ok=maybe_bool,
     fault=count,
+    loop_reason=st.none() | count,
+    loop_residual=st.none() | any_float,
+    trust=st.builds(
+        Trust,
+        horizontal_m=st.none() | any_float,
+        yaw_rad=st.none() | any_float,
+        limit_m=st.none() | any_float,
+        alert=st.booleans(),
+        laser=st.booleans(),
+        light=st.booleans(),
+        wheels=st.booleans(),
+        gap=st.none() | any_float,
+        places=st.none() | count,
+    ),
     light=st.none()
     | st.builds(
         LightPicture,
@@ -115,12 +129,14 @@ def snapshot(**changes: Any) -> Snapshot:
 
 def test_sizes_are_those_promised() -> None:
     assert registers.BLOCK_WORDS <= 64
-    assert registers.DATAGRAM_SIZE <= 160
+    assert registers.DATAGRAM_SIZE <= 256
     assert len(registers.encode_block(snapshot())) == 2 * registers.BLOCK_WORDS
     assert len(registers.encode_datagram(snapshot())) == registers.DATAGRAM_SIZE
     assert len(registers.encode_mirror(snapshot())) == 2 * registers.MIRROR_WORDS
     assert len(lights.encode_lights(snapshot())) == 2 * lights.BLOCK_WORDS
     assert lights.BLOCK_WORDS <= 125, "the lights must be readable in one request"
+    assert lights.ADDRESS + lights.BLOCK_WORDS <= integrity.ADDRESS
+    assert len(integrity.encode_integrity(snapshot())) == 2 * integrity.BLOCK_WORDS
     assert registers.MIRROR_ADDRESS + registers.MIRROR_WORDS <= lights.ADDRESS
     assert registers.BLOCK_WORDS <= registers.MIRROR_ADDRESS
     assert registers.MIRROR_WORDS <= 125, "the mirror must be readable in one request"
@@ -129,12 +145,15 @@ def test_sizes_are_those_promised() -> None:
 def test_wide_points_are_aligned_in_the_datagram() -> None:
     for offset, point in zip(registers.BODY.offsets, registers.BODY.points, strict=True):
         assert (registers.BODY_OFFSET + 2 * offset) % (point.wire.bits // 8) == 0, point.name
-    for offset, point in zip(lights.TAIL.offsets, lights.TAIL.points, strict=True):
-        assert (registers.TAIL_OFFSET + 2 * offset) % (point.wire.bits // 8) == 0, point.name
+    for begin, tail in ((registers.TAIL_OFFSET, lights.TAIL), (registers.TRUST_OFFSET, integrity.TAIL)):
+        for offset, point in zip(tail.offsets, tail.points, strict=True):
+            assert (begin + 2 * offset) % (point.wire.bits // 8) == 0, point.name
+    assert registers.DATAGRAM_SIZE % 4 == 0, "and so is the CRC"
 
 
 def test_names_are_unique() -> None:
-    for points in (registers.BODY.points + lights.TAIL.points, registers.MIRROR, lights.BLOCK.points):
+    sent = registers.BODY.points + lights.TAIL.points + integrity.TAIL.points
+    for points in (sent, registers.MIRROR, lights.BLOCK.points, integrity.BLOCK.points):
         names = [p.name for p in points]
         assert len(set(names)) == len(names)
 
@@ -163,10 +182,10 @@ def test_block_by_hand() -> None:
 
 def test_datagram_by_hand() -> None:
     data = registers.encode_datagram(snapshot())
-    assert data[:8] == b"LUMI\x01\x00\x9c\x00"
+    assert data[:8] == b"LUMI\x01\x00\xac\x00"
     assert struct.unpack_from("<IHH", data, 8) == (70_000, 3, 7)
     assert struct.unpack_from("<3i", data, 40) == (12345, -23456, 3_000_000)
-    assert struct.unpack_from("<I", data, 152) == (zlib.crc32(data[:152]),)
+    assert struct.unpack_from("<I", data, 168) == (zlib.crc32(data[:168]),)
 
 
 def test_readings_are_in_si_units() -> None:
@@ -217,6 +236,9 @@ def test_no_snapshot_breaks_an_encoder(taken: Snapshot) -> None:
     seen = lights.decode_lights(lights.encode_lights(taken))
     assert {p.name: seen[p.name] for p in lights.TAIL.points} == {p.name: datagram[p.name] for p in lights.TAIL.points}
     assert all(value is None or math.isfinite(value) for value in seen.values())
+    trusted = integrity.decode_integrity(integrity.encode_integrity(taken))
+    assert {p.name: trusted[p.name] for p in integrity.POINTS} == {p.name: datagram[p.name] for p in integrity.POINTS}
+    assert all(value is None or math.isfinite(value) for value in trusted.values())
     mirror = registers.decode_mirror(registers.encode_mirror(taken))
     assert all(value is None or math.isfinite(value) for value in mirror.values())
 

@@ -1,0 +1,83 @@
+"""The alert on the position error: raised at once, over only when the bound has stayed within, said once."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import pytest
+
+from daemon.alarm import CLEAR_S, Alarm, bounded
+from daemon.publish.snapshot import State
+from daemon.state import Evidence, Memory, Reason
+
+
+def run(alarm: Alarm, bounds: list[float | None], begin: float = 0.0) -> list[bool]:
+    """One bound a tenth of a second."""
+    return [alarm.take(begin + 0.1 * k, bound) for k, bound in enumerate(bounds)]
+
+
+def test_no_limit_no_alert() -> None:
+    assert run(Alarm(0.0), [None, 100.0, 0.1]) == [False, False, False]
+
+
+def test_who_knows_nothing_does_not_say_that_all_is_well(caplog: pytest.LogCaptureFixture) -> None:
+    alarm = Alarm(0.5)
+    assert alarm.on
+    with caplog.at_level(logging.INFO):
+        assert all(run(alarm, [None] * 20))
+    assert caplog.messages == [], "before the first bound there is nothing to be alarmed about"
+    assert not alarm.said
+
+
+@pytest.mark.parametrize("bad", [None, 0.51, float("nan"), float("inf")])
+def test_one_cycle_above_the_limit_raises_it_and_it_is_said_once(
+    bad: float | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    alarm = Alarm(0.5)
+    with caplog.at_level(logging.INFO):
+        run(alarm, [0.2] * 20)
+        assert not alarm.on
+        assert run(alarm, [bad, 0.2, bad, bad], 2.0) == [True] * 4
+        assert alarm.said
+        assert len(caplog.messages) == 1
+        assert "integrity.alert_m" in caplog.messages[0]
+        assert "0.50 m" in caplog.messages[0]
+        after = run(alarm, [0.2] * 20, 3.0)
+    assert after[0]
+    assert not after[-1]
+    assert after.count(True) == pytest.approx(CLEAR_S / 0.1, abs=1), "over only after the bound has stayed within"
+    assert len(caplog.messages) == 2
+    assert "over" in caplog.messages[1]
+
+
+def test_it_does_not_chatter() -> None:
+    alarm = Alarm(0.5)
+    run(alarm, [0.2] * 20)
+    assert all(run(alarm, [0.51, 0.49] * 30, 2.0))
+
+
+HELD = Memory(State.TRACKING, Reason.NONE)
+
+
+def test_a_bound_stands_where_the_pose_is_held() -> None:
+    assert bounded(HELD, Evidence(1.0))
+    assert bounded(replace(HELD, state=State.DEGRADED), Evidence(1.0))
+
+
+@pytest.mark.parametrize("state", [s for s in State if s not in (State.TRACKING, State.DEGRADED)])
+def test_no_bound_in_any_other_state(state: State) -> None:
+    assert not bounded(replace(HELD, state=state), Evidence(1.0))
+
+
+@pytest.mark.parametrize(
+    ("memory", "evidence"),
+    [
+        (HELD, Evidence(1.0, guessed=True)),
+        (HELD, Evidence(1.0, places=1)),
+        (replace(HELD, doubt=True), Evidence(1.0)),
+        (replace(HELD, odd_since=0.9), Evidence(1.0)),
+    ],
+)
+def test_no_bound_of_a_place_in_doubt(memory: Memory, evidence: Evidence) -> None:
+    assert not bounded(memory, evidence)
