@@ -194,7 +194,9 @@ def _against(links: tuple[light.Link, ...]) -> int:
 
 
 def _places(result: StepResult | None) -> int | None:
-    """How many places fit: light says that there are several, as long as it has not told which."""
+    """How many places fit: of the map, or light says that there are several, as long as it has not told which."""
+    if result is not None and result.places is not None:
+        return result.places
     if result is None or result.lights is None or result.placed:
         return None
     return 2 if result.lights.fix is Fix.AMBIGUOUS else None

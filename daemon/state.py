@@ -235,7 +235,7 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
     memory = _remember(memory, evidence)
     state, reason = _say(memory, evidence)
     lost = state is State.LOST or (memory.lost and state in (State.RELOCATING, State.AMBIGUOUS, State.NO_LIDAR))
-    doubt = lost or (memory.doubt and state is not State.TRACKING)
+    doubt = lost or evidence.places is not None or (memory.doubt and state is not State.TRACKING)
     return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt)
 
 
@@ -243,9 +243,10 @@ def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The table, gravest first."""
     if evidence.silence is None or evidence.silence >= SILENT_PERIODS:
         return _say_without_laser(memory, evidence)
-    if evidence.places is not None and evidence.places != 1:
-        several = evidence.places > 1
-        return (State.AMBIGUOUS, Reason.SEVERAL_PLACES) if several else (State.RELOCATING, Reason.SEARCHING)
+    if evidence.places is not None:
+        if evidence.places > 1:
+            return State.AMBIGUOUS, Reason.SEVERAL_PLACES
+        return State.RELOCATING, Reason.CONFIRMING if evidence.places else Reason.SEARCHING
     if not evidence.mapped:
         return State.MAPPING, Reason.UNPROVED
     if memory.lost and not _proved(memory, evidence):
@@ -376,6 +377,8 @@ def _remember(memory: Memory, evidence: Evidence) -> Memory:
         return _forget_laser(memory, evidence)
     since = memory.disagree_since if memory.disagree_since is not None else now
     memory = replace(memory, disagree_since=since if evidence.agree is False else None)
+    if evidence.places is not None:
+        memory = replace(memory, good=0)  # what fits the surroundings proves nothing of the place in the map
     if evidence.match is None:
         return memory
     return _take_good(memory, evidence.match, now) if evidence.match.good else _take_failed(memory)

@@ -218,7 +218,9 @@ def correct(state: State, T_map_base: Array, T_odom_base: Array) -> None:
     """Move the map; what was laid since the pose was last known comes along, what is older stays where it is."""
     assert state.absolute is not None
     T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
-    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), state.absolute.since)
+    shift_map(
+        state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), max(state.absolute.since, state.atlas.since)
+    )
     move_map(state, T_map_odom)
 
 

@@ -131,6 +131,10 @@ class Atlas:
         waiting: loops without support. jobs: to be handed out. asked: when, in keyframes laid, and what to do with the
             answer, by job ID. look, solution: IDs of the latest jobs of these kinds.
         stale: whether the graph has changed since it was solved.
+        adrift: key of the first submap whose place in the map is not known, None where the robot's place is: it and all
+            later ones are a part of the graph that nothing joins to the older one. since: ID of their first keyframe, 0
+            where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
+            T_submap_adrift and its covariance in the latter's axes.
         closures: loops accepted so far. news: the latest, until it was reported.
         adrift: key of the first submap whose place in the map is not known, with all later ones; None: all are known.
     """
@@ -151,6 +155,9 @@ class Atlas:
     look: int = 0
     solution: int = 0
     stale: bool = False
+    adrift: int | None = None
+    since: int = 0
+    bridge: tuple[int, Array, Array] | None = None
     closures: int = 0
     news: Loop | None = None
     adrift: int | None = None
@@ -177,6 +184,35 @@ class Atlas:
         self.asked[job_id] = self.laid, then
         self.next_job += 1
         return job_id
+
+    def of_part(self, submap: Submap) -> list[Submap]:
+        """The submaps whose place relative to this one is known: all, or those that are (not) adrift as it is."""
+        if self.adrift is None:
+            return list(self.submaps.values())
+        adrift = submap.key >= self.adrift
+        return [other for other in self.submaps.values() if (other.key >= self.adrift) == adrift]
+
+    def settled(self) -> list[Submap]:
+        """The submaps in which the place can be looked for: finished, and not adrift."""
+        return [
+            submap
+            for submap in self.submaps.values()
+            if submap.settled is not None and (self.adrift is None or submap.key < self.adrift)
+        ]
+
+    def cut(self, since: int) -> None:
+        """Say that from keyframe ``since`` on, the next one, the place in the map is not known; there must be a map.
+
+        What was adrift already, and has never been placed, is forgotten.
+        """
+        if self.adrift is not None:
+            kept = [key for key in self.submaps if key < self.adrift]
+            self.constraints.keep(np.asarray(np.isin(self.constraints.between, kept).all(axis=1)))
+            self.submaps = {key: self.submaps[key] for key in kept}
+            self.frames, self.waiting = [], []
+        newest = self.newest
+        assert newest is not None
+        self.adrift, self.since, self.bridge = newest.key + 1, since, None
 
     def give_up(self) -> None:
         """Wait no longer for jobs that must have failed; the graph is then still to be solved."""
@@ -217,7 +253,8 @@ class Atlas:
         self.C = F @ self.C @ F.T + P + FLOOR
         self.way_m += math.hypot(x, y) if newest is not None else 0.0
         self.T_odom_last = T
-        if newest is None or anew or len(self.frames) >= SIZE:
+        cut = newest is not None and self.adrift is not None and newest.key < self.adrift
+        if newest is None or anew or cut or len(self.frames) >= SIZE:
             self._begin(frame, newest, sigma)
         frame.submap = next(reversed(self.submaps.values()))
         self.frames.append(frame)
@@ -236,9 +273,15 @@ class Atlas:
         T = frame.T_odom_keyframe
         if before is not None:
             R = se2.rotation(-T[2])
-            self.constraints.add(before.key, key, se2.between(before.T_odom_submap, T), R @ self.C @ R.T, False)
-            self.marginal = self.spread(T)
-            self._settle(before, tuple(self.frames), sigma)
+            way = se2.between(before.T_odom_submap, T), R @ self.C @ R.T
+            if key == self.adrift:
+                self.bridge = (before.key, *way) if self.frames else None
+                self.marginal = np.zeros((3, 3))
+            else:
+                self.constraints.add(before.key, key, *way, False)
+                self.marginal = self.spread(T)
+            if self.frames:
+                self._settle(before, tuple(self.frames), sigma)
         self.submaps[key] = Submap(key, frame.key, frame.T_map_keyframe, T, self.way_m)
         self.C = np.zeros((3, 3))
         self.frames = []
@@ -261,7 +304,7 @@ class Atlas:
 
     def thin_out(self, latest: Submap) -> None:
         """Bound what is kept per area: of the submaps of one place and heading the newest few stay."""
-        here = [submap for submap in self.submaps.values() if cell_of(submap) == cell_of(latest)]
+        here = [other for other in self.of_part(latest) if cell_of(other) == cell_of(latest)]
         for submap in here[:-KEPT]:
             self.let_go(submap)
 

@@ -73,7 +73,7 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
     tie = state.absolute
     P = turned(state, tie.P if tie is not None and tie.placed else atlas.spread(frame.T_odom_keyframe))
     reach = min(told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])), told.most_m)
-    for submap in atlas.submaps.values():
+    for submap in atlas.of_part(frame.submap):
         x, y, _ = submap.T_map_submap.tolist()
         away = math.hypot(x - T[0], y - T[1])
         if submap.settled is not None and away < reach and atlas.way_m - submap.way_m > told.recent_m:

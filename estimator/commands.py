@@ -1,10 +1,10 @@
-"""What a person or a PLC may order: set the pose, or forget the map."""
+"""What a person or a PLC may order: set the pose, forget the map, or look for the place in it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from estimator import se2
+from estimator import adrift, se2
 from estimator.mapframe import move_map, shift_map
 from estimator.mapping import NOTHING
 from estimator.records import Array, Command, Order
@@ -14,11 +14,17 @@ from estimator.state import State
 def obey(state: State, command: Command) -> None:
     """SET_POSE moves the whole map so that the robot stands there; RESET forgets the map and begins at that pose.
 
-    A map of this session has no other tie to the world than what it is told, so it moves as one piece. A pose that is
-    no number is ignored; RESET without a pose begins at the origin. ``T_odom_base`` stays as it is.
+    A map of this session has no other tie to the world than what it is told, so it moves as one piece; where the place
+    in it is not known, only what is adrift moves. A pose that is no number is ignored; RESET without a pose begins at
+    the origin. RELOCALISE looks for the robot everywhere in the map, and begins a new local map, because the old one
+    may be that of another place. ``T_odom_base`` stays as it is.
     """
     T_map_base = command.T_map_base
     if T_map_base is not None and not np.isfinite(T_map_base).all():
+        return
+    if command.order is Order.RELOCALISE:
+        if adrift.begin(state):
+            state.local, state.failures = None, 0
         return
     if command.order is Order.RESET:
         forget(state)
@@ -39,5 +45,5 @@ def forget(state: State) -> None:
 def place(state: State, T_map_base: Array) -> None:
     """Move the map frame so that the robot's pose is ``T_map_base``, and everything in the map with the robot."""
     T_map_odom = se2.compose(T_map_base, se2.inverse(state.fused.T_odom_base))
-    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), 0)
+    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), state.atlas.since)
     move_map(state, T_map_odom)

@@ -27,7 +27,8 @@ def shift_map(state: State, moved: Array, since: int) -> None:
         if lone.first < since:
             break
         lone.T_map_submap = se2.compose(moved, lone.T_map_submap)
-    newest = state.atlas.newest
+    newest, adrift = state.atlas.newest, state.atlas.adrift
     for submap in state.atlas.submaps.values():
-        if submap.first >= since or submap is newest:
+        driven = submap is newest and (adrift is None or submap.key >= adrift)
+        if submap.first >= since or driven:
             submap.T_map_submap = se2.compose(moved, submap.T_map_submap)

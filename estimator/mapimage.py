@@ -206,6 +206,7 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
         state.keyframes[frame.key] = frame
         state.places.setdefault(square_of(frame.T_map_keyframe), []).append(frame.key)
     state.next_key = 1 + max((*state.keyframes, *(piece.first for piece in image.submaps)))
+    atlas.since = state.next_key
     if state.absolute is not None:
         state.absolute.since = state.next_key
     return state

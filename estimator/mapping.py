@@ -125,11 +125,13 @@ def retire(state: State, newest: Keyframe) -> None:
     place = square_of(newest.T_map_keyframe)
     here = [key for key in state.places.get(place, ()) if key in state.keyframes]
     here.append(newest.key)
+    since = state.atlas.since  # what is adrift may be anywhere: it takes the place of nothing older
+    older, here = [key for key in here if key < since], [key for key in here if key >= since]
     while len(here) > state.settings.keep:
         gone = state.keyframes.pop(here.pop(0))
         if state.settings.history:
             state.retired[gone.key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)
-    state.places[place] = here
+    state.places[place] = older + here
 
 
 def square_of(T_map_keyframe: Array) -> Place:

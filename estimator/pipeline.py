@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, closing, grid, matchers, matching, motion, protection, se2
+from estimator import absolute, adrift, closing, grid, matchers, matching, motion, protection, se2
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
@@ -162,6 +162,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         lights=None if state.light is None else state.light.result,
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
+        places=adrift.places(state),
         jobs=state.atlas.take_jobs(),
         anew=state.anew,
         protection=protection.bound(state),

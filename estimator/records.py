@@ -77,6 +77,7 @@ class Order(Enum):
 
     SET_POSE = "set_pose"
     RESET = "reset"
+    RELOCALISE = "relocalise"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

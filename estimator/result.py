@@ -215,6 +215,8 @@ class StepResult:
         anew: how often the local map has been begun anew because nothing fitted the old one: since then the place in
             the map is a guess.
         protection: bound on the error of T_map_base; None: none can be given.
+        places: None where the place in the map is known; else how many places of it fit all that was seen: 0 none yet,
+            1 one that is being confirmed.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
@@ -235,4 +237,5 @@ class StepResult:
     gap: float | None = None
     anew: int = 0
     protection: Protection | None = None
+    places: int | None = None
     jobs: tuple[Job, ...] = ()

@@ -187,7 +187,17 @@ def test_looking_for_the_place() -> None:
     memory = tracking()
     assert said(judge(memory, seen(3.0, places=0))) == (State.RELOCATING, Reason.SEARCHING)
     assert said(judge(memory, seen(3.0, places=3))) == (State.AMBIGUOUS, Reason.SEVERAL_PLACES)
-    assert judge(memory, seen(3.0, places=1)).state is State.TRACKING
+    assert said(judge(memory, seen(3.0, places=1))) == (State.RELOCATING, Reason.CONFIRMING)
+
+
+def test_a_place_that_was_found_has_to_be_proved() -> None:
+    """Scans that fitted while the place was looked for say nothing of it, nor does the motion on which all agree."""
+    memory = run(tracking(odometry=True), scans(3.0, 30, odometry=True, agree=True, places=1))
+    assert memory.doubt
+    soon = run(memory, scans(6.0, int(9.0 * rules.RELOCATED_PROOF_S), odometry=True, agree=True))
+    assert soon.state is not State.TRACKING
+    t = 6.0 + 0.9 * rules.RELOCATED_PROOF_S
+    assert run(soon, scans(t, 10, odometry=True, agree=True)).state is State.TRACKING
 
 
 def test_an_order_starts_the_proof_anew() -> None:
@@ -337,6 +347,7 @@ def test_what_must_hold_whatever_happens(steps: list[Evidence]) -> None:
         memory = judge(memory, evidence)
         if memory.state is State.TRACKING:
             assert all(memory.known)
+            assert evidence.places is None
             assert evidence.silence is not None
             assert evidence.silence < rules.SILENT_PERIODS
             assert memory.failed < rules.FAILED_SCANS
