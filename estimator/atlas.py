@@ -136,7 +136,6 @@ class Atlas:
             where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
             T_submap_adrift and its covariance in the latter's axes.
         closures: loops accepted so far. news: the latest, until it was reported.
-        adrift: key of the first submap whose place in the map is not known, with all later ones; None: all are known.
     """
 
     submaps: dict[int, Submap] = field(default_factory=dict)
@@ -160,7 +159,6 @@ class Atlas:
     bridge: tuple[int, Array, Array] | None = None
     closures: int = 0
     news: Loop | None = None
-    adrift: int | None = None
 
     @property
     def newest(self) -> Submap | None:
