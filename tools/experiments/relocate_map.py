@@ -1,0 +1,57 @@
+"""The maps that robots are switched on with: made by one drive through the building, and kept.
+
+In the light the drive starts knowing nothing; without light it is told where it starts, so that map and truth have one
+frame. All background jobs answer with the next scan.
+"""
+
+from __future__ import annotations
+
+from heapq import merge
+from typing import Any, Final
+
+import numpy as np
+
+from estimator.light import LightsSetup
+from estimator.mapimage import MapImage, image_of
+from estimator.pipeline import new_state
+from estimator.records import Array, Command, Order, Record, Scan
+from daemon.evidence import Observer
+from tools.experiments.relocate_trial import Robot
+from tools.experiments.relocate_world import BODY, PERIOD_S, Place, Site, odometry
+from tools.sim.people import Crowd
+from tools.sim.robot import Drive
+
+LAPS: Final = 1
+
+
+def drive_of(place: Place) -> Drive:
+    """The drive that makes the map."""
+    return Drive(place.building.route, BODY, 2.0, LAPS)
+
+
+def mapped(site: Site, lights: LightsSetup | None, seconds: float = float("inf")) -> tuple[MapImage, Array]:
+    """The map, and (n, 4) rows of instant and error (m, m, rad) of the pose as published live."""
+    drive = drive_of(site.place)
+    end = min(seconds, LAPS * drive.lap_s + 1.0)
+    robot = Robot(new_state(None, lights), Observer(0.0, odometry=True, lights=lights is not None))
+    rng = np.random.default_rng((site.seed, 6))
+    nobody = Crowd(())
+    streams: list[Any] = [odometry(drive.pose, (0.0, end), rng)]
+    streams.append(site.scan(k, drive.pose, nobody) for k in range(int(end / PERIOD_S)))
+    pending: list[Record] = []
+    if lights is None:
+        pending.append(Command(0.0, Order.SET_POSE, drive.pose(np.zeros(1))[0]))
+    else:
+        streams.append(site.light(drive.pose, (0.0, end), site.seed))
+    errors = []
+    for record in merge(*streams, key=lambda one: one.t_end):
+        pending.append(record)
+        if not isinstance(record, Scan):
+            continue
+        robot.take(record.t_end, pending)
+        pending = []
+        now = robot.moment(record.t_end, drive.pose(np.array([robot.t_mono]))[0])
+        errors.append((now.t, now.off_m, now.off_rad, float(now.given)))
+    while robot.waiting:
+        robot.take(end, [])
+    return image_of(robot.state), np.array(errors)
