@@ -36,7 +36,7 @@ class Light:
 
     Attributes:
         setup: as given. decoder: of the photodiode's blocks. filter: see estimator/lights.py. result: after the latest
-            epoch.
+            epoch. epoch: that epoch, None before the first.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
@@ -46,6 +46,7 @@ class Light:
         learned = None if setup.residuals is None else Learned(setup.residuals, setup.survey.receiver)
         self.filter = lights.new_lights(setup.survey, corrections=learned)
         self.result = lights.result(self.filter)
+        self.epoch: LightEpoch | None = None
         self._decoded = self._decoded_before = False
         self._spared = 0
 
@@ -57,8 +58,8 @@ class Light:
     def take(self, record: SampleBlock | LightEpoch) -> LightsResult:
         """Decode a block, if it is one, and take the epoch into the filter."""
         self._decoded = isinstance(record, SampleBlock)
-        epoch = cdma.decode(self.decoder, record) if isinstance(record, SampleBlock) else record
-        self.result = lights.update(self.filter, epoch)
+        self.epoch = cdma.decode(self.decoder, record) if isinstance(record, SampleBlock) else record
+        self.result = lights.update(self.filter, self.epoch)
         return self.result
 
     def look_on(self, codes: int) -> None:

@@ -11,11 +11,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from daemon.evidence import Observer
 from estimator.light import LightsSetup
 from estimator.mapimage import MapImage, image_of
 from estimator.pipeline import new_state
 from estimator.records import Array, Command, Order, Record, Scan
-from daemon.evidence import Observer
 from tools.experiments.relocate_trial import Robot
 from tools.experiments.relocate_world import BODY, PERIOD_S, Place, Site, odometry
 from tools.sim.people import Crowd

@@ -1,0 +1,185 @@
+"""What light says of the place while the robot is adrift in a stored map: windows to look in, and a witness.
+
+Light names lamps, and with stored gains their strengths give the position to a decimetre from the first epochs on;
+where codes repeat there are several. It says little of the heading until the robot has moved: that, and the
+confirmation, come from the laser. Nothing here is ever told to the `lights` filter, which stays free of the laser.
+
+It counts only in a map whose frame is that of the light survey (`told`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from estimator import se2
+from estimator.absolute import ACROSS_M, ROW_M
+from estimator.cdma_epoch import UNUSABLE
+from estimator.lights_start import Place, places, probabilities
+from estimator.lights_state import Lights, Track
+from estimator.linear3 import invert3
+from estimator.records import Array
+from estimator.result import SURPRISE, Fix, LinkState
+from estimator.state import State
+
+CHANCE: Final = 1e-4
+"""A hypothesis of light less likely than that is none."""
+TOGETHER_M: Final = 1.0
+"""Hypotheses no farther apart are looked for in one window."""
+MARGIN_M: Final = 0.25
+"""By which a window is larger than three deviations of what light says: walls and floor reflect as no model knows."""
+GUESS_M: Final = 0.6
+"""Size of a window about a place read off a single epoch."""
+WIDEST_M: Final = 3.0
+"""Light that is vaguer than that says nothing."""
+SILENT_S: Final = 0.5
+"""Without a usable epoch for so long light says nothing of where the robot is now."""
+FACTOR: Final = 6.0
+"""By which the variance of a hypothesis of light counts: what is young about it, and what its model does not know."""
+SLACK: Final = np.diag((0.1**2, 0.1**2, 0.05**2))
+LEAST: Final = 3
+"""Links used without which light is no witness."""
+AGAINST: Final = 0.34
+"""Share of links against the place from which on it is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where light allows the base to be in the map: within ``reach_m`` of (x, y), at any heading; how likely."""
+
+    x: float
+    y: float
+    reach_m: float
+    chance: float
+
+
+def told(state: State) -> bool:
+    """Whether there is light, and the map's frame is that of its survey."""
+    if state.light is None:
+        return False
+    return any(submap.light is not None for submap in state.atlas.settled())
+
+
+def windows(state: State, T_base_frame: Array | None = None) -> tuple[Window, ...]:
+    """Where light allows the robot to be, likeliest first; none where it says nothing.
+
+    Where the links contradict the place that the `lights` filter still holds, as when the robot has been carried off,
+    the latest epoch is read by itself.
+
+    Args:
+        state: all of the estimator.
+        T_base_frame: where, seen from the base now, what is to be looked for was seen; None: here.
+    """
+    if not told(state):
+        return ()
+    assert state.light is not None
+    lights, epoch = state.light.filter, state.light.epoch
+    if epoch is None or lights.course.t_mono - lights.t_epoch > SILENT_S:
+        return ()
+    if contradicted(lights):
+        if epoch.block & UNUSABLE or len(epoch.ids) == 0:
+            return ()
+        return tuple(about(lights, place) for place in places(lights, epoch))
+    if lights.result is not None and lights.result.fix is Fix.HELD:
+        return ()
+    return clustered(lights, se2.identity() if T_base_frame is None else T_base_frame)
+
+
+def contradicted(lights: Lights) -> bool:
+    """Whether what is received does not fit the place that the filter holds."""
+    return len(lights.tracks) == 1 and (math.isfinite(lights.t_lost) or math.isfinite(lights.t_odd))
+
+
+def about(lights: Lights, place: Place) -> Window:
+    """The window about a place of the receiver."""
+    rx = lights.survey.receiver
+    return Window(place.x, place.y, GUESS_M + math.hypot(rx.x, rx.y), math.exp(-0.5 * place.cost))
+
+
+def clustered(lights: Lights, T_base_frame: Array) -> tuple[Window, ...]:
+    """A window for each group of hypotheses that lie together; none where they are too vague to look in."""
+    if not lights.tracks:
+        return ()
+    chances = probabilities(lights.tracks).tolist()
+    groups: list[list[tuple[Array, float, float]]] = []
+    for track, chance in zip(lights.tracks, chances, strict=True):
+        if chance < CHANCE:
+            continue
+        at = se2.compose(track.x[:3], T_base_frame)[:2]
+        spread = 3.0 * math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0))
+        near = next((group for group in groups if math.hypot(*(group[0][0] - at)) < TOGETHER_M), None)
+        if near is None:
+            groups.append([(at, spread, chance)])
+        else:
+            near.append((at, spread, chance))
+    more = MARGIN_M + beside(lights)
+    made = [window_of(group, more) for group in groups]
+    made.sort(key=lambda window: -window.chance)
+    return () if any(window.reach_m > WIDEST_M for window in made) else tuple(made)
+
+
+def window_of(group: list[tuple[Array, float, float]], more: float) -> Window:
+    """The circle about hypotheses (place, spread, chance) in which all of them lie."""
+    x, y = np.mean([at for at, _, _ in group], axis=0).tolist()
+    reach = max(math.hypot(at[0] - x, at[1] - y) + spread for at, spread, _ in group)
+    return Window(x, y, reach + more, sum(chance for _, _, chance in group))
+
+
+def beside(lights: Lights) -> float:
+    """What is added to a window where the lamps in use stand in one row: the other side of it fits nearly as well."""
+    lamps = lights.catalogue.by_id
+    seen = () if lights.result is None else lights.result.accepted
+    at = np.array([(lamps[k].x, lamps[k].y) for k in seen if k in lamps]).reshape(-1, 2)
+    if len(at) < 2:
+        return ACROSS_M
+    narrow = float(np.linalg.eigvalsh(np.cov(at.T, bias=True))[0])
+    return ACROSS_M * math.exp(-max(narrow, 0.0) / ROW_M**2)
+
+
+def compatible(state: State, T_map_base: Array) -> bool | None:
+    """Whether light allows a pose of the robot now; None where it says nothing."""
+    around = windows(state)
+    if not around:
+        return None
+    x, y, _ = T_map_base.tolist()
+    if not any(math.hypot(window.x - x, window.y - y) < window.reach_m for window in around):
+        return False
+    assert state.light is not None
+    lights = state.light.filter
+    if contradicted(lights):
+        return True
+    return any(fits(track, T_map_base) for track in likely(lights))
+
+
+def likely(lights: Lights) -> list[Track]:
+    """The hypotheses that count."""
+    chances = probabilities(lights.tracks).tolist()
+    return [track for track, chance in zip(lights.tracks, chances, strict=True) if chance >= CHANCE]
+
+
+def fits(track: Track, T_map_base: Array) -> bool:
+    """Whether a pose is that of a hypothesis, heading included as far as that is known."""
+    off = T_map_base - track.x[:3]
+    off[2] = se2.wrap(float(off[2]))
+    return float(off @ invert3(FACTOR * track.P[:3, :3] + SLACK) @ off) < SURPRISE
+
+
+def witness(state: State, T_map_base: Array) -> bool:
+    """Whether light counts as the second witness of a pose that the laser has found.
+
+    It does where lamps are used and few are against it, and where it allows no other place: a second window means that
+    codes repeat, or that the lamps in view are too few to tell.
+    """
+    if compatible(state, T_map_base) is not True or len(windows(state)) != 1:
+        return False
+    assert state.light is not None
+    lights = state.light.filter
+    if contradicted(lights) or lights.result is None:
+        return False
+    states = [link.state for link in lights.result.links]
+    used = states.count(LinkState.ACCEPTED)
+    against = states.count(LinkState.OCCLUDED) + states.count(LinkState.REJECTED)
+    return used >= LEAST and against <= AGAINST * (used + against)
