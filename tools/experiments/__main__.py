@@ -19,7 +19,20 @@ from tools.experiments.report import Report, Skipped, Work, save
 from tools.figures import table
 
 GROUPS: Final = {
-    "lights": ("fig4", "fig5", "claim", "adaptive", "room", "tones", "static", "walks", "survey", "beamquality")
+    "lights": (
+        "fig4",
+        "fig5",
+        "claim",
+        "adaptive",
+        "room",
+        "tones",
+        "static",
+        "walks",
+        "survey",
+        "beamquality",
+        "relocate",
+        "relocate_real",
+    )
 }
 
 
@@ -44,7 +57,7 @@ def run_one(name: str, options: argparse.Namespace) -> bool:
     begun = time.monotonic()
     try:
         report = importlib.import_module(f"tools.experiments.{name}").run(
-            options.quick, Work(options.jobs, sys.stderr.isatty())
+            options.quick, Work(options.jobs, sys.stderr.isatty(), options.trials)
         )
     except Skipped as reason:
         print(f"skipped: {reason}")
@@ -70,6 +83,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--only", action="append", metavar="NAME", help="run just this one (may be repeated)")
     parser.add_argument("--quick", action="store_true", help="a small part of each, in seconds; figures are rough")
     parser.add_argument("--jobs", type=int, default=1, help="processes to spread trials over (default: 1)")
+    parser.add_argument("--trials", type=int, default=0, help="of experiments that repeat something at random")
     parser.add_argument("--out", type=Path, default=Path("out/experiments"))
     options = parser.parse_args(arguments)
     names = available(options.group)

@@ -6,8 +6,12 @@ frame. All background jobs answer with the next scan.
 
 from __future__ import annotations
 
+import copyreg
+import pickle
 from heapq import merge
+from pathlib import Path
 from typing import Any, Final
+from weakref import WeakSet
 
 import numpy as np
 
@@ -55,3 +59,17 @@ def mapped(site: Site, lights: LightsSetup | None, seconds: float = float("inf")
     while robot.waiting:
         robot.take(end, [])
     return image_of(robot.state), np.array(errors)
+
+
+def kept_map(path: Path, site: Site, lights: LightsSetup | None) -> MapImage:
+    """The map of a site, from the file where it was kept or by a drive."""
+    if path.exists():
+        with path.open("rb") as kept:
+            found = pickle.load(kept)
+        assert isinstance(found, MapImage)
+        return found
+    image, _ = mapped(site, lights)
+    copyreg.pickle(WeakSet, lambda _: (WeakSet, ()))  # of what hangs on a submap the image has a table of its own
+    with path.open("wb") as kept:
+        pickle.dump(image, kept)
+    return image

@@ -86,12 +86,13 @@ class Work:
     Args:
         jobs: processes; 1 runs everything here, in order, which is also what a debugger wants.
         progress: whether to write to stderr at all.
+        trials: how many an experiment that repeats something at random is to make; 0: as many as it thinks fit.
     """
 
-    def __init__(self, jobs: int = 1, progress: bool = False) -> None:
+    def __init__(self, jobs: int = 1, progress: bool = False, trials: int = 0) -> None:
         if jobs < 1:
             raise ValueError(f"jobs = {jobs}: at least one process is needed")
-        self.jobs, self.progress, self._shown_at = jobs, progress, -math.inf
+        self.jobs, self.progress, self.trials, self._shown_at = jobs, progress, trials, -math.inf
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> list[Result]:
         """``[function(item) for item in items]``, in that order; both must be importable by other processes.
