@@ -20,20 +20,10 @@ from tools.figures import table
 
 GROUPS: Final = {
     "lights": (
-        "fig4",
-        "fig5",
-        "claim",
-        "adaptive",
-        "room",
-        "tones",
-        "static",
-        "walks",
-        "survey",
-        "beamquality",
-        "relocate",
-        "relocate_real",
-    )
-}
+        "fig4", "fig5", "claim", "adaptive", "room", "tones", "static", "walks", "survey", "beamquality",
+        "relocate", "relocate_real",
+    ),
+}  # fmt: skip
 
 
 def available(group: str) -> list[str]:

@@ -107,12 +107,17 @@ def attempt(task: Task) -> Outcome:
     carried, moving = bool(task.seed % 2), bool(task.seed // 2 % 2)
     case = Case(task.setting, carried, moving, SETTINGS[task.setting].seconds)
     done = trial(site, image_of(task.setting), case, task.seed, lights)
-    with journal(task.setting).open("a") as kept:
-        kept.write(json.dumps(asdict(done)) + "\n")
+    keep(task.setting, done)
     return done
 
 
-def done_before(name: str) -> dict[int, Outcome]:
+def keep(name: str, done: Outcome) -> None:
+    """Write an outcome down."""
+    with journal(name).open("a") as kept:
+        kept.write(json.dumps(asdict(done)) + "\n")
+
+
+def kept_outcomes(name: str) -> dict[int, Outcome]:
     """Outcomes that are kept, by seed; a line cut short by a stop is left out."""
     path, found = journal(name), {}
     if path.exists():
@@ -130,7 +135,7 @@ def run(quick: bool, work: Work) -> Report:
     outcomes: dict[str, list[Outcome]] = {}
     for name, setting in SETTINGS.items():
         image_of(name)
-        kept = done_before(name)
+        kept = kept_outcomes(name)
         seeds = range(max(2, round(setting.share * whole)))
         fresh = work.map(attempt, [Task(name, seed) for seed in seeds if seed not in kept], name)
         found = kept | {one.seed: one for one in fresh}

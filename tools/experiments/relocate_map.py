@@ -64,12 +64,22 @@ def mapped(site: Site, lights: LightsSetup | None, seconds: float = float("inf")
 def kept_map(path: Path, site: Site, lights: LightsSetup | None) -> MapImage:
     """The map of a site, from the file where it was kept or by a drive."""
     if path.exists():
-        with path.open("rb") as kept:
-            found = pickle.load(kept)
+        found = unpickled(path)
         assert isinstance(found, MapImage)
         return found
     image, _ = mapped(site, lights)
-    copyreg.pickle(WeakSet, lambda _: (WeakSet, ()))  # of what hangs on a submap the image has a table of its own
-    with path.open("wb") as kept:
-        pickle.dump(image, kept)
+    pickled(path, image)
     return image
+
+
+def pickled(path: Path, what: object) -> None:
+    """Keep something for other processes of the same program."""
+    copyreg.pickle(WeakSet, lambda _: (WeakSet, ()))  # of what hangs on a submap an image has a table of its own
+    with path.open("wb") as kept:
+        pickle.dump(what, kept)
+
+
+def unpickled(path: Path) -> object:
+    """What was kept."""
+    with path.open("rb") as kept:
+        return pickle.load(kept)

@@ -68,13 +68,17 @@ class Moment:
 
 @dataclass(eq=False)
 class Robot:
-    """An estimator with the part of the daemon that judges it, and a worker that answers with the next step."""
+    """An estimator with the part of the daemon that judges it, and a worker that answers with the next step.
+
+    Attributes:
+        period_s: from scan to scan. waiting: jobs to be run. slowest_job_s: processor time.
+    """
 
     state: State
     observer: Observer
     memory: Memory = field(default_factory=Memory)
+    period_s: float = PERIOD_S
     waiting: list[Job] = field(default_factory=list)
-    job_s: float = 0.0
     slowest_job_s: float = 0.0
     result: StepResult | None = None
 
@@ -90,7 +94,7 @@ class Robot:
                 self.observer.on_scan(record.t_end)
         self.result = step(self.state, taken, UNLIMITED)
         self.waiting = list(self.result.jobs)
-        evidence = self.observer.evidence(t, PERIOD_S, LidarStatus(link=Link.STREAMING), taken, self.result)
+        evidence = self.observer.evidence(t, self.period_s, LidarStatus(link=Link.STREAMING), taken, self.result)
         self.memory = judge(self.memory, evidence)
         return self.result
 
@@ -103,9 +107,7 @@ class Robot:
     def _run(self, job: Job) -> object:
         begin = time.thread_time()
         payload = job.run()
-        took = time.thread_time() - begin
-        self.job_s += took
-        self.slowest_job_s = max(self.slowest_job_s, took)
+        self.slowest_job_s = max(self.slowest_job_s, time.thread_time() - begin)
         return payload
 
     def moment(self, t: float, true: Array) -> Moment:
@@ -118,10 +120,10 @@ class Robot:
         return Moment(t, state, reason, given, math.hypot(off[0], off[1]), abs(se2.wrap(float(off[2]))), places)
 
 
-def switched_on(image: MapImage, lights: LightsSetup | None, settings: Settings | None = None) -> Robot:
+def switched_on(image: MapImage, lights: LightsSetup | None, t: float = 0.0, period_s: float = PERIOD_S) -> Robot:
     """A robot with a map, at its first moment."""
-    state = restored(image, settings or Settings(), lights)
-    return Robot(state, Observer(0.0, odometry=True, lidar=True, lights=lights is not None))
+    state = restored(image, Settings(), lights)
+    return Robot(state, Observer(t, odometry=True, lidar=True, lights=lights is not None), period_s=period_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +223,7 @@ def trial(site: Site, image: MapImage, case: Case, seed: int, lights: LightsSetu
 def outcome(
     case: Case, seed: int, begin: float, moments: list[Moment], view: tuple[bool, int], job_s: float
 ) -> Outcome:
-    """What the moments amount to."""
+    """What the moments amount to; ``begin``: when being switched on or put down, s."""
     before = [one for one in moments if one.t <= begin - LIFTED_S]
     after = [one for one in moments if one.t > begin]
     last = after[-1]
@@ -234,21 +236,22 @@ def outcome(
     return Outcome(
         case=case.name, seed=seed, carried=case.carried, moving=case.moving, unique=view[0], lamps=view[1],
         right_s=since, tracking_s=tracking, end=Said(last.state).name, ended_right=last.right,
-        wrong_s=longest([one.given and not one.right for one in after]),
-        far_s=longest([one.far for one in after]), astray_s=longest([one.astray for one in after]),
+        wrong_s=longest(after, [one.given and not one.right for one in after]),
+        far_s=longest(after, [one.far for one in after]), astray_s=longest(after, [one.astray for one in after]),
         ambiguous=any(one.state == Said.AMBIGUOUS for one in after),
         known_before=bool(before) and before[-1].right and before[-1].state == Said.TRACKING,
         job_s=job_s, off_m=last.off_m, off_rad=last.off_rad,
     )  # fmt: skip
 
 
-def longest(flags: list[bool]) -> float:
-    """Seconds of the longest run of moments for which something held."""
-    best = run = 0
-    for flag in flags:
-        run = run + 1 if flag else 0
-        best = max(best, run)
-    return PERIOD_S * best
+def longest(moments: list[Moment], flags: list[bool]) -> float:
+    """Seconds of the longest run of moments for which something held, one scan counting as one period."""
+    best, begun = 0.0, None
+    period = (moments[-1].t - moments[0].t) / max(1, len(moments) - 1)
+    for one, flag in zip(moments, flags, strict=True):
+        begun = (one.t if begun is None else begun) if flag else None
+        best = max(best, 0.0 if begun is None else one.t - begun + period)
+    return best
 
 
 __all__ = ["Case", "Moment", "Outcome", "Robot", "Stroll", "outcome", "switched_on", "trial"]

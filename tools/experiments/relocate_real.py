@@ -1,0 +1,283 @@
+"""Switched on anywhere, with real scans: the first half of a recorded drive is the map, the second half asks.
+
+The Intel Research Lab's log (SICK LMS, 180 beams). Short runs of consecutive scans with their odometry begin at random
+instants of its second half, each with a robot that has just been switched on. Lamps are made up: one every 2.4 m along
+the way, over a ceiling that no one has seen; walls, as the laser mapped them, stand in their light. The truth is the
+run's own final trajectory over the whole log, corrected by all its loops; the map was made of the first half alone,
+under these lamps, so its frame is theirs. Places that the first half has not seen are asked for too, and told apart.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from daemon.bridge import OdometryBridge, ScanBridge
+from daemon.config import LidarConfig
+from daemon.evidence import Observer
+from estimator import se2
+from estimator.light import LightsSetup
+from estimator.mapimage import MapImage, image_of
+from estimator.pipeline import Settings, State, keyframe_poses, new_state
+from estimator.records import Array, LightEpoch, Odometry, Record, Scan
+from hal.odometry import RawOdometry
+from hal.replay.carmen import read_carmen
+from tools.experiments.relocate import FOLDER, at_most, digest, keep, kept_outcomes
+from tools.experiments.relocate_map import pickled, unpickled
+from tools.experiments.relocate_trial import Case, Outcome, Robot, outcome, switched_on
+from tools.experiments.report import COMMAND, Report, Skipped, Table, Work
+from tools.figures import Figure, bounded
+from tools.sim.ceiling import Ceiling, Effects
+from tools.sim.ceiling_lamps import Fixture, with_codes
+from tools.sim.ceiling_records import epochs, survey
+from tools.sim.hybrid import Trajectory
+from tools.sim.world import Plan
+
+LOG: Final = "intel/intel.clf.gz"
+PERIOD_S: Final = 0.2
+SPACING_M: Final = 2.4
+BESIDE_M: Final = 1.3
+"""A lamp hangs where the way passes a crossing of a grid of `SPACING_M` at no more than this."""
+WALL_M: Final = 0.2
+SECONDS: Final = 5.0
+TRIALS: Final = 1000
+KNOWN_M: Final = 1.0
+"""A place counts as mapped if the first half passed within this of it."""
+EFFECTS: Final = Effects(bounces=0, people=False, sway=False)
+
+Batch = tuple[Scan, list[Record]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Log:
+    """Scans of the log, each with the records since the one before, itself the last."""
+
+    batches: list[Batch]
+
+    @property
+    def stamps(self) -> Array:
+        """(n,) ends of the scans."""
+        return np.array([scan.t_end for scan, _ in self.batches])
+
+
+@cache
+def log_of() -> Log:
+    """The log.
+
+    Raises:
+        Skipped: it is not there.
+    """
+    root = os.environ.get("LUMILOOP_DATA")
+    if root is None or not (Path(root) / LOG).is_file():
+        raise Skipped(f"LUMILOOP_DATA must name the folder that holds {LOG} (see docs/data.md)")
+    log = read_carmen(Path(root) / LOG)
+    wheels, bridge = OdometryBridge(), ScanBridge(LidarConfig())
+    bridge.T_base_lidar = np.array(log.mount)
+    batches: list[Batch] = []
+    due: list[Record] = []
+    for event in log.events(0.0):
+        if isinstance(event, RawOdometry):
+            moved = wheels.increment(event)
+            due += [] if moved is None else [moved]
+            continue
+        scan = bridge.scan(event)
+        batches.append((scan, [*due, scan]))
+        due = []
+    return Log(batches)
+
+
+def driven(robot: Robot, batches: list[Batch], light: Iterator[LightEpoch] | None = None) -> list[tuple[int, Array]]:
+    """Drive through the batches; anchor and pose relative to it after each."""
+    hung = []
+    epoch = None if light is None else next(light, None)
+    for scan, records in batches:
+        more: list[Record] = []
+        while light is not None and epoch is not None and epoch.t_end <= scan.t_end:
+            more.append(epoch)
+            epoch = next(light, None)
+        result = robot.take(scan.t_end, [*more, *records])
+        hung.append((result.anchor, result.T_anchor_base))
+    while robot.waiting:
+        robot.take(batches[-1][0].t_end, [])
+    return hung
+
+
+def robot_of(state: State) -> Robot:
+    """A robot at the log's begin."""
+    return Robot(state, Observer(0.0, odometry=True, lights=state.light is not None), period_s=PERIOD_S)
+
+
+def reference() -> tuple[Array, Array, Array]:
+    """Stamps and final poses of the whole log, and places (n, 2) of what stands about."""
+    log = log_of()
+    robot = robot_of(new_state(Settings(history=True)))
+    hung = driven(robot, log.batches)
+    frames = keyframe_poses(robot.state)
+    poses = np.array([se2.compose(frames[anchor], T) for anchor, T in hung])
+    walls = [
+        se2.apply(submap.T_map_submap, submap.settled.elements[:, :2].astype(np.float64))
+        for submap in robot.state.atlas.submaps.values()
+        if submap.settled is not None
+    ]
+    cells = np.unique(np.round(np.vstack(walls) / WALL_M).astype(np.int64), axis=0)
+    return log.stamps, poses, WALL_M * cells
+
+
+def lamps_over(poses: Array) -> tuple[Fixture, ...]:
+    """Lamps along a way."""
+    crossings = np.unique(np.round(poses[:, :2] / SPACING_M).astype(np.int64), axis=0)
+    made = []
+    for x, y in (SPACING_M * crossings).tolist():
+        if np.hypot(poses[:, 0] - x, poses[:, 1] - y).min() < BESIDE_M:
+            made.append(Fixture(x, y, 2.9, (x - 2.5, y - 2.5, x + 2.5, y + 2.5)))
+    return with_codes(made)
+
+
+def ceiling_over(poses: Array, walls: Array) -> Ceiling:
+    """The lamps along a way, and what stands in their light."""
+    clear = walls[[np.hypot(*(poses[:, :2] - wall).T).min() > 0.3 for wall in walls]]  # who passed by is no wall
+    plan = Plan()
+    for x, y in clear.tolist():
+        plan.circle((x, y), 0.5 * WALL_M)
+    return Ceiling(lamps_over(poses), plan.build(), 3.0, EFFECTS, seed=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What all queries share: truth, lamps, the map of the first half, and the first half's way."""
+
+    truth: Trajectory
+    walls: Array
+    image: MapImage
+    half: int
+
+    @property
+    def mapped(self) -> Array:
+        """(n, 2) places passed in the first half."""
+        return self.truth.poses[: self.half, :2]
+
+
+@cache
+def ceiling() -> Ceiling:
+    """The lamps, one for each process."""
+    ground = ground_of()
+    return ceiling_over(ground.truth.poses, ground.walls)
+
+
+def setup() -> LightsSetup:
+    """The photodiode."""
+    return LightsSetup(survey(ceiling()), clock_ppm=0.0)
+
+
+@cache
+def ground_of() -> Ground:
+    """Reference and map, made once and kept."""
+    path = FOLDER / f"real-{digest()}.map"
+    if path.exists():
+        found = unpickled(path)
+        assert isinstance(found, Ground)
+        return found
+    stamps, poses, walls = reference()
+    truth, half = Trajectory(stamps, poses), len(stamps) // 2
+    the = ceiling_over(poses, walls)
+    robot = robot_of(new_state(None, LightsSetup(survey(the), clock_ppm=0.0)))
+    driven(robot, log_of().batches[:half], epochs(the, truth.at, (float(stamps[0]), float(stamps[half - 1])), 1))
+    ground = Ground(truth, walls, image_of(robot.state), half)
+    pickled(path, ground)
+    return ground
+
+
+def attempt(task: tuple[int, bool]) -> Outcome:
+    """One query: seed, and whether the lamps are on."""
+    seed, lit = task
+    ground, log = ground_of(), log_of()
+    rng = np.random.default_rng((seed, 9))
+    stamps = log.stamps
+    last = int(np.searchsorted(stamps, stamps[-1] - SECONDS)) - 1
+    begin = int(rng.integers(ground.half, last))
+    end = int(np.searchsorted(stamps, stamps[begin] + SECONDS))
+    lights = setup() if lit else None
+    t0 = float(log.batches[begin][0].t_begin)
+    robot = switched_on(ground.image, lights, t0, PERIOD_S)
+    light = epochs(ceiling(), ground.truth.at, (t0 - 0.2, float(stamps[end])), seed) if lit else iter(())
+    pending = next(light, None)
+    moments = []
+    for k in range(begin, end):
+        scan, records = log.batches[k]
+        records = [one for one in records if k > begin or not isinstance(one, Odometry)]
+        more: list[Record] = []
+        while pending is not None and pending.t_end <= scan.t_end:
+            more.append(pending)
+            pending = next(light, None)
+        robot.take(scan.t_end, [*more, *records])
+        moments.append(robot.moment(scan.t_end, ground.truth.at(np.array([robot.t_mono]))[0]))
+    at = ground.truth.at(np.array([t0]))[0, :2]
+    known = bool(np.hypot(*(ground.mapped - at).T).min() < KNOWN_M)
+    case = Case("real, lit" if lit else "real, dark", False, True, SECONDS)
+    done = outcome(case, seed, t0, moments, (known, 0), robot.slowest_job_s)
+    keep(case.name, done)
+    return done
+
+
+def run(quick: bool, work: Work) -> Report:
+    """Queries with and without light; with ``quick`` nothing: the log alone takes a minute."""
+    log_of()
+    if quick:
+        raise Skipped("the map alone takes a minute; there is no quick part of it")
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    ground_of()
+    seeds = range(work.trials or TRIALS)
+    rows, figures = [], []
+    for lit in (True, False):
+        name = "real, lit" if lit else "real, dark"
+        kept = kept_outcomes(name)
+        fresh = work.map(attempt, [(seed, lit) for seed in seeds if seed not in kept], name)
+        found = kept | {one.seed: one for one in fresh}
+        mine = [found[seed] for seed in seeds]
+        for known in (True, False):
+            part = [one for one in mine if one.unique == known]
+            rows += [row_of(f"{name}, {'mapped' if known else 'not mapped'}", part)] if part else []
+        figures += figures_of(name, mine)
+    return Report(tuple(figures), (Table("Real scans: where am I?", HEAD, tuple(rows)),), (), (), NOTES)
+
+
+HEAD: Final = (
+    "", "queries", "right in 1 s, %", "at the end, %", "not yet, %", "wrong at the end", "off > 1 m or 15 deg",
+    "TRACKING wrongly", "slowest job, ms",
+)  # fmt: skip
+NOTES: Final = (
+    "truth: the run's own final trajectory over the whole log; lamps are made up along it",
+    f"each query is {SECONDS:.0f} s of the second half, some 25 scans, with its odometry",
+    "right: 20 cm and 3 deg, from then on to the end; mapped: the first half passed within 1 m of where it begins",
+)
+
+
+def row_of(title: str, found: list[Outcome]) -> tuple[str | float | int, ...]:
+    """A line of the table."""
+    n = len(found)
+    hidden = sum(one.end in ("AMBIGUOUS", "RELOCATING", "LOST", "STARTING") for one in found)
+    right = sum(one.ended_right for one in found)
+    return (
+        title, n, 100.0 * sum(one.right_s is not None and one.right_s <= 1.0 for one in found) / n, 100.0 * right / n,
+        100.0 * hidden / n, n - right - hidden, sum(one.far_s > 0.0 for one in found),
+        sum(one.astray_s > 0.0 for one in found), 1e3 * max(one.job_s for one in found),
+    )  # fmt: skip
+
+
+def figures_of(name: str, found: list[Outcome]) -> list[Figure]:
+    """What the project has bounds for."""
+    n, far = len(found), sum(one.far_s > 0.0 for one in found)
+    right = 100.0 * sum(one.ended_right for one in found) / n
+    command = f"{COMMAND} relocate_real"
+    out = [bounded(f"{name}: right at the end", right, "%", ">= 97", command)] if "lit" in name else []
+    return [
+        *out,
+        bounded(f"{name}: off by > 1 m or 15 deg, of {n}", float(far), "", "<= 0", command),
+        Figure(f"{name}: off by so much, less than (95 %)", 100.0 * at_most(far, n), "%", command=command),
+    ]
