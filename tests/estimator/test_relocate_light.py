@@ -1,0 +1,114 @@
+"""Windows that light gives for looking in a stored map, and when it counts as a witness."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from estimator.keyframe import Submap
+from estimator.light import LightsSetup
+from estimator.pipeline import new_state, step
+from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
+from estimator.relocate_light import Window, compatible, told, windows, witness
+from estimator.state import State
+from estimator.submap import Settled
+from tools.experiments.relocate_world import Site, Stroll, lit_house
+from tools.sim.ceiling import Effects
+
+pytestmark = pytest.mark.jit
+
+HERE = np.array((4.0, 10.9, 0.7))
+MILD = Effects(gain_spread=0.02, bounces=0, obstacles=False, people=False, sway=False)
+
+
+@cache
+def site(reused: bool = False) -> Site:
+    return Site(lit_house(reused=reused), MILD, 1)
+
+
+@cache
+def light(at: tuple[float, float, float], reused: bool = False) -> tuple[LightEpoch, ...]:
+    """Epochs of a robot at rest, without what lamps say of themselves."""
+    way = Stroll(np.array(at), 0.0, 0.0)
+    return tuple(replace(one, lamps=(None,) * len(one.ids)) for one in site(reused).light(way.at, (0.0, 0.6), 1))
+
+
+def robot(reused: bool = False, surveyed: bool = True) -> State:
+    """Switched on with a map whose frame is the survey's."""
+    state = new_state(lights=LightsSetup(site(reused).survey, clock_ppm=0.0))
+    settled = Settled(np.zeros((0, 8), np.float32), None, 0.01)  # type: ignore[arg-type]  # nobody looks at it here
+    placed = (np.zeros(3), np.eye(3)) if surveyed else None
+    state.atlas.submaps[1] = Submap(1, 1, np.zeros(3), np.zeros(3), settled=settled, light=placed)
+    state.atlas.adrift, state.atlas.since = 2, 2
+    return state
+
+
+def shown(state: State, at: Array = HERE, reused: bool = False) -> State:
+    x, y, yaw = at.tolist()
+    for epoch in light((x, y, yaw), reused):
+        step(state, [Odometry(epoch.t_begin, epoch.t_end, np.zeros(3)), epoch], UNLIMITED)
+    return state
+
+
+def inside(window: Window, at: Array) -> bool:
+    return math.hypot(window.x - at[0], window.y - at[1]) < window.reach_m
+
+
+def test_light_gives_one_small_window_that_holds_the_place_at_any_heading() -> None:
+    state = shown(robot())
+    (window,) = windows(state)
+    assert inside(window, HERE)
+    assert window.reach_m < 1.0
+    assert window.chance == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_fits_is_compatible_and_what_lies_elsewhere_is_not() -> None:
+    state = shown(robot())
+    for turn in (0.0, 1.5, 3.0):
+        assert compatible(state, HERE + np.array((0.05, -0.05, turn))) is True
+    assert compatible(state, HERE + np.array((3.0, 0.0, 0.0))) is False
+    assert witness(state, HERE)
+    assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
+
+
+def test_before_the_first_epoch_and_in_another_frame_light_says_nothing() -> None:
+    dark, foreign = robot(), shown(robot(surveyed=False))
+    for state in (dark, foreign):
+        assert windows(state) == ()
+        assert compatible(state, HERE) is None
+        assert not witness(state, HERE)
+    assert not told(foreign)
+    assert not told(new_state())
+
+
+def test_codes_that_repeat_give_a_window_for_each_place_and_no_witness() -> None:
+    """Rooms 0 and 2 to the south send the same codes in the same pattern."""
+    at, twin = np.array((2.2, 3.0, 0.4)), np.array((14.2, 3.0, 0.4))
+    state = shown(robot(reused=True), at, reused=True)
+    found = windows(state)
+    assert len(found) == 2
+    assert {inside(found[0], at), inside(found[1], at)} == {True, False}
+    assert all(inside(window, at) or inside(window, twin) for window in found)
+    assert compatible(state, at) is True
+    assert not witness(state, at)
+
+
+def test_a_robot_carried_off_is_looked_for_where_the_latest_light_came_from() -> None:
+    """The `lights` filter itself takes two seconds to give its place up."""
+    state = shown(robot())
+    state.light.filter.tracks = state.light.filter.tracks[:1]  # type: ignore[union-attr]  # as after some way
+    state.light.filter.t_odd = 0.5  # type: ignore[union-attr]
+    (window,) = windows(state)
+    assert inside(window, HERE)
+    assert compatible(state, HERE) is True
+    assert not witness(state, HERE)
+
+
+def test_light_that_has_gone_says_nothing() -> None:
+    state = shown(robot())
+    step(state, [Odometry(0.6, 1.5, np.zeros(3))], UNLIMITED)
+    assert windows(state) == ()
