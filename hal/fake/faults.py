@@ -4,7 +4,7 @@
 
     [[fault]]
     what = "bit_flip"     # a word of the device's vocabulary
-    where = "lidar"       # which device; may be left out while there is only one
+    where = "lidar"       # which device; may be left out while only one knows the word
     when = 2.0            # seconds after the schedule starts (after the order, when ordered live)
     for = 1.5             # seconds; without `for` and `count` it lasts until it is cleared
     count = 3             # or: how many times it strikes
@@ -117,8 +117,8 @@ def read_fault(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, V
     Raises:
         FaultError: unknown device, word or key, or a value of the wrong kind or out of range.
     """
-    only = next(iter(vocabularies)) if len(vocabularies) == 1 else None
-    where = table.get("where", only)
+    able = [name for name, words in vocabularies.items() if len(vocabularies) == 1 or table.get("what") in words]
+    where = table.get("where", able[0] if len(able) == 1 else None)
     if where not in vocabularies:
         raise FaultError(f"{path}.where", f"{where!r} is no device here; there are: {', '.join(sorted(vocabularies))}")
     what = table.get("what")

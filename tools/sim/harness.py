@@ -28,6 +28,7 @@ from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.transport import FakeOpener
 from hal.inputs import InputPort
 from tools.sim.feed import feed_odometry
+from tools.sim.hands import Hands
 from tools.sim.harness_light import BUS, LEVEL, LinkBridge, light_up, lights_of
 from tools.sim.scene import Scenario, Scene, SimulatedScene
 from tools.sim.scene_light import LINK
@@ -92,7 +93,8 @@ def run(
         seconds: from the first scan asked for.
         scenario: the simulated scene; default the paper's robot in the paper's room.
         scene: another scene, instead of a scenario.
-        faults: TOML schedule of faults of the lidar and, with lights, of the converter (``adc``).
+        faults: TOML schedule of faults of the lidar and, with lights, of the converter (``adc``), and of being carried
+            (``robot``, see tools/sim/hands.py).
         odometry: whether wheel odometry is fed.
         lidar: whether there is a lidar; without one, lights must be in the scenario.
 
@@ -151,6 +153,8 @@ async def _main(settings: Config, scene: Scene, log: _Log, order: _Order) -> int
     light = lights_of(scene)
     if light is not None:
         targets |= light_up(around, light, clock)
+    if isinstance(scene, SimulatedScene):
+        targets["robot"] = Hands(scene, clock.now)
     schedule = FaultSchedule(targets)
     if order.faults:
         schedule.load(order.faults)

@@ -38,6 +38,7 @@ from hal.fake.tcp_server import TcpServer
 from tools.sim.buildings import BUILDINGS
 from tools.sim.ceiling import Effects
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
+from tools.sim.hands import Hands
 from tools.sim.hybrid import HybridScene
 from tools.sim.scene import Scenario, Scene, SimulatedScene
 from tools.sim.scene_light import Lights
@@ -95,7 +96,12 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--survey", type=Path, metavar="FILE", help="write the plan of the lamps here, a survey for the daemon")
     add("--spread", type=float, default=0.05, help="of the lamps' powers about the plan (default %(default)s)")
-    add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults of `lidar` and `adc`, starts at once")
+    add(
+        "--faults",
+        type=Path,
+        metavar="FILE",
+        help="TOML schedule of orders for `lidar`, `adc`, `robot`; starts at once",
+    )
     add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
     add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
@@ -138,6 +144,8 @@ async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None
         targets: dict[str, Target] = {"lidar": device}
         there = {"model": scene.model.modl, "start": scene.truth(np.array([loop.time()]))[0].tolist()}
         there |= await _light_up(options, scene, targets, stack)
+        if isinstance(scene, SimulatedScene):
+            targets["robot"] = Hands(scene, loop.time)
         schedule = FaultSchedule(targets)
         stack.callback(schedule.close)
         if options.faults is not None:

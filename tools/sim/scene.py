@@ -17,6 +17,7 @@ from hal.fake.scan import FakeScan
 from tools.sim import beams
 from tools.sim.beams import Optics, Posture, Returns, Scanner, Sweep
 from tools.sim.buildings import Building, building
+from tools.sim.hands import Way, start_of, then
 from tools.sim.odometry import Odometer, Wheels
 from tools.sim.people import Crowd
 from tools.sim.robot import Body, Drive
@@ -105,6 +106,9 @@ class SimulatedScene:
         self.optics = scenario.optics or OPTICS.get(scenario.lidar, beams.UTM_30LX)
         self.held = held
         self.t_go: float | None = None
+        self._way = Way(self.drive)
+        self._counted = np.zeros(3)
+        self._put_down = 0
         self._t_first: float | None = None
         self._crowd = Crowd(self.building.people if scenario.people else ())
         self._scanner = Scanner(self.building.world, sweep_of(self.model), self.optics, scenario.seed)
@@ -127,11 +131,11 @@ class SimulatedScene:
         first = self.begin(t_mono)
         t = t_mono - first
         since = first - t_mono if self.t_go is None else first - self.t_go  # <= 0: not driving yet
-        pitch, roll = self.drive.tilt(t + since)
-        robot = self.drive.pose(np.array([t + since]))[0]
+        pitch, roll = self.drive.tilt(float(self._way.clock(np.array([t + since]))[0]))
+        robot = self._way.poses(np.array([t + since]))[0]
         legs = self._crowd.legs(t + self._scanner.sweep.first_s, robot)
         posture = Posture(self.scenario.body.height, pitch, roll)
-        seen = self._scanner.measure(t, lambda at: compose(self.drive.pose(at + since), self.mount), legs, posture)
+        seen = self._scanner.measure(t, lambda at: compose(self._way.poses(at + since), self.mount), legs, posture)
         return to_device(self.model, seen)
 
     def begin(self, t_mono: float) -> float:
@@ -153,8 +157,14 @@ class SimulatedScene:
         self.held = False
 
     def driven(self, t_mono: Array) -> Array:
-        """(n,) s since the robot drove off, 0 before."""
-        return np.zeros(len(t_mono)) if self.t_go is None else np.maximum(t_mono - self.t_go, 0.0)
+        """(n,) s on the drive's clock: since the robot drove off, 0 before; being carried, it stands still."""
+        return np.zeros(len(t_mono)) if self.t_go is None else self._way.clock(t_mono - self.t_go)
+
+    def carry(self, t_mono: float, ahead_s: float, takes_s: float) -> None:
+        """Lift the robot and put it down further along its tour; one that is held stays."""
+        if self.t_go is not None:
+            self._way.carry(t_mono - self.t_go, ahead_s, takes_s)
+            self._surprise()
 
     def walked(self, t_mono: Array) -> Array:
         """(n,) s since people began to walk, 0 before."""
@@ -166,13 +176,24 @@ class SimulatedScene:
         if self.t_go is None:
             return t_mono + 1.0 / rate, np.zeros(3)
         k = max(int(np.floor((t_mono - self.t_go) * rate + 1e-6)) + 1, 0)
-        return self.t_go + k / rate, self._odometer.reading(k)
+        return self.t_go + k / rate, self._rolled(k / rate)
+
+    def _rolled(self, t: float) -> Array:
+        """What the wheels have counted at ``t`` since the robot drove off: nothing of being carried."""
+        rate, carries = self.scenario.wheels.rate_hz, self._way.carries
+        while self._put_down < len(carries) and t >= carries[self._put_down].t_down:
+            one = carries[self._put_down]
+            before = then(self._counted, self._odometer.reading(round(one.from_s * rate)))
+            self._counted = start_of(before, self._odometer.reading(round(one.to_s * rate)))
+            self._put_down += 1
+        there = float(self._way.clock(np.array([t]))[0])
+        return then(self._counted, self._odometer.reading(round(there * rate)))
 
     def truth(self, t_mono: Array) -> Array:
         """See :class:`Scene`."""
         if self.t_go is None:
             return self.drive.pose(np.zeros(len(t_mono)))
-        return self.drive.pose(np.asarray(t_mono) - self.t_go)
+        return self._way.poses(np.asarray(t_mono) - self.t_go)
 
 
 def lidar_model(name: str) -> LidarModel:
