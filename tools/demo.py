@@ -3,8 +3,8 @@
 The simulator is one process (a lidar on a pty, a photodiode's converter on an I2C bus behind a socket, odometry and
 truth as datagrams), the daemon another (``lumiloop run``). This process reads the pose and the links over Modbus, as
 any PLC would, and compares the pose with the truth of the same instant. On the way the photodiode and then the lidar
-are switched off and on again; keys do the same at any time. At the end the map is taken from the daemon's own
-recording. Loopback only; nothing is left running.
+are switched off and on again, or, with --kidnap, the robot is carried away; keys do the same at any time. At the end
+the map is taken from the daemon's own recording. Loopback only; nothing is left running.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Any, Final
 
 from daemon.publish.client import NoAnswer, Reader, Reading
 from daemon.publish.snapshot import State
-from tools.demo_acts import NAMES, OrderRefused, Stage, complaint, keyboard, pressed, programme
+from tools.demo_acts import NAMES, ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
 from tools.demo_score import READY, Score, Track, pose_of, summary, verdict
 
 ROOT: Final = Path(__file__).parents[1]
@@ -189,7 +189,8 @@ def watch(show: Show, score: Score, seconds: float) -> None:
         track.collect()
         score.take(reading, None if reading["t_mono"] is None else track.at(float(reading["t_mono"])))
         show.stage.press(pressed(), now - begin)
-        for told in [*show.stage.play(now - begin, int(reading["state"] or 0)), *score.news()]:
+        off_m, jumps = (score.error_m[-1] if score.error_m else None), int(reading["jumps"] or 0)
+        for told in [*show.stage.play(now - begin, int(reading["state"] or 0), off_m, jumps), *score.news()]:
             print(f"----- {told}", flush=True)
         if now >= line_at:
             print(line(now - begin, score, (score.reads - reads) / (now - line_at + LINE_PERIOD_S)), flush=True)
@@ -252,7 +253,8 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
     modbus, odometry = free_port(), free_port()
     config = write_config(folder, modbus, odometry, lights=not options.dark)
     daemon_words = [sys.executable, "-m", "daemon", "run", "--config", str(config), "--record", str(folder / RECORDING)]
-    stage = Stage(folder / CONTROL, [] if options.dark else programme(options.seconds))
+    acts = programme(options.seconds, options.kidnap) if options.kidnap or not options.dark else []
+    stage = Stage(folder / CONTROL, acts)
     score.acts, score.surveyed = stage.acts, not options.dark
     with contextlib.ExitStack() as stack:
         truth = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -267,7 +269,7 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
         wait_for_pose(daemon, reader, patience)
         print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
         if sys.stdin.isatty() and not options.dark:
-            print("keys: p switches the photodiode off or on, l the lidar")
+            print("keys: p switches the photodiode off or on, l the lidar, c carries the robot away")
         simulator.send_signal(signal.SIGUSR1)
         stack.enter_context(keyboard())
         watch(Show(reader, Track(truth), stage, [daemon, simulator]), score, options.seconds)
@@ -293,8 +295,12 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
             f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg"
         )
     for act in score.acts:
-        seen, back = (("never" if t is None else f"after {t:.1f} s") for t in (act.seen, act.back))
-        print(f"{NAMES[act.device]} off: not TRACKING {seen}; on again: TRACKING {back}")
+        seen, back, right = (("never" if t is None else f"after {t:.1f} s") for t in (act.seen, act.back, act.right))
+        if act.device == ROBOT:
+            print(f"robot lifted: not TRACKING {seen}; put down: pose right {right}, TRACKING {back}")
+            print(f"map jumps counted: {act.jumps[0]} before, {act.jumps[1]} at the end")
+        else:
+            print(f"{NAMES[act.device]} off: not TRACKING {seen}; on again: TRACKING {back}")
     (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
     print(f"figures: {out / 'summary.json'}")
     if wrong:
@@ -311,6 +317,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--forever", action="store_const", const=0.0, dest="seconds", help="until Ctrl-C; records 0.3 GB an hour"
     )
     parser.add_argument("--dark", action="store_true", help="without lamps: lidar and odometry alone")
+    parser.add_argument("--kidnap", action="store_true", help="carry the robot away instead of switching sensors off")
     parser.add_argument("--building", default="paper_room", help="see `python -m tools.sim --help`")
     parser.add_argument("--seed", type=int, default=0, help="of noise, slip and people")
     parser.add_argument("--out", type=Path, default=OUT, help="where results go (default %(default)s)")

@@ -1,4 +1,4 @@
-"""What happens to the sensors in the demo: at set times, or by a key, one of them is switched off and on again."""
+"""What happens in the demo, at set times or by a key: a sensor goes off and on again, or the robot is carried away."""
 
 from __future__ import annotations
 
@@ -15,11 +15,20 @@ from typing import Any, Final
 
 from daemon.publish.snapshot import State
 
-KEYS: Final = {"p": "adc", "l": "lidar"}
-NAMES: Final = {"adc": "photodiode", "lidar": "lidar"}
+ROBOT: Final = "robot"
+KEYS: Final = {"p": "adc", "l": "lidar", "c": ROBOT}
+NAMES: Final = {"adc": "photodiode", "lidar": "lidar", ROBOT: "robot"}
+AHEAD_S, TAKES_S = 32.0, 2.0
+"""How much further along its tour the robot is put down when it is carried away, and how long that takes, s."""
 SHORTEST_S: Final = 45.0
 """A shorter demo has no time for it."""
 _ANSWER_S: Final = 2.0
+
+
+AWAY: Final = "the robot is lifted and carried away"
+RIGHT_M: Final = 0.2
+"""A pose that is off by less is right."""
+CARRY: Final = f"carry where={ROBOT} ahead={AHEAD_S:g} takes={TAKES_S:g}"
 
 
 class OrderRefused(Exception):
@@ -28,10 +37,11 @@ class OrderRefused(Exception):
 
 @dataclass(slots=True)
 class Act:
-    """One sensor is off from ``begin`` to ``end``, seconds since the robot drove off.
+    """One sensor is off, or the robot in the air, from ``begin`` to ``end``, seconds since the robot drove off.
 
     Attributes:
         seen: s after ``begin`` until the state was not TRACKING any more. back: s after ``end`` until it was again.
+        right: s after ``end`` until the pose was right and stayed so. jumps: of the map pose, before and by now.
     """
 
     device: str
@@ -40,20 +50,34 @@ class Act:
     state: str = "to come"
     seen: float | None = None
     back: float | None = None
+    right: float | None = None
+    jumps: tuple[int, int] = (0, 0)
 
     @property
     def figures(self) -> dict[str, Any]:
         """For the summary."""
+        if self.device == ROBOT:
+            return {
+                "what": NAMES[self.device], "lifted_s": round(self.begin, 2), "put_down_s": round(self.end, 2),
+                "not_tracking_after_s": self.seen, "right_again_after_s": self.right,
+                "tracking_again_after_s": self.back, "jumps": list(self.jumps),
+            }  # fmt: skip
         return {
-            "sensor": NAMES[self.device], "off_from_s": round(self.begin, 2), "off_until_s": round(self.end, 2),
+            "what": NAMES[self.device], "off_from_s": round(self.begin, 2), "off_until_s": round(self.end, 2),
             "degraded_after_s": self.seen, "tracking_again_after_s": self.back,
         }  # fmt: skip
 
 
-def programme(seconds: float) -> list[Act]:
-    """First the photodiode, then the lidar, with time to recover from each; nothing in a short or an endless demo."""
+def programme(seconds: float, kidnap: bool = False) -> list[Act]:
+    """First the photodiode, then the lidar, with time to recover from each; nothing in a short or an endless demo.
+
+    With ``kidnap`` the robot is carried away instead, once it has seen something of the room.
+    """
     if seconds < SHORTEST_S:
         return []
+    if kidnap:
+        begin = 0.45 * seconds
+        return [Act(ROBOT, begin, begin + TAKES_S)]
     return [
         Act("adc", 0.35 * seconds, 0.46 * seconds),
         Act("lidar", 0.62 * seconds, 0.73 * seconds),
@@ -67,25 +91,36 @@ class Stage:
     control: Path
     acts: list[Act] = field(default_factory=list)
 
-    def play(self, t: float, state: int) -> list[str]:
-        """What has to be done ``t`` seconds after the start; returns what to tell the viewer."""
+    def play(self, t: float, state: int, off_m: float | None = None, jumps: int = 0) -> list[str]:
+        """What has to be done ``t`` seconds after the start; returns what to tell the viewer.
+
+        ``state``, ``off_m``, ``jumps``: as published, the error against the truth of the same instant.
+        """
         told = []
         for act in self.acts:
+            carried = act.device == ROBOT
             if act.state == "to come" and t >= act.begin:
-                self._order(f"order off where={act.device}")
+                self._order(f"order {CARRY}" if carried else f"order off where={act.device}")
                 act.state = "off"
-                told.append(f"the {NAMES[act.device]} is switched off")
+                told.append(AWAY if carried else f"the {NAMES[act.device]} is switched off")
             if act.state == "off" and t >= act.end:
-                self._order(f"clear off {act.device}")
+                if not carried:
+                    self._order(f"clear off {act.device}")
                 act.state = "on again"
-                told.append(f"the {NAMES[act.device]} is switched on again")
+                told.append("the robot is put down" if carried else f"the {NAMES[act.device]} is switched on again")
             _note(act, t, state == State.TRACKING)
+            if carried:
+                told += _follow(act, t, off_m, jumps)
         return told
 
     def press(self, key: str, t: float) -> None:
         """A key was pressed: the sensor it stands for goes off, or comes back."""
         device = KEYS.get(key.lower())
         if device is None:
+            return
+        if device == ROBOT:
+            if all(act.state == "on again" for act in self.acts if act.device == ROBOT):
+                self.acts.append(Act(ROBOT, t, t + TAKES_S))
             return
         running = [act for act in self.acts if act.device == device and act.state == "off"]
         if running:
@@ -110,10 +145,27 @@ class Stage:
 
 
 def _note(act: Act, t: float, tracking: bool) -> None:
-    if act.state == "off" and act.seen is None and not tracking:
+    unseen = act.seen is None and act.state == ("off" if act.device != ROBOT else act.state)
+    if t >= act.begin and unseen and not tracking:
         act.seen = round(t - act.begin, 2)
-    if act.state == "on again" and act.back is None and tracking:
+    if act.state == "on again" and act.back is None and tracking and (act.seen is not None or act.device != ROBOT):
         act.back = round(t - act.end, 2)
+
+
+def _follow(act: Act, t: float, off_m: float | None, jumps: int) -> list[str]:
+    """Watch the pose of a robot that was carried away; returns what to tell the viewer."""
+    if act.state == "to come":
+        act.jumps = jumps, jumps
+        return []
+    act.jumps = act.jumps[0], jumps
+    if act.state == "off" or off_m is None:
+        return []
+    if off_m > RIGHT_M:
+        act.right = None
+    elif act.right is None:
+        act.right = round(t - act.end, 2)
+        return [f"the pose is right again {act.right:.1f} s after it was put down; map jumps {jumps}"]
+    return []
 
 
 def complaint(acts: list[Act]) -> str:
@@ -121,6 +173,12 @@ def complaint(acts: list[Act]) -> str:
     for act in acts:
         if act.state != "on again":
             continue
+        if act.seen is None and act.device == ROBOT:
+            return "the robot was carried away and the state stayed TRACKING"
+        if act.back is None and act.device == ROBOT:
+            return "the robot was put down again, but the state has not become TRACKING since"
+        if act.right is None and act.device == ROBOT:
+            return "the robot was put down again, and its pose is not right since"
         if act.seen is None:
             return f"the {NAMES[act.device]} was off for {act.end - act.begin:.0f} s and the state stayed TRACKING"
         if act.back is None:

@@ -155,6 +155,40 @@ def test_a_key_switches_a_sensor_off_and_the_same_key_on_again(tmp_path: Path) -
     assert orders == ["order off where=lidar", "clear off lidar"]
 
 
+def test_a_robot_is_carried_away_and_watched_until_it_is_found(tmp_path: Path) -> None:
+    [act] = programme(60.0, kidnap=True)
+    tracking, lost = int(State.TRACKING), int(State.LOST)
+    told: list[str] = []
+    with simulator(tmp_path / "control", "ok") as orders:
+        stage = Stage(tmp_path / "control", [act])
+        for tenth in range(600):
+            t = 0.1 * tenth
+            away, found = t >= act.begin + 0.45, t >= act.end + 0.95
+            off_m = 3.0 if away and not found else 0.04
+            told += stage.play(t, lost if away and t < act.end + 5.95 else tracking, off_m, 4 if found else 3)
+    assert orders == ["order carry where=robot ahead=32 takes=2"]
+    assert (act.seen, act.right, act.back) == pytest.approx((0.5, 1.0, 6.0), abs=0.11)
+    assert act.jumps == (3, 4)
+    assert told[:2] == ["the robot is lifted and carried away", "the robot is put down"]
+    assert "right again" in told[2]
+    assert complaint([act]) == ""
+    act.right = None
+    assert "not right" in complaint([act])
+    act.back = None
+    assert "not become TRACKING" in complaint([act])
+    act.seen = None
+    assert "stayed TRACKING" in complaint([act])
+
+
+def test_a_key_carries_the_robot_away_once_at_a_time(tmp_path: Path) -> None:
+    with simulator(tmp_path / "control", "ok") as orders:
+        stage = Stage(tmp_path / "control")
+        for t in (1.0, 1.5):
+            stage.press("c", t)
+            stage.play(t, int(State.TRACKING))
+    assert orders == ["order carry where=robot ahead=32 takes=2"]
+
+
 def test_a_simulator_that_refuses_or_is_gone_is_told_plainly(tmp_path: Path) -> None:
     stage = Stage(tmp_path / "control", programme(60.0))
     with pytest.raises(OrderRefused, match="does not take orders"):
