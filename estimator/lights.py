@@ -20,7 +20,7 @@ from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
 from estimator.lights_links import Sight, distrust, forget, judge, relearn, sights, table, view_of
 from estimator.lights_memory import fresh_gains
-from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places
+from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places, rule_out
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3, positive_part
 from estimator.records import Array, Imu, Odometry
@@ -207,6 +207,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         track.weight += likelihood if way > 0.0 else 0.0  # standing still, strengths say nothing of the heading
         views.append((track, seen))
     if len(lights.tracks) > 1:
+        rule_out(lights, epoch)
         decide(lights)
     return next((seen for track, seen in views if lights.tracks and track is lights.tracks[0]), [])
 

@@ -193,6 +193,29 @@ def decide(lights: Lights) -> None:
     lights.tracks = kept
 
 
+def rule_out(lights: Lights, epoch: LightEpoch) -> None:
+    """Drop hypotheses from which a lamp cannot be seen that has said which one it is, as long as one is left.
+
+    Where codes repeat this decides, even at rest.
+    """
+    rx, out = lights.survey.receiver, []
+    named = [
+        (lights.catalogue.by_id[frame.lamp_id], float(epoch.amplitude[i]))
+        for i, frame in enumerate(epoch.lamps)
+        if frame is not None and frame.lamp_id in lights.catalogue.by_id
+    ]
+    direct = [lamp for lamp, amplitude in named if amplitude > lights.catalogue.rims[lamp.lamp_id]]
+    for track in lights.tracks:
+        spread = 3.0 * math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0)) + APART_M
+        for lamp in direct:
+            reach = (lamp.z - rx.z) * math.tan(min(rx.half_fov_rad, 1.3)) + spread
+            if math.hypot(lamp.x - track.x[0], lamp.y - track.x[1]) > reach:
+                out.append(track)
+                break
+    if out and len(out) < len(lights.tracks):
+        lights.tracks = [track for track in lights.tracks if track not in out]
+
+
 def same(a: Track, b: Track) -> bool:
     """Whether two hypotheses have become one."""
     near = math.hypot(*(a.x[:2] - b.x[:2]).tolist()) < SAME_M

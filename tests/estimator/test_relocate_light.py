@@ -112,3 +112,16 @@ def test_light_that_has_gone_says_nothing() -> None:
     state = shown(robot())
     step(state, [Odometry(0.6, 1.5, np.zeros(3))], UNLIMITED)
     assert windows(state) == ()
+
+
+def test_a_lamp_that_says_which_one_it_is_rules_out_the_other_room_at_rest() -> None:
+    at = np.array((2.2, 3.0, 0.4))
+    state = shown(robot(reused=True), at, reused=True)
+    assert len(windows(state)) == 2
+    way = Stroll(at, 0.0, 0.0)
+    told_by_itself = [one for one in site(True).light(way.at, (0.0, 3.6), 1) if any(one.lamps)]
+    for epoch in told_by_itself[:3]:
+        moved = [Odometry(0.6, epoch.t_end, np.zeros(3))] if epoch is told_by_itself[0] else []
+        step(state, [*moved, epoch], UNLIMITED)
+    (window,) = windows(state)
+    assert inside(window, at)
