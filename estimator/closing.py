@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator import se2
+from estimator import livemap, se2
 from estimator.atlas import LOOK, SOLVE, Atlas, Ints, Waiting
 from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
@@ -40,12 +40,15 @@ def take_answer(state: State, answer: Answer) -> None:
     """Take in what a job has found."""
     state.atlas.answer(answer)
     solve_graph(state, state.atlas)
+    livemap.go_on(state)
 
 
 def keyframe_laid(state: State, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
     """Hang a new keyframe on the map and look whether this place is known; arguments as of `Atlas.add`."""
     atlas, told = state.atlas, state.settings.loops
+    before, frames = atlas.newest, atlas.frames
     atlas.add(frame, P, sigma, anew)
+    livemap.follow(state, before, frames)
     if told is not None and not atlas.looking and atlas.since_look >= told.every:
         look_back(state, told, frame)
 
@@ -202,6 +205,8 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
         return
     moved = se2.compose(solution.poses[-1], se2.inverse(last.T_map_submap))
     first = se2.compose(solution.poses[0], se2.inverse(submaps[0].T_map_submap))
+    if state.live is not None:
+        state.live.due = True
     for submap, T in zip(submaps, solution.poses, strict=True):
         if not (held and submap is last):
             submap.T_map_submap = T

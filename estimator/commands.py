@@ -37,6 +37,8 @@ def forget(state: State) -> None:
     """Drop the map; the pose now hangs on the start."""
     state.keyframes, state.places, state.retired, state.lone, state.local = {}, {}, {}, {}, None
     state.atlas = state.atlas.renewed()
+    if state.live is not None:
+        state.live.clear()
     state.P_anchor, state.fused.P = NOTHING.copy(), NOTHING.copy()
     state.anchor, state.T_odom_anchor, state.failures = 0, state.fused.T_odom_base, 0
     state.T_map_start = se2.compose(state.T_map_odom, state.fused.T_odom_base)

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from estimator import se2
 from estimator.kernel import kernel
-from estimator.keyframe import Keyframe
+from estimator.keyframe import Beams
 from estimator.records import Array, Beam
+
+Placed = tuple[Array, Beams]
+"""T_map_lidar and beams of a scan."""
 
 LIMIT = 50_000_000
 """Cells beyond which a grid is refused: 200 MB."""
@@ -82,12 +84,10 @@ def cast_beams(
             cells[last_row, last_column] = min(CLAMP, max(-CLAMP, cells[last_row, last_column] + change))
 
 
-def extent(keyframes: Sequence[Keyframe], margin: float) -> tuple[Array, Array]:
-    """Lower left and upper right corner that hold every keyframe and every surface point."""
+def extent(scans: Sequence[Placed], margin: float) -> tuple[Array, Array]:
+    """Lower left and upper right corner that hold every lidar and every surface point."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for k in keyframes:
-        T = se2.compose(k.T_map_keyframe, k.T_base_lidar)
-        bearing, reach, kind = k.beams()
+    for T, (bearing, reach, kind) in scans:
         hit = (kind == Beam.HIT) & np.isfinite(reach) & np.isfinite(bearing)
         angle = bearing[hit] + T[2]
         for axis, ends in enumerate((reach[hit] * np.cos(angle), reach[hit] * np.sin(angle))):
@@ -96,25 +96,34 @@ def extent(keyframes: Sequence[Keyframe], margin: float) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def render(keyframes: Sequence[Keyframe], resolution: float) -> Grid:
-    """The grid of these keyframes at their present places in the map; the GIL is free while a scan is cast.
+def blank(rows: int, columns: int, resolution: float) -> npt.NDArray[np.float32]:
+    """So many unknown cells.
+
+    Raises:
+        ValueError: more than :data:`LIMIT`.
+    """
+    if rows * columns > LIMIT:
+        raise ValueError(
+            f"a map of {columns} x {rows} cells is too large; choose a resolution coarser than {resolution} m"
+        )
+    return np.zeros((rows, columns), np.float32)
+
+
+def render(scans: Sequence[Placed], resolution: float) -> Grid:
+    """The grid of these scans, on multiples of the resolution; the GIL is free while a scan is cast.
 
     Raises:
         ValueError: the resolution is not positive, or the grid would have more than :data:`LIMIT` cells.
     """
     if not resolution > 0.0:
         raise ValueError(f"map resolution is {resolution} m per cell; it must be positive")
-    if not keyframes:
+    if not scans:
         return Grid(np.zeros(2), resolution, np.zeros((0, 0), np.float32))
-    low, high = extent(keyframes, 4.0 * resolution)
+    low, high = extent(scans, 4.0 * resolution)
     origin = np.floor(low / resolution) * resolution
     columns, rows = (np.ceil((high - origin) / resolution)).astype(np.int64).tolist()
-    if rows * columns > LIMIT:
-        raise ValueError(
-            f"a map of {columns} x {rows} cells is too large; choose a resolution coarser than {resolution} m"
-        )
-    cells = np.zeros((rows, columns), np.float32)
+    cells = blank(rows, columns, resolution)
     frame = np.array((origin[0], origin[1], resolution))
-    for k in keyframes:
-        cast_beams(cells, frame, se2.compose(k.T_map_keyframe, k.T_base_lidar), k.beams())
+    for T_map_lidar, beams in scans:
+        cast_beams(cells, frame, T_map_lidar, beams)
     return Grid(origin, resolution, cells)

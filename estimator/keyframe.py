@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 from weakref import WeakSet
 
@@ -121,9 +122,12 @@ def unturned(bearing_rad: Array, turned_rad: float) -> Array:
     return np.asarray(bearing_rad - turned_rad * (1.0 - np.arange(n) / (n - 1)))
 
 
-def unhung(frame: Keyframe) -> Keyframe:
-    """The same keyframe, fixed to where it is in the map now."""
-    return replace(frame, submap=Submap(0, frame.key, frame.T_map_keyframe, frame.T_odom_keyframe))
+def hanging(frames: Iterable[Keyframe]) -> list[tuple[Submap, list[Keyframe]]]:
+    """Keyframes by what they hang on, in the order in which that was laid."""
+    groups: dict[int, tuple[Submap, list[Keyframe]]] = {}
+    for frame in frames:
+        groups.setdefault(frame.submap.first, (frame.submap, []))[1].append(frame)
+    return [groups[first] for first in sorted(groups)]
 
 
 def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -> Keyframe:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from estimator import se2
+from estimator import livemap, se2
 from estimator.atlas import Constraints
 from estimator.fusion import covariance
 from estimator.keyframe import Keyframe, Submap
@@ -205,6 +205,7 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
         frame = replace(hung.frame, submap=submap, T_odom_keyframe=T_odom)
         state.keyframes[frame.key] = frame
         state.places.setdefault(square_of(frame.T_map_keyframe), []).append(frame.key)
+    livemap.begin(state)
     state.next_key = 1 + max((*state.keyframes, *(piece.first for piece in image.submaps)))
     atlas.since = state.next_key
     if state.absolute is not None:

@@ -7,22 +7,22 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, adrift, closing, grid, matchers, matching, motion, protection, se2
+from estimator import absolute, adrift, closing, livemap, matchers, matching, motion, protection, se2
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
-from estimator.keyframe import unhung, unturned
+from estimator.keyframe import hanging, unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
 from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
-from estimator.records import Answer, Array, Command, Imu, Job, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
+from estimator.records import Answer, Array, Command, Imu, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
 from estimator.refusal import in_time, nothing_of, refused
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
 from estimator.state import Settings, State, new_state
 
-__all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_job", "render_map", "step"]
+__all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_map", "step"]
 
 
 def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
@@ -191,15 +191,5 @@ def keyframe_poses(state: State) -> dict[int, Array]:
 
 
 def render_map(state: State, resolution: float) -> Grid:
-    """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (see `grid.render`)."""
-    return grid.render(list(state.keyframes.values()), resolution)
-
-
-def render_job(state: State, resolution: float, job_id: int, priority: int = 9) -> Job:
-    """:func:`render_map` as work for the background worker: the keyframes of this moment, nothing else of the state.
-
-    The answer's payload is the `Grid`. Later steps do not disturb it: a keyframe's scan never changes, and these hang
-    on nothing that a correction moves.
-    """
-    keyframes = tuple(unhung(frame) for frame in state.keyframes.values())
-    return Job(job_id, priority, lambda: grid.render(keyframes, resolution))
+    """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (`livemap.at_once`)."""
+    return livemap.at_once(hanging(state.keyframes.values()), resolution)

@@ -12,6 +12,7 @@ import numpy as np
 from estimator import se2
 from estimator.atlas import Atlas
 from estimator.keyframe import Keyframe, Submap
+from estimator.livemap import LiveMap
 from estimator.localmap import LocalMap, MapSettings
 from estimator.loop import LoopSettings
 from estimator.matchers import Matcher, Weight, load
@@ -43,6 +44,7 @@ class Settings:
             the beams still fit the map.
         keep: keyframes kept per half metre square and eighth of a turn.
         history: keep the pose of keyframes whose scan has been let go; for replay, which needs them once at the end.
+        live_m: metres per cell of a map that is kept up to date for whoever shows it; 0: none is.
         loops: when a place counts as seen before; None: never.
         matcher: the default one, or one to compare it with. weight: of Eq. 15, where the matcher is the paper's.
     """
@@ -54,6 +56,7 @@ class Settings:
     keyframe_share: float = 0.7
     keep: int = 2
     history: bool = False
+    live_m: float = 0.0
     loops: LoopSettings | None = field(default_factory=LoopSettings)
     matcher: Matcher = Matcher.LINE
     weight: Weight = Weight.INFORMATION
@@ -73,6 +76,7 @@ class State:
         T_map_odom: absolute correction. T_map_start: keyframe 0, where the robot was switched on.
         keyframes: by ID, with their scans. places: their IDs by half metre square and eighth of a turn.
         atlas: what the keyframes hang on, and loops.
+        live: the map as cells, None: nobody asks for it.
         retired: where history is kept, what those let go hang on, and their places there. lone: where light alone held
             the pose, by ID.
         anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, covariance of its place in the map.
@@ -96,6 +100,7 @@ class State:
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     places: dict[Place, list[int]] = field(default_factory=dict)
     atlas: Atlas = field(default_factory=Atlas)
+    live: LiveMap | None = None
     retired: dict[int, tuple[Submap, Array]] = field(default_factory=dict)
     lone: dict[int, Submap] = field(default_factory=dict)
     local: LocalMap | None = None
@@ -132,6 +137,8 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
     """
     state = State(settings or Settings())
     load(state.settings)
+    if state.settings.live_m > 0.0:
+        state.live = LiveMap(state.settings.live_m)
     if lights is not None:
         from estimator.absolute import Absolute
         from estimator.light import Light
