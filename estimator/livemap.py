@@ -40,7 +40,7 @@ SPENT: Final = 0.05
 
 
 class Drawn(NamedTuple):
-    """A patch as it lies in the tiles: where, on which, and in how many cells of each it counts."""
+    """A patch as it lies in the tiles: where, on which, and how much of it counts in each."""
 
     patch: Patch
     T_map_submap: Array
@@ -272,7 +272,7 @@ def shift(shown: Drawn, T_map_submap: Array, resolution: float) -> float:
 
 def spent(one: Drawn, stale: frozenset[Tile]) -> bool:
     """Whether next to nothing that a patch says counts any more."""
-    return not one.tiles & stale and sum(one.used.values()) < SPENT * max(1, one.patch.known)
+    return not one.tiles & stale and sum(one.used.values()) < SPENT * max(1, one.patch.weight)
 
 
 def at_once(pieces: Iterable[tuple[Submap, Sequence[Keyframe]]], resolution: float) -> Grid:

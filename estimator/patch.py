@@ -52,13 +52,13 @@ class Patch:
 
     Attributes:
         T_map_submap: where the submap was when this was rendered. corner: column and row, on the map's grid, of cell
-            [0, 0]. shape: rows, columns. known: cells that say something. packed: the cells, compressed.
+            [0, 0]. shape: rows, columns. weight: sum of the sizes of its words. packed: the cells, compressed.
     """
 
     T_map_submap: Array
     corner: tuple[int, int]
     shape: tuple[int, int]
-    known: int
+    weight: int
     packed: bytes
 
     def cells(self) -> Cells:
@@ -93,7 +93,7 @@ def render(frames: Sequence[Seen], T_map_submap: Array, resolution: float) -> Pa
     column, row = np.rint(drawn.origin / resolution).astype(np.int64).tolist()
     rows, columns = cells.shape
     packed = zlib.compress(cells.tobytes(), LEVEL)
-    return Patch(T_map_submap, (column, row), (rows, columns), int(np.count_nonzero(cells)), packed)
+    return Patch(T_map_submap, (column, row), (rows, columns), int(np.abs(cells.astype(np.int64)).sum()), packed)
 
 
 def shortened(beams: Beams) -> Beams:
@@ -107,7 +107,7 @@ def shortened(beams: Beams) -> Beams:
 
 @kernel("i8(i2[:, ::1], i2[:, ::1], i1[:, ::1], f8[::1])")
 def lay_under(said: Shorts, heard: Shorts, cells: Cells, how: Array) -> int:
-    """Add an older patch to a tile, as far as its cells have not heard enough; in how many cells it counted.
+    """Add an older patch to a tile, as far as its cells have not heard enough; how much of its words counted.
 
     ``said``, ``heard``: sums of the words that count, and of their sizes. ``how``: column and row in the patch of the
     middle of the tile's cell [0, 0], and by how much they change with a column of the tile, and with a row.
@@ -133,7 +133,7 @@ def lay_under(said: Shorts, heard: Shorts, cells: Cells, how: Array) -> int:
                 size = left
             said[j, i] += word
             heard[j, i] += size
-            used += 1
+            used += size
     return used
 
 
@@ -152,7 +152,7 @@ def affine(patch: Patch, T_map_submap: Array, tile: Tile, resolution: float) -> 
 def compose(
     tiles: Sequence[Tile], newest_first: Iterable[tuple[int, Patch, Array, frozenset[Tile]]], resolution: float
 ) -> tuple[dict[Tile, Cells], dict[tuple[int, Tile], int]]:
-    """What patches (key, patch, T_map_submap, tiles it lies on) say of these tiles together, and who counted where."""
+    """What patches (key, patch, T_map_submap, tiles) say of these tiles together, and how much each counts where."""
     said = {tile: np.zeros((SIDE, SIDE), np.int16) for tile in tiles}
     heard = {tile: np.zeros((SIDE, SIDE), np.int16) for tile in tiles}
     used = {}
