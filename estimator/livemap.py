@@ -190,8 +190,11 @@ def follow(state: State, before: Submap | None, frames: Sequence[Keyframe]) -> N
     live, newest = state.live, state.atlas.newest
     if live is None or newest is None:
         return
-    if before is not None and newest is not before:
-        live.laid(before, frames)
+    if newest is not before:
+        if newest.key == state.atlas.adrift:  # what was adrift before has never been placed
+            live.fresh = {key: seen for key, seen in live.fresh.items() if key < newest.key}
+        if before is not None:
+            live.laid(before, frames)
     if len(state.atlas.frames) % EVERY == 1:
         live.laid(newest, state.atlas.frames)
     live.due = True

@@ -117,21 +117,16 @@ def lay_under(said: Shorts, heard: Shorts, cells: Cells, how: Array) -> int:
     used = 0
     for j in range(rows):
         for i in range(columns):
-            left = ENOUGH - heard[j, i]
+            left = ENOUGH - int(heard[j, i])
             if left <= 0:
                 continue
             u = int(np.floor(how[0] + i * how[2] + j * how[4]))
             v = int(np.floor(how[1] + i * how[3] + j * how[5]))
             if u < 0 or v < 0 or u >= wide or v >= high:
                 continue
-            word = np.int64(cells[v, u])
-            size = abs(word)
-            if size == 0:
-                continue
-            if size > left:
-                word = left if word > 0 else -left
-                size = left
-            said[j, i] += word
+            word = int(cells[v, u])
+            size = min(abs(word), left)
+            said[j, i] += size if word > 0 else -size
             heard[j, i] += size
             used += size
     return used
