@@ -11,7 +11,7 @@ RUN    := $(BIN)/python -W default
 .DEFAULT_GOAL := help
 
 
-.PHONY: help venv demo test test-system test-all check bench experiments lock docs clean
+.PHONY: help venv demo test test-system test-all check bench experiments install uninstall deb lock docs clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -68,6 +68,15 @@ experiments: venv  ## what positions from light reach, in simulated rooms and on
 docs: venv  ## regenerate the documents that come from code
 	$(RUN) -m daemon.publish.document docs
 	$(RUN) -m daemon --reference > docs/configuration.md
+
+install:  ## into /opt/lumiloop with its units, rules and example configuration (root; DESTDIR=, PREFIX=, PYTHON=)
+	systemd/install.sh install
+
+uninstall:  ## remove that; configuration and maps stay unless PURGE=1
+	systemd/install.sh uninstall
+
+deb:  ## the same as a Debian package, in out/
+	systemd/package.sh
 
 lock:  ## renew the lock files (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade pyproject.toml -o requirements/core.lock

@@ -68,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     _map(commands.add_parser("map", help="work with maps"))
     _calibrate(commands.add_parser("calibrate", help="lamps, receiver, wheels and mount, from a recorded drive"))
     _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
+    _warm(commands.add_parser("warm", help="compile the kernels of this version now, and not at the first start"))
     _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
     return parser
 
@@ -157,6 +158,11 @@ def _written(parser: argparse.ArgumentParser, what: str, default: Path | None = 
     parser.add_argument("--out", type=Path, metavar="FILE", default=default, help=what)
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
     _config_arguments(parser)
+
+
+def _warm(parser: argparse.ArgumentParser) -> None:
+    _config_arguments(parser)
+    parser.set_defaults(body=_later("daemon.warm", "main"))
 
 
 def _codes(parser: argparse.ArgumentParser) -> None:

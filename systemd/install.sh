@@ -1,0 +1,108 @@
+#!/bin/sh
+# Installs lumiloop into a virtual environment of its own, with its units, rules and example configuration; or removes
+# exactly that. `make install` and `make uninstall` call it, and the Debian package is what it yields.
+#
+#   DESTDIR   put everything below this directory (a package's root); empty: into the system
+#   PREFIX    the virtual environment, default /opt/lumiloop
+#   PYTHON    interpreter to build it with, default /usr/bin/python3 (3.11 or newer)
+#   PURGE     with uninstall: 1 removes configuration, maps and caches too
+set -eu
+
+PREFIX=${PREFIX:-/opt/lumiloop}
+DESTDIR=${DESTDIR:-}
+PYTHON=${PYTHON:-/usr/bin/python3}
+SOURCE=$(cd "$(dirname "$0")/.." && pwd)
+ROOT=${DESTDIR}${PREFIX}
+UNITS=/lib/systemd/system
+
+say() { echo "lumiloop: $*"; }
+
+fail() {
+    echo "lumiloop: $*" >&2
+    exit 1
+}
+
+put() { # mode, file below the source, place
+    install -D -m "$1" "$SOURCE/$2" "$DESTDIR$3"
+}
+
+environment() {
+    "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || fail "$PYTHON is older than 3.11; name another one: PYTHON=..."
+    "$PYTHON" -c 'import venv, ensurepip' 2> /dev/null || fail "the venv module is missing: apt-get install python3-venv"
+    rm -rf "$ROOT"
+    "$PYTHON" -m venv "$ROOT"
+    "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --require-hashes -r "$SOURCE/requirements/core.lock"
+    wheel=$(mktemp -d)
+    tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator | tar -C "$wheel" -xf -
+    PIP_CONSTRAINT="$SOURCE/requirements/build.txt" "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps "$wheel"
+    rm -rf "$wheel"
+    "$ROOT/bin/python" -m pip uninstall --quiet --disable-pip-version-check --yes setuptools pip
+    rm -f "$ROOT"/bin/activate* "$ROOT"/bin/Activate.ps1 "$ROOT"/bin/pip* "$ROOT"/bin/wheel
+    # made below DESTDIR, to be run without it
+    for script in "$ROOT"/bin/*; do
+        if [ ! -L "$script" ]; then sed -i "1s|$ROOT|$PREFIX|" "$script"; fi
+    done
+    sed -i "s|$ROOT|$PREFIX|g" "$ROOT/pyvenv.cfg"
+    find "$ROOT" -name direct_url.json -delete
+    find "$ROOT/lib" -type d -name tests -prune -exec rm -rf {} +
+    find "$ROOT" -name __pycache__ -prune -exec rm -rf {} +
+    "$PYTHON" -m compileall -q -s "$DESTDIR" --invalidation-mode checked-hash "$ROOT/lib" || true
+    mkdir -p "$DESTDIR/usr/bin"
+    ln -sfn "$PREFIX/bin/lumiloop" "$DESTDIR/usr/bin/lumiloop"
+}
+
+files() {
+    for unit in lumiloop.service lumiloop-warmup.service; do
+        install -d "$DESTDIR$UNITS"
+        sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/$unit" > "$DESTDIR$UNITS/$unit"
+        chmod 644 "$DESTDIR$UNITS/$unit"
+    done
+    put 644 systemd/60-lumiloop.rules /lib/udev/rules.d/60-lumiloop.rules
+    put 644 systemd/lumiloop.catalog /usr/lib/systemd/catalog/lumiloop.catalog
+    put 644 systemd/lumiloop.sysusers /usr/lib/sysusers.d/lumiloop.conf
+    put 644 README.md /usr/share/doc/lumiloop/README.md
+    put 644 LICENSE /usr/share/doc/lumiloop/copyright
+    put 644 systemd/drop-ins/port-502.conf /usr/share/doc/lumiloop/examples/port-502.conf
+    (cd "$SOURCE/systemd" && find . -name '*.toml') | while read -r example; do
+        put 644 "systemd/$example" "/usr/share/doc/lumiloop/examples/$example"
+    done
+    (cd "$SOURCE/docs" && find . -type f) | while read -r page; do
+        put 644 "docs/$page" "/usr/share/doc/lumiloop/docs/$page"
+    done
+    if [ ! -e "$DESTDIR/etc/lumiloop/lumiloop.toml" ]; then
+        put 644 systemd/lumiloop.toml /etc/lumiloop/lumiloop.toml
+    fi
+}
+
+tell_system() {
+    if [ -n "$DESTDIR" ] || [ ! -d /run/systemd/system ]; then return; fi
+    systemctl daemon-reload
+    if [ "$1" = install ]; then systemd-sysusers lumiloop.conf; fi
+    journalctl --update-catalog || true
+    udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev || true
+}
+
+case "${1:-}" in
+    install)
+        environment
+        files
+        tell_system install
+        say "installed into ${DESTDIR:-/}; edit /etc/lumiloop/lumiloop.toml, then: systemctl enable --now lumiloop"
+        ;;
+    uninstall)
+        if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
+            systemctl disable --now lumiloop.service lumiloop-warmup.service 2> /dev/null || true
+        fi
+        rm -rf "$ROOT" "$DESTDIR/usr/share/doc/lumiloop"
+        rm -f "$DESTDIR/usr/bin/lumiloop" "$DESTDIR$UNITS/lumiloop.service" "$DESTDIR$UNITS/lumiloop-warmup.service" \
+            "$DESTDIR/lib/udev/rules.d/60-lumiloop.rules" "$DESTDIR/usr/lib/systemd/catalog/lumiloop.catalog" \
+            "$DESTDIR/usr/lib/sysusers.d/lumiloop.conf"
+        if [ "${PURGE:-0}" = 1 ]; then
+            rm -rf "$DESTDIR/etc/lumiloop" "$DESTDIR/var/lib/private/lumiloop" "$DESTDIR/var/cache/private/lumiloop"
+            rm -f "$DESTDIR/var/lib/lumiloop" "$DESTDIR/var/cache/lumiloop"
+        fi
+        tell_system uninstall
+        say "removed; configuration and maps stay (PURGE=1 removes them too)"
+        ;;
+    *) fail "usage: $0 install | uninstall" ;;
+esac

@@ -1,0 +1,73 @@
+#!/bin/sh
+# Makes the Debian package: what `make install` yields, with the scripts that tell the system. Needs dpkg-deb.
+#
+#   package.sh [FOLDER]    where to put it, default out/
+#   TREE                   an installation below a directory (DESTDIR), to be packed as it is; default: a new one
+#   PYTHON                 as for install.sh
+set -eu
+
+SOURCE=$(cd "$(dirname "$0")/.." && pwd)
+OUT=${1:-$SOURCE/out}
+MADE=$(mktemp -d)
+trap 'rm -rf "$MADE"' EXIT
+PYTHON=${PYTHON:-/usr/bin/python3}
+
+VERSION=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$SOURCE/pyproject.toml")
+MINOR=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+NEXT=$("$PYTHON" -c 'import sys; print("%d.%d" % (sys.version_info[0], sys.version_info[1] + 1))')
+ARCH=$(dpkg --print-architecture)
+
+if [ -n "${TREE:-}" ]; then
+    cp -a "$TREE/." "$MADE"
+else
+    DESTDIR=$MADE PYTHON=$PYTHON "$SOURCE/systemd/install.sh" install
+fi
+TREE=$MADE
+chmod 755 "$TREE"
+mkdir -p "$TREE/DEBIAN" "$OUT"
+cat > "$TREE/DEBIAN/control" << EOF
+Package: lumiloop
+Version: $VERSION
+Architecture: $ARCH
+Maintainer: lumiloop developers <lumiloop@localhost>
+Depends: python3 (>= $MINOR), python3 (<< $NEXT), systemd, udev, libc6
+Installed-Size: $(du -sk "$TREE" | cut -f1)
+Section: science
+Priority: optional
+Description: indoor robot localisation from a 2D lidar and coded ceiling lights
+ One daemon that reads a HOKUYO lidar and a photodiode under coded lamps and
+ publishes pose, covariance, loop flags and health over Modbus and UDP.
+EOF
+echo /etc/lumiloop/lumiloop.toml > "$TREE/DEBIAN/conffiles"
+cat > "$TREE/DEBIAN/postinst" << 'EOF'
+#!/bin/sh
+set -e
+if [ "$1" = configure ]; then
+    systemd-sysusers lumiloop.conf || true
+    journalctl --update-catalog > /dev/null 2>&1 || true
+    if [ -d /run/systemd/system ]; then
+        systemctl daemon-reload
+        udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev || true
+        systemctl try-restart lumiloop.service || true
+    fi
+fi
+EOF
+cat > "$TREE/DEBIAN/prerm" << 'EOF'
+#!/bin/sh
+set -e
+if [ -d /run/systemd/system ] && [ "$1" = remove ]; then
+    systemctl disable --now lumiloop.service lumiloop-warmup.service || true
+fi
+EOF
+cat > "$TREE/DEBIAN/postrm" << 'EOF'
+#!/bin/sh
+set -e
+if [ "$1" = purge ]; then
+    rm -rf /var/lib/private/lumiloop /var/cache/private/lumiloop /etc/lumiloop
+    rm -f /var/lib/lumiloop /var/cache/lumiloop
+fi
+if [ -d /run/systemd/system ]; then systemctl daemon-reload; fi
+EOF
+chmod 755 "$TREE"/DEBIAN/postinst "$TREE"/DEBIAN/prerm "$TREE"/DEBIAN/postrm
+dpkg-deb --root-owner-group -Zgzip -z1 --build "$TREE" "$OUT/lumiloop_${VERSION}_${ARCH}.deb" > /dev/null
+echo "$OUT/lumiloop_${VERSION}_${ARCH}.deb"

@@ -1,0 +1,131 @@
+"""A Debian with a real systemd as its first process, in a container of this machine (systemd-nspawn(1)).
+
+The base is built once and kept as a tar; each test session unpacks a fresh copy. Nothing is left behind: the container
+is stopped, its files are removed, and it has no mounts of its own outside of its name spaces.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+SUITE = "bookworm"
+PACKAGES = "systemd,systemd-sysv,dbus,python3,udev"
+TOOLS = {"systemd-nspawn": "systemd-container", "mmdebstrap": "mmdebstrap", "nsenter": "util-linux"}
+BUILD_S, BOOT_S, COMMAND_S = 900.0, 60.0, 120.0
+
+
+def missing() -> str:
+    """What this machine lacks to run a container, with the remedy; empty if nothing."""
+    if os.geteuid() != 0:
+        return "a container with its own systemd needs root"
+    packages = [package for tool, package in TOOLS.items() if shutil.which(tool) is None]
+    return f"missing programs: apt-get install {' '.join(packages)}" if packages else ""
+
+
+def base() -> Path:
+    """The base system as a tar; made where it is not there yet (two minutes, from the distribution's mirror)."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lumiloop"
+    tar = cache / f"{SUITE}.tar"
+    if not tar.exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        part = cache / f"{SUITE}.{os.getpid()}.tar"  # a name that tells mmdebstrap the format
+        command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}", SUITE, str(part)]
+        try:
+            subprocess.run(command, check=True, timeout=BUILD_S)
+            part.replace(tar)
+        finally:
+            part.unlink(missing_ok=True)
+    return tar
+
+
+@dataclass
+class Container:
+    """A booted container.
+
+    Attributes:
+        root: its files. leader: its first process, as this machine numbers it.
+    """
+
+    root: Path
+    leader: int
+
+    def run(self, *command: str, check: bool = True, seconds: float = COMMAND_S) -> str:
+        """Run a command inside; what it wrote, both streams."""
+        enter = ["nsenter", "--target", str(self.leader), "--all", "--", *command]
+        done = subprocess.run(enter, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=seconds)
+        if check and done.returncode:
+            raise AssertionError(f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}")
+        return done.stdout
+
+    def show(self, unit: str, *names: str) -> dict[str, str]:
+        """Properties of a unit (systemctl show)."""
+        lines = self.run("systemctl", "show", unit, *(f"--property={name}" for name in names)).splitlines()
+        return dict(line.split("=", 1) for line in lines if "=" in line)
+
+    def until(self, unit: str, seconds: float, **wanted: str) -> dict[str, str]:
+        """Wait until a unit's properties are these."""
+        end = time.monotonic() + seconds
+        while True:
+            seen = self.show(unit, *wanted)
+            if seen == wanted:
+                return seen
+            if time.monotonic() > end:
+                log = self.run("journalctl", "--no-pager", "-n", "30", check=False)
+                raise AssertionError(f"{unit} is {seen}, not {wanted}, after {seconds} s:\n{log}")
+            time.sleep(0.05)
+
+
+def unpack(root: Path) -> None:
+    """A fresh copy of the base system."""
+    root.mkdir()
+    subprocess.run(["tar", "-C", str(root), "-xf", str(base())], check=True, timeout=BUILD_S)
+
+
+def inside(root: Path, *command: str, binds: tuple[str, ...] = (), seconds: float = BUILD_S) -> str:
+    """Run a command in a container that is not booted."""
+    how = ["systemd-nspawn", "-q", "-D", str(root), "--register=no", "--console=pipe", "--private-network"]
+    done = subprocess.run(
+        [*how, *(f"--bind-ro={bind}" for bind in binds), *command],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=seconds,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@contextmanager
+def booted(root: Path, *binds: str) -> Iterator[Container]:
+    """Boot it; ``binds``: as nspawn's ``--bind``. Powered off at the end."""
+    command = ["systemd-nspawn", "-q", "-D", str(root), "-b", "--register=no", "--keep-unit", "--console=pipe"]
+    command += ["--private-network", *(f"--bind={bind}" for bind in binds)]
+    command += ["--property=DeviceAllow=char-pts rw"] if binds else []
+    with (root.parent / "console").open("w") as console:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=console, stderr=subprocess.STDOUT)
+    try:
+        yield Container(root, _wait_for_boot(process, root.parent / "console"))
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=BOOT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _wait_for_boot(process: subprocess.Popen[bytes], console: Path) -> int:
+    """The leader, once its system is up."""
+    end = time.monotonic() + BOOT_S
+    while time.monotonic() < end and process.poll() is None:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        if children:
+            container = Container(Path(), int(children[0]))
+            if container.run("systemctl", "is-system-running", check=False).strip() in ("running", "degraded"):
+                return container.leader
+        time.sleep(0.1)
+    raise AssertionError(f"the container does not boot:\n{console.read_text()}")

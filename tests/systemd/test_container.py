@@ -1,0 +1,222 @@
+"""The package on a fresh Debian under its real service manager: start, READY, devices, watchdog, kill, stop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon import logs
+from tests.systemd import container
+from tests.systemd.container import Container
+
+ROOT = Path(__file__).parents[2]
+UNIT = "lumiloop.service"
+READY_S = 12.0
+"""Four times the three seconds that a warm start may take from kill to READY."""
+COMPILE_S = 600.0
+
+CONFIG = """
+[lidar]
+device = "/dev/ttyACM0"
+"""
+DROP_IN = """
+[Service]
+DeviceAllow=char-pts rw
+WatchdogSec=4
+"""
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(1500)]
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `make install` yields below a directory of its own."""
+    if reason := container.missing():
+        pytest.skip(reason)
+    made = tmp_path_factory.mktemp("install")
+    environment = {**os.environ, "DESTDIR": str(made), "PYTHON": "/usr/bin/python3"}
+    subprocess.run([ROOT / "systemd/install.sh", "install"], check=True, env=environment, capture_output=True)
+    return made
+
+
+@pytest.fixture(scope="module")
+def package(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Debian package of that tree."""
+    out = tmp_path_factory.mktemp("package")
+    environment = {**os.environ, "TREE": str(tree), "PYTHON": "/usr/bin/python3"}
+    done = subprocess.run([ROOT / "systemd/package.sh", out], check=True, env=environment, capture_output=True)
+    return Path(done.stdout.decode().split()[-1])
+
+
+@pytest.fixture(scope="module")
+def lidar(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A UTM-30LX on a pseudo-terminal that the group dialout may use."""
+    link = tmp_path_factory.mktemp("lidar") / "tty"
+    command = [sys.executable, "-m", "hal.fake", "--model", "UTM-30LX", "--pty", str(link)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as fake:
+        while not link.exists():
+            assert fake.poll() is None
+            time.sleep(0.02)
+        device = link.resolve()
+        shutil.chown(device, 0, "dialout")
+        device.chmod(0o660)
+        yield device
+        fake.send_signal(signal.SIGINT)
+
+
+@pytest.fixture(scope="module")
+def machine(package: Path, lidar: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+    """A Debian with the package installed by its own package manager."""
+    folder = tmp_path_factory.mktemp("container")
+    root = folder / "root"
+    try:
+        container.unpack(root)
+        container.inside(root, "dpkg", "-i", "/package.deb", binds=(f"{package}:/package.deb",))
+        (root / "etc/lumiloop/lumiloop.toml").write_text(CONFIG)
+        drop_in = root / "etc/systemd/system/lumiloop.service.d"
+        drop_in.mkdir(parents=True)
+        (drop_in / "test.conf").write_text(DROP_IN)
+        with container.booted(root, f"{lidar}:/dev/ttyACM0") as booted:
+            yield booted
+    finally:
+        shutil.rmtree(root, ignore_errors=True)
+
+
+def listing(tree: Path) -> dict[str, str]:
+    """Every file with what is in it."""
+    found = {}
+    for path in sorted(tree.rglob("*")):
+        if path.relative_to(tree).parts[0] == "DEBIAN":
+            continue
+        if path.is_symlink():
+            found[str(path.relative_to(tree))] = f"-> {path.readlink()}"
+        elif path.is_file():
+            found[str(path.relative_to(tree))] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def test_the_package_is_what_the_installation_yields(tree: Path, package: Path, tmp_path: Path) -> None:
+    subprocess.run(["dpkg-deb", "-x", package, tmp_path], check=True)
+    assert listing(tmp_path) == listing(tree)
+    shutil.rmtree(tmp_path)
+
+
+def test_nothing_installed_names_the_place_where_it_was_built(tree: Path) -> None:
+    for path in [*(tree / "opt/lumiloop/bin").iterdir(), tree / "opt/lumiloop/pyvenv.cfg"]:
+        if path.is_file() and not path.is_symlink():
+            assert str(tree) not in path.read_text(errors="replace"), path
+
+
+def test_the_installation_stays_below_its_bound(tree: Path) -> None:
+    size = sum(path.lstat().st_size for path in tree.rglob("*") if path.is_file() and not path.is_symlink())
+    assert size < 480e6
+
+
+def test_it_starts_and_says_ready(machine: Container) -> None:
+    machine.run("systemctl", "start", UNIT, seconds=COMPILE_S)
+    machine.until(UNIT, READY_S, ActiveState="active", SubState="running")
+    assert machine.show("lumiloop-warmup.service", "Result") == {"Result": "success"}
+
+
+def test_it_runs_as_nobody_in_particular_with_its_two_groups(machine: Container) -> None:
+    status = Path(f"/proc/{_main(machine)}/status").read_text()
+    fields = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
+    assert 61184 <= int(fields["Uid"].split()[0]) <= 65519
+    groups = machine.run("getent", "group", "dialout", "i2c")
+    assert {line.split(":")[2] for line in groups.splitlines()} <= set(fields["Groups"].split())
+    assert int(fields["CapEff"], 16) == 0
+    assert fields["Seccomp"].strip() == "2"
+    assert fields["NoNewPrivs"].strip() == "1"
+
+
+def test_it_reads_the_lidar_and_publishes_a_pose(machine: Container) -> None:
+    end = time.monotonic() + 20.0
+    while True:
+        said = json.loads(machine.run("lumiloop", "status", "--json"))
+        if said.get("state") in ("MAPPING", "TRACKING", "DEGRADED"):
+            return
+        assert time.monotonic() < end, said
+        time.sleep(0.2)
+
+
+def test_the_journal_has_fields(machine: Container) -> None:
+    text = machine.run("journalctl", "--no-pager", "-o", "json", "-u", UNIT)
+    entries = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
+    told = [entry for entry in entries if entry.get("MESSAGE_ID") == logs.STATE_ID]
+    assert told
+    assert all(entry["LUMILOOP_STATE"] and entry["_SYSTEMD_UNIT"] == UNIT for entry in told)
+    assert "What can be done" in machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT)
+
+
+def test_it_may_write_only_where_it_should(machine: Container) -> None:
+    root = Path(f"/proc/{_main(machine)}/root")
+    mounts = Path(f"/proc/{_main(machine)}/mountinfo").read_text()
+    options = {line.split()[4]: line.split()[5] for line in mounts.splitlines()}
+    assert re.match(r"ro\b", options["/"])
+    for place in ("/var/lib/private/lumiloop", "/var/cache/private/lumiloop"):
+        assert re.match(r"rw\b", options[place]), place
+    assert (root / "var/cache/private/lumiloop").is_dir()
+
+
+def test_a_hang_is_ended_by_the_watchdog(machine: Container) -> None:
+    before = _main(machine)
+    os.kill(before, signal.SIGSTOP)
+    _restarted(machine, before, 4.0 + READY_S)
+    log = machine.run("journalctl", "--no-pager", "-u", UNIT)
+    assert "Watchdog timeout" in log
+
+
+def test_a_killed_one_is_back_within_seconds(machine: Container) -> None:
+    before = _main(machine)
+    os.kill(before, signal.SIGKILL)
+    _restarted(machine, before, READY_S)
+
+
+def test_it_stops_cleanly(machine: Container) -> None:
+    begun = time.monotonic()
+    machine.run("systemctl", "stop", UNIT)
+    assert time.monotonic() - begun < 8.0
+    assert machine.show(UNIT, "Result", "ExecMainStatus") == {"Result": "success", "ExecMainStatus": "0"}
+
+
+def test_it_is_removed_without_a_trace_but_what_it_has_learned(machine: Container) -> None:
+    machine.run("dpkg", "--remove", "lumiloop")
+    left = machine.run("find", "/opt", "/lib/systemd/system", "/usr/share", "-path", "*lumiloop*", "-type", "f")
+    assert left.split() == []
+    assert (machine.root / "etc/lumiloop/lumiloop.toml").exists()
+    machine.run("dpkg", "--purge", "lumiloop")
+    assert not (machine.root / "etc/lumiloop").exists()
+
+
+def _main(machine: Container) -> int:
+    """The daemon's process as this machine numbers it."""
+    inner = machine.show(UNIT, "MainPID")["MainPID"]
+    for status in Path("/proc").glob("[0-9]*/status"):
+        try:
+            text = status.read_text()
+            if re.search(rf"^NSpid:\t\d+\t{inner}$", text, re.MULTILINE) and "lumiloop" in text.split("\n", 1)[0]:
+                return int(status.parent.name)
+        except OSError:
+            continue
+    raise AssertionError(f"no process {inner} of {UNIT}")
+
+
+def _restarted(machine: Container, before: int, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        seen = machine.show(UNIT, "ActiveState", "SubState", "MainPID")
+        if seen["SubState"] == "running" and seen["ActiveState"] == "active" and _main(machine) != before:
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"not back within {seconds} s: {seen}\n{machine.run('journalctl', '--no-pager', '-n', '30')}")

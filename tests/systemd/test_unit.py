@@ -1,0 +1,70 @@
+"""The unit files as they are shipped: valid, hardened, and free of what would break the compiler."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SYSTEMD = Path(__file__).parents[2] / "systemd"
+UNIT = SYSTEMD / "lumiloop.service"
+MOST_EXPOSED = 2.0
+
+needs_analyze = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+
+
+def settings(path: Path) -> list[tuple[str, str]]:
+    lines = (line for line in path.read_text().splitlines() if line and line[0] not in "#[")
+    return [(name, value) for name, _, value in (line.partition("=") for line in lines)]
+
+
+@needs_analyze
+@pytest.mark.parametrize("name", ["lumiloop.service", "lumiloop-warmup.service"])
+def test_the_service_manager_accepts_it(name: str, tmp_path: Path) -> None:
+    for path in SYSTEMD.glob("*.service"):
+        text = path.read_text().replace("/opt/lumiloop/bin/lumiloop", "/bin/true")
+        (tmp_path / path.name).write_text(text)
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", str(tmp_path / name)],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@needs_analyze
+def test_it_is_hardened() -> None:
+    done = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--no-pager", str(UNIT)], capture_output=True, text=True
+    )
+    exposure = re.search(r"exposure level for lumiloop\.service: ([\d.]+)", done.stdout)
+    assert exposure is not None, done.stderr
+    assert float(exposure.group(1)) <= MOST_EXPOSED
+
+
+@pytest.mark.parametrize("name", ["lumiloop.service", "lumiloop-warmup.service"])
+def test_kernels_may_be_compiled(name: str) -> None:
+    """LLVM makes memory executable after writing it: with MemoryDenyWriteExecute= no start would succeed."""
+    assert "MemoryDenyWriteExecute" not in dict(settings(SYSTEMD / name))
+
+
+def test_both_units_share_user_and_cache() -> None:
+    daemon, warmup = (dict(settings(SYSTEMD / name)) for name in ("lumiloop.service", "lumiloop-warmup.service"))
+    for name in ("DynamicUser", "User", "CacheDirectory", "StateDirectory"):
+        assert daemon[name] == warmup[name]
+
+
+def test_it_is_started_again_for_ever() -> None:
+    told = dict(settings(UNIT))
+    assert (told["StartLimitIntervalSec"], told["Restart"]) == ("0", "always")
+
+
+def test_devices_are_named_by_what_they_are() -> None:
+    rules = (SYSTEMD / "60-lumiloop.rules").read_text()
+    assert 'ATTRS{idVendor}=="15d1"' in rules
+    assert 'ENV{ID_MM_DEVICE_IGNORE}="1"' in rules
+    groups = set(re.findall(r'GROUP="(\w+)"', rules))
+    assert groups == set(dict(settings(UNIT))["SupplementaryGroups"].split())
+    assert groups == set(re.findall(r"^g (\w+)", (SYSTEMD / "lumiloop.sysusers").read_text(), re.MULTILINE))
