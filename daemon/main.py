@@ -32,6 +32,7 @@ from daemon.network import Feeds, Network
 from daemon.notify import notify
 from daemon.photodiode import AdcMaker, BlockWatch, make_adc
 from daemon.publish.snapshot import Snapshot, State
+from daemon.realtime import claim
 from daemon.sampleclock import SampleClock
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
@@ -184,6 +185,7 @@ class Daemon:
         try:
             await _first_to_end(warming, stopped, tasks["heartbeat"])
             if not stop.is_set():
+                log.info("%s", "; ".join(claim()))
                 tasks["cycle"] = asyncio.create_task(self.pacemaker.run(), name="cycle")
                 notify("READY=1", "STATUS=running")
                 await _first_to_end(stopped, tasks["cycle"], tasks["heartbeat"])

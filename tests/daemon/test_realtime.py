@@ -1,0 +1,69 @@
+"""Real-time scheduling and locked memory, in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daemon import realtime
+
+ROOT = Path(__file__).parents[2]
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may take SCHED_FIFO without a limit that says so")
+
+
+def said_by(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_without_the_units_limits_nothing_is_taken() -> None:
+    assert realtime._schedule(0).startswith("ordinary scheduling")
+    assert realtime._lock(8 << 20).startswith("memory not locked")
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+@needs_root
+@pytest.mark.parametrize(("most", "priority"), [(50, 40), (20, 20), (resource.RLIM_INFINITY, 40)])
+def test_the_loops_thread_takes_its_priority_and_later_threads_do_not(most: int, priority: int) -> None:
+    code = f"""
+import os, threading
+from daemon import realtime
+text = realtime._schedule({most})
+seen = []
+thread = threading.Thread(target=lambda: seen.append(os.sched_getscheduler(0)))
+thread.start(); thread.join()
+policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+print(text, policy == os.SCHED_FIFO, os.sched_getparam(0).sched_priority, seen[0] == os.SCHED_OTHER)
+"""
+    assert said_by(code) == f"SCHED_FIFO {priority} True {priority} True"
+
+
+@needs_root
+def test_locked_memory_holds_what_is_touched_and_no_more() -> None:
+    code = f"""
+import mmap
+from pathlib import Path
+from daemon import realtime
+text = realtime._lock({resource.RLIM_INFINITY})
+held = mmap.mmap(-1, 256 << 20)
+held[:1 << 20] = bytes(1 << 20)
+status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+print(text, int(status["VmLck"].split()[0]) > 256 << 10, int(status["VmRSS"].split()[0]) < 128 << 10)
+"""
+    said = said_by(code)
+    if said.startswith("memory not locked"):
+        pytest.skip(f"this machine does not let root lock memory: {said}")
+    assert said == "memory locked True True"
+
+
+def test_a_kernel_that_refuses_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert realtime._schedule(40) == "ordinary scheduling (Operation not permitted)"
