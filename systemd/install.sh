@@ -13,7 +13,7 @@ DESTDIR=${DESTDIR:-}
 PYTHON=${PYTHON:-/usr/bin/python3}
 SOURCE=$(cd "$(dirname "$0")/.." && pwd)
 ROOT=${DESTDIR}${PREFIX}
-UNITS=/lib/systemd/system
+UNITS=/usr/lib/systemd/system
 
 say() { echo "lumiloop: $*"; }
 
@@ -57,7 +57,7 @@ files() {
         sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/$unit" > "$DESTDIR$UNITS/$unit"
         chmod 644 "$DESTDIR$UNITS/$unit"
     done
-    put 644 systemd/60-lumiloop.rules /lib/udev/rules.d/60-lumiloop.rules
+    put 644 systemd/60-lumiloop.rules /usr/lib/udev/rules.d/60-lumiloop.rules
     put 644 systemd/lumiloop.catalog /usr/lib/systemd/catalog/lumiloop.catalog
     put 644 systemd/lumiloop.sysusers /usr/lib/sysusers.d/lumiloop.conf
     put 644 README.md /usr/share/doc/lumiloop/README.md
@@ -77,7 +77,10 @@ files() {
 tell_system() {
     if [ -n "$DESTDIR" ] || [ ! -d /run/systemd/system ]; then return; fi
     systemctl daemon-reload
-    if [ "$1" = install ]; then systemd-sysusers lumiloop.conf; fi
+    if [ "$1" = install ]; then
+        systemd-sysusers lumiloop.conf
+        systemctl stop lumiloop-warmup.service 2> /dev/null || true # it compiles this version with the next start
+    fi
     journalctl --update-catalog || true
     udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev || true
 }
@@ -95,7 +98,7 @@ case "${1:-}" in
         fi
         rm -rf "$ROOT" "$DESTDIR/usr/share/doc/lumiloop"
         rm -f "$DESTDIR/usr/bin/lumiloop" "$DESTDIR$UNITS/lumiloop.service" "$DESTDIR$UNITS/lumiloop-warmup.service" \
-            "$DESTDIR/lib/udev/rules.d/60-lumiloop.rules" "$DESTDIR/usr/lib/systemd/catalog/lumiloop.catalog" \
+            "$DESTDIR/usr/lib/udev/rules.d/60-lumiloop.rules" "$DESTDIR/usr/lib/systemd/catalog/lumiloop.catalog" \
             "$DESTDIR/usr/lib/sysusers.d/lumiloop.conf"
         if [ "${PURGE:-0}" = 1 ]; then
             rm -rf "$DESTDIR/etc/lumiloop" "$DESTDIR/var/lib/private/lumiloop" "$DESTDIR/var/cache/private/lumiloop"

@@ -48,6 +48,7 @@ if [ "$1" = configure ]; then
     if [ -d /run/systemd/system ]; then
         systemctl daemon-reload
         udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev || true
+        systemctl stop lumiloop-warmup.service || true
         systemctl try-restart lumiloop.service || true
     fi
 fi

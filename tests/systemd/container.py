@@ -88,11 +88,10 @@ def unpack(root: Path) -> None:
     subprocess.run(["tar", "-C", str(root), "-xf", str(base())], check=True, timeout=BUILD_S)
 
 
-def inside(root: Path, *command: str, binds: tuple[str, ...] = (), seconds: float = BUILD_S) -> str:
-    """Run a command in a container that is not booted."""
-    how = ["systemd-nspawn", "-q", "-D", str(root), "--register=no", "--console=pipe", "--private-network"]
+def inside(root: Path, *command: str, seconds: float = BUILD_S) -> str:
+    """Run a command among its files, without booting it."""
     done = subprocess.run(
-        [*how, *(f"--bind-ro={bind}" for bind in binds), *command],
+        ["chroot", str(root), *command],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=seconds,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
@@ -103,7 +102,7 @@ def inside(root: Path, *command: str, binds: tuple[str, ...] = (), seconds: floa
 def booted(root: Path, *binds: str) -> Iterator[Container]:
     """Boot it; ``binds``: as nspawn's ``--bind``. Powered off at the end."""
     command = ["systemd-nspawn", "-q", "-D", str(root), "-b", "--register=no", "--keep-unit", "--console=pipe"]
-    command += ["--private-network", *(f"--bind={bind}" for bind in binds)]
+    command += [f"--machine=lumiloop-{os.getpid()}", "--private-network", *(f"--bind={bind}" for bind in binds)]
     command += ["--property=DeviceAllow=char-pts rw"] if binds else []
     with (root.parent / "console").open("w") as console:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=console, stderr=subprocess.STDOUT)
