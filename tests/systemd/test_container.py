@@ -193,8 +193,8 @@ def test_it_stops_cleanly(machine: Container) -> None:
 
 def test_it_is_removed_without_a_trace_but_what_it_has_learned(machine: Container) -> None:
     machine.run("dpkg", "--remove", "lumiloop")
-    left = machine.run("find", "/opt", "/usr/lib", "/usr/share", "-path", "*lumiloop*", "-type", "f")
-    assert left.split() == []
+    places = [machine.root / place for place in ("opt", "usr/bin", "usr/lib", "usr/share")]
+    assert [path for place in places for path in place.rglob("*lumiloop*")] == []
     assert (machine.root / "etc/lumiloop/lumiloop.toml").exists()
     machine.run("dpkg", "--purge", "lumiloop")
     assert not (machine.root / "etc/lumiloop").exists()
@@ -217,7 +217,8 @@ def _restarted(machine: Container, before: int, seconds: float) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         seen = machine.show(UNIT, "ActiveState", "SubState", "MainPID")
-        if seen["SubState"] == "running" and seen["ActiveState"] == "active" and _main(machine) != before:
+        up = (seen["ActiveState"], seen["SubState"]) == ("active", "running") and seen["MainPID"] != "0"
+        if up and _main(machine) != before:
             return
         time.sleep(0.05)
     raise AssertionError(f"not back within {seconds} s: {seen}\n{machine.run('journalctl', '--no-pager', '-n', '30')}")
