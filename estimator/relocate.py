@@ -1,0 +1,264 @@
+"""Where in the whole map a keyframe fits, without any idea of the pose: everywhere, or where light or a person says.
+
+The scan is searched for by branch and bound in one field of all settled submaps; each place that comes out is matched
+against the submaps that lie there and judged as a loop is: by the share of the beams that fit, by what speaks against
+it, by rank and by residual. A place that has been found before is only matched again where odometry says that the
+robot must be by now. What the answers come to over several keyframes is decided elsewhere (`adrift`).
+
+All of this is work for the background job; nothing here reads or changes a state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from estimator import localmap, se2
+from estimator.globalsearch import Around, Field, SearchSettings, field_of, search
+from estimator.keyframe import Keyframe
+from estimator.linear3 import invert3
+from estimator.localmap import LocalMap, contradicted
+from estimator.loop import LoopSettings
+from estimator.matching import MatchSettings, Prior, View, match
+from estimator.records import Array
+from estimator.result import MatchResult
+from estimator.scanpoints import oriented
+from estimator.submap import Settled, points_of_frame
+
+CELL_M, CELLS = 0.1, 6e6
+"""Resolution of the field, and how many cells it may have before it is made coarser."""
+
+HITS, NODES, POINTS, LEAST = 16, 3_000_000, 120, 0.45
+"""Of the search: places at most, nodes at most, points of the scan, least score of a place."""
+
+AROUND, NEAR_M = 6, 10.0
+"""Submaps that a place is matched with: so many at most, and the nearest, and none farther than that but one."""
+
+WITNESSES: Final = 3
+"""Of these, so many are asked whether they have looked through where the scan has points."""
+
+GUESS: Final = np.diag((0.3**-2, 0.3**-2, 0.1**-2))
+"""Information with which a match starts."""
+
+SAME_M, SAME_RAD = 0.4, 0.2
+"""Two places nearer than this are one; a match that ends farther from where it began has found another place."""
+
+POSSIBLE: Final = 0.15
+"""Share of the evidence that may speak against a place before it is ruled out; a loop has to be surer."""
+
+
+class Verdict(Enum):
+    """What a keyframe says of a place."""
+
+    HOLDS = "it fits as a loop does"
+    OPEN = "nothing rules it out"
+    NO = "too much speaks against it"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """A settled submap and where it lies."""
+
+    key: int
+    T_map_submap: Array
+    settled: Settled
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terrain:
+    """All that is settled, in the map's frame; ``elements``: those of each piece."""
+
+    pieces: tuple[Piece, ...]
+    elements: tuple[Array, ...]
+    field: Field
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """How a keyframe fits at a place.
+
+    Attributes:
+        T_map_keyframe: the place as matched. P: covariance, 3x3, axes of the map.
+        share, against, residual_m: how well, as of `loop.Found`. key: submap nearest to it.
+    """
+
+    T_map_keyframe: Array
+    P: Array
+    share: float
+    against: float
+    residual_m: float
+    key: int
+    verdict: Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Query:
+    """What a look is asked.
+
+    Attributes:
+        frame: keyframe to look for. pieces: where. before: terrain of an earlier look.
+        guesses: where it should be by what was found earlier: T_map_keyframe each.
+        past: earlier keyframes, of which a new place has to be true as well.
+        windows: where to search; everywhere if None.
+    """
+
+    frame: Keyframe
+    pieces: tuple[Piece, ...]
+    before: Terrain | None
+    guesses: tuple[Array, ...]
+    past: tuple[Keyframe, ...]
+    windows: tuple[Around, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looked:
+    """What a look has found.
+
+    Attributes:
+        terrain: for the next one. guesses: a fit for each guess. fresh: further places, each with its fits in the past.
+        complete: no place was left out: neither the cap on nodes nor that on places ended the search.
+    """
+
+    terrain: Terrain
+    guesses: tuple[Fit, ...]
+    fresh: tuple[tuple[Fit, tuple[Fit, ...]], ...]
+    complete: bool
+    nodes: int
+
+
+def look(query: Query, told: LoopSettings) -> Looked:
+    """Look for a keyframe in the whole map."""
+    terrain = terrain_of(query.pieces, query.before)
+    view = view_of(query.frame, told)
+    guesses = tuple(fit(view, terrain, T, told) for T in query.guesses)
+    if view is None:
+        return Looked(terrain, guesses, (), False, 0)
+    hits, complete, nodes = searched(query, terrain, view)
+    known = [one.T_map_keyframe for one in guesses]
+    past = [(frame, view_of(frame, told)) for frame in query.past] if hits else []
+    fresh = []
+    for T in hits:
+        if any(same(T, other) for other in known):
+            continue
+        one = fit(view, terrain, T, told)
+        if one.verdict is Verdict.NO or any(same(one.T_map_keyframe, other) for other in known):
+            continue
+        known.append(one.T_map_keyframe)
+        earlier = []
+        for frame, seen in past:
+            T_back = se2.between(query.frame.T_odom_keyframe, frame.T_odom_keyframe)
+            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), told))
+        if all(other.verdict is not Verdict.NO for other in earlier):
+            fresh.append((one, tuple(earlier)))
+    return Looked(terrain, guesses, tuple(fresh), complete, nodes)
+
+
+def terrain_of(pieces: tuple[Piece, ...], before: Terrain | None) -> Terrain:
+    """The terrain of these submaps; the same one as before where nothing has come, gone or moved."""
+    if before is not None and len(before.pieces) == len(pieces):
+        pairs = zip(before.pieces, pieces, strict=True)
+        if all(a.settled is b.settled and np.array_equal(a.T_map_submap, b.T_map_submap) for a, b in pairs):
+            return before
+    elements = tuple(placed(piece) for piece in pieces)
+    points = np.vstack([some[:, :2] for some in elements])
+    width, height = np.ptp(points, axis=0) + 2.0
+    cell = max(CELL_M, math.sqrt(float(width * height) / CELLS))
+    return Terrain(pieces, elements, field_of(points, cell, cell, 1.0))
+
+
+def placed(piece: Piece) -> Array:
+    """The elements of a submap in the map's frame."""
+    elements = piece.settled.elements.astype(np.float64)
+    R = se2.rotation(piece.T_map_submap[2])[:2, :2]
+    elements[:, :2] = se2.apply(piece.T_map_submap, elements[:, :2])
+    elements[:, 2:4] = elements[:, 2:4] @ R.T
+    return elements
+
+
+def view_of(frame: Keyframe, told: LoopSettings) -> View | None:
+    """A keyframe as something to match; None where it has seen too little."""
+    points = points_of_frame(frame, 0.01)
+    if len(points.xy) < MatchSettings().min_points:
+        return None
+    return View(oriented(points, told.points), frame.T_base_lidar, frame.beams(), 0.01)
+
+
+def searched(query: Query, terrain: Terrain, view: View) -> tuple[list[Array], bool, int]:
+    """Places (T_map_keyframe) where the scan fits best, whether they are all there are, nodes opened."""
+    frame = query.frame
+    lidar_base = se2.inverse(frame.T_base_lidar)
+    seen = se2.apply(lidar_base, points_of_frame(frame, view.noise_m).xy)
+    around: Sequence[Around | None] = (None,) if query.windows is None else query.windows
+    hits: list[Array] = []
+    complete, nodes = True, 0
+    for window in around:
+        asked = SearchSettings(least=LEAST, hits=HITS, nodes=NODES - nodes, points=POINTS, around=window)
+        found = search(terrain.field, seen, asked)
+        hits += [se2.compose(hit.T_map_lidar, lidar_base) for hit in found.hits]
+        complete &= found.complete and len(found.hits) < HITS
+        nodes += found.nodes
+    return hits, complete, nodes
+
+
+def same(T: Array, other: Array) -> bool:
+    """Whether two places are one."""
+    x, y, yaw = se2.between(T, other).tolist()
+    return math.hypot(x, y) < SAME_M and abs(yaw) < SAME_RAD
+
+
+def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings) -> Fit:
+    """Match a scan at a place of the map, and judge it."""
+    near = nearest(terrain, T)
+    key = terrain.pieces[near[0]].key
+    if view is None:
+        return Fit(T, np.eye(3), 0.0, 0.0, 0.0, key, Verdict.OPEN)
+    local = local_of(terrain, near, T)
+    result = match(view, local, Prior(T, GUESS), 60, MatchSettings())
+    if not result.ok:
+        against = worst(terrain, near, local, T, view)
+        return Fit(T, np.eye(3), 0.0, against, 0.0, key, Verdict.NO if against > POSSIBLE else Verdict.OPEN)
+    T_found = result.T_odom_base
+    against = worst(terrain, near, local, T_found, view)
+    share = result.inliers / max(1, result.queries)
+    extra = np.diag((told.extra_m**2, told.extra_m**2, told.extra_rad**2))
+    P = invert3(result.information) + extra
+    verdict = judged(result, share, against, told)
+    return Fit(T_found, P, share, against, result.residual_m, key, verdict if same(T, T_found) else Verdict.NO)
+
+
+def judged(result: MatchResult, share: float, against: float, told: LoopSettings) -> Verdict:
+    """What a match says of its place."""
+    if against > POSSIBLE:
+        return Verdict.NO
+    sure = share >= told.share and against <= told.against and result.residual_m <= told.sse_m
+    return Verdict.HOLDS if sure and result.known_axes.all() else Verdict.OPEN
+
+
+def nearest(terrain: Terrain, T: Array) -> list[int]:
+    """Numbers of the pieces that lie about a place, nearest first; at least one."""
+    away = [math.hypot(*(piece.T_map_submap[:2] - T[:2]).tolist()) for piece in terrain.pieces]
+    order = sorted(range(len(away)), key=lambda k: (away[k], k))
+    return [k for n, k in enumerate(order[:AROUND]) if n == 0 or away[k] < NEAR_M]
+
+
+def local_of(terrain: Terrain, near: Sequence[int], T: Array) -> LocalMap:
+    """The pieces as one map to match against, in the map's frame."""
+    return localmap.index(np.vstack([terrain.elements[k] for k in near]), T[:2], 1, None)
+
+
+def worst(terrain: Terrain, near: Sequence[int], local: LocalMap, T: Array, view: View) -> float:
+    """Largest share of the evidence against a place that the map with one of its witnesses knows of."""
+    eye = se2.compose(T, view.T_base_lidar)
+    most = contradicted(local, eye, view.beams, view.noise_m)
+    for k in near[:WITNESSES]:
+        piece = terrain.pieces[k]
+        T_submap_eye = se2.between(piece.T_map_submap, eye)
+        empty = localmap.empty(np.zeros(2))
+        empty.newest = piece.settled.witness
+        most = max(most, contradicted(empty, T_submap_eye, view.beams, view.noise_m))
+    return most
