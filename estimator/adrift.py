@@ -1,23 +1,59 @@
 """Where in the map the robot is, when that is not known: after the start in a stored map, or after it was carried off.
 
-Until it is found the robot maps on as ever, in a part of the graph that nothing joins to the older one.
+Until it is found the robot maps on as ever, in a part of the graph that nothing joins to the older one. Looks in the
+older one (`relocate`, jobs for the background) leave over some places (`hypotheses`); when one of them is sure, a loop
+joins the two parts, ``T_map_odom`` takes the robot there at once, and ordinary loops take over.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+
 from estimator import absolute, se2
+from estimator.atlas import LOOK, Atlas
+from estimator.closing import join
+from estimator.globalsearch import Around
+from estimator.hypotheses import Hypothesis, Seek
+from estimator.keyframe import Keyframe, square_of
+from estimator.linear3 import invert3
+from estimator.loop import Found
+from estimator.mapframe import move_map, shift_map
+from estimator.records import Array
+from estimator.relocate import Looked, Piece, Query, look
+from estimator.result import LoopReason
 from estimator.state import State
+
+HINT_M, HINT_RAD = 1.0, 0.5
+"""How far the robot may be from where a person has said that it is."""
+HINT_LOOKS: Final = 4
+"""Looks after which the map says that it is not there."""
+SURPRISE: Final = 16.3
+"""Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
 
 
 def begin(state: State) -> bool:
     """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in."""
     atlas = state.atlas
-    if not atlas.settled():
+    if not atlas.settled() or state.settings.loops is None:
         return False
     if atlas.adrift is not None:
         forget_adrift(state)
     atlas.cut(state.next_key)
+    atlas.seek = Seek()
     return True
+
+
+def local_map_lost(state: State) -> None:
+    """The local map is begun anew: the robot may have been carried off, unless light holds it where it is."""
+    tie = state.absolute
+    held = tie is not None and tie.placed and tie.gap is not None and tie.gap <= SURPRISE
+    if not held:
+        begin(state)
 
 
 def forget_adrift(state: State) -> None:
@@ -32,4 +68,127 @@ def forget_adrift(state: State) -> None:
 def places(state: State) -> int | None:
     """How many places fit, None where the place is known (see `StepResult.places`); light alone may know it too."""
     lit = state.absolute is not None and state.absolute.placed and absolute.blind(state)
-    return None if state.atlas.adrift is None or lit else 0
+    return None if state.atlas.adrift is None or lit else len(state.atlas.seek.alive)
+
+
+def hinted(state: State) -> None:
+    """A person has just said where the robot is: it is looked for there first."""
+    state.atlas.seek = Seek(terrain=state.atlas.seek.terrain, hint=(state.T_map_odom, 0))
+
+
+def keyframe_laid(state: State, frame: Keyframe) -> None:
+    """Look for a new keyframe, if the robot is adrift and no other look is under way."""
+    atlas, told = state.atlas, state.settings.loops
+    if atlas.adrift is None or told is None or atlas.seek.job in atlas.asked:
+        return
+    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
+    if not pieces:
+        return
+    seek, asked = atlas.seek, atlas.seek.alive
+    guesses = tuple(se2.compose(one.T_map_odom, frame.T_odom_keyframe) for one in asked)
+    around = windows(state, frame)
+    query = Query(frame, pieces, seek.terrain, guesses, seek.past, seek.due(frame), around)
+    then = partial(take_look, state, seek, frame, asked)
+    seek.job = atlas.ask(LOOK, partial(look, query, told), then)
+
+
+def windows(state: State, frame: Keyframe) -> tuple[Around, ...] | None:
+    """Where a keyframe is to be searched for, by what a person or light says; everywhere if None."""
+    hint = state.atlas.seek.hint
+    if hint is not None:
+        T_map_lidar = se2.compose(se2.compose(hint[0], frame.T_odom_keyframe), frame.T_base_lidar)
+        return (Around(T_map_lidar, HINT_M, HINT_RAD),)
+    if state.light is None:
+        return None
+    from estimator import relocate_light  # costs nothing where there is no photodiode
+
+    lever = math.hypot(*frame.T_base_lidar[:2].tolist())
+    allowed = relocate_light.windows(state)
+    return tuple(Around(np.array((one.x, one.y, 0.0)), one.reach_m + lever, math.pi) for one in allowed) or None
+
+
+def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
+    """Take in what a look has found; and the decision, if it is one."""
+    assert isinstance(payload, Looked)
+    if state.atlas.seek is not seek or state.atlas.adrift is None:
+        return
+    seek.take(frame, asked, payload)
+    if seek.hint is not None and not seek.alive:
+        T_map_odom, looks = seek.hint
+        seek.hint = (T_map_odom, looks + 1) if looks + 1 < HINT_LOOKS else None
+    seek.alive = tuple(one for one in seek.alive if said(state, one) is not False)
+    if len(seek.alive) == 1 and seek.sure(said(state, seek.alive[0]) is True):
+        land(state, seek.alive[0])
+
+
+def said(state: State, one: Hypothesis) -> bool | None:
+    """Whether a person or light says that this is the place (True) or that it is not; None where neither can tell."""
+    if state.atlas.seek.hint is not None:
+        return True  # it was looked for nowhere else
+    if state.light is None:
+        return None
+    from estimator import relocate_light
+
+    T_map_base = se2.compose(one.T_map_odom, state.fused.T_odom_base)
+    if relocate_light.witness(state, T_map_base):
+        return True
+    return False if relocate_light.compatible(state, T_map_base) is False else None
+
+
+def land(state: State, one: Hypothesis) -> None:
+    """The place is known: join what was mapped adrift to the older map, and take the robot there."""
+    atlas, (frame, fit) = state.atlas, one.held[-1]
+    found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in atlas.submaps]
+    if fit.key not in atlas.submaps or not found:
+        return
+    T_map_keyframe = se2.compose(atlas.submaps[fit.key].T_map_submap, fit.T_submap_keyframe)
+    T_map_odom = se2.compose(T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
+    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), atlas.since)
+    move_map(state, T_map_odom)
+    since, first = atlas.since, atlas.adrift
+    atlas.adrift, atlas.since, atlas.seek = None, 0, Seek(terrain=atlas.seek.terrain)
+    for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
+        if it.key in atlas.submaps:
+            R = se2.rotation(-atlas.submaps[it.key].T_map_submap[2])
+            P = R @ it.P @ R.T
+            close = Found(it.key, it.T_submap_keyframe, P, it.share, it.against, it.residual_m, np.zeros(3))
+            join(atlas, at, replace(close, reason=LoopReason.PLACED))
+    bridge(atlas, first)
+    resettle(state, frame, fit.P)
+    rehang(state, since)
+
+
+def bridge(atlas: Atlas, first: int | None) -> None:
+    """The way driven across the break counts as one that may be false, where what was found agrees with it."""
+    told, atlas.bridge = atlas.bridge, None
+    if told is None or first not in atlas.submaps or told[0] not in atlas.submaps:
+        return
+    key, T, P = told
+    before, after = atlas.submaps[key], atlas.submaps[first]
+    off = se2.between(T, se2.between(before.T_map_submap, after.T_map_submap))
+    if float(off @ invert3(P) @ off) < SURPRISE:
+        atlas.constraints.add(key, after.key, T, P, True)
+
+
+def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
+    """How sure the pose is now: by the match that has decided, and the way since."""
+    atlas = state.atlas
+    newest = atlas.newest
+    assert newest is not None
+    T_keyframe_newest = se2.between(frame.T_odom_keyframe, newest.T_odom_submap)
+    R = se2.rotation(-state.T_map_odom[2])
+    P = se2.carry(frame.T_map_keyframe, T_keyframe_newest, P_map)
+    atlas.marginal = R @ P @ R.T
+    state.P_anchor = atlas.spread(state.T_odom_anchor)
+    tie = state.absolute
+    if tie is not None and tie.placed:
+        tie.P, tie.X = state.P_anchor + state.fused.P, state.fused.P.copy()
+
+
+def rehang(state: State, since: int) -> None:
+    """List the keyframes that were adrift by the places that they have come to."""
+    for here in state.places.values():
+        here[:] = [key for key in here if key < since]
+    for key, frame in state.keyframes.items():
+        if key >= since:
+            state.places.setdefault(square_of(frame.T_map_keyframe), []).append(key)

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator import se2
+from estimator.hypotheses import Seek
 from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
 from estimator.loop import Found
@@ -134,7 +135,7 @@ class Atlas:
         adrift: key of the first submap whose place in the map is not known, None where the robot's place is: it and all
             later ones are a part of the graph that nothing joins to the older one. since: ID of their first keyframe, 0
             where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
-            T_submap_adrift and its covariance in the latter's axes.
+            T_submap_adrift and its covariance in the latter's axes. seek: the search for the place.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
@@ -157,6 +158,7 @@ class Atlas:
     adrift: int | None = None
     since: int = 0
     bridge: tuple[int, Array, Array] | None = None
+    seek: Seek = field(default_factory=Seek)
     closures: int = 0
     news: Loop | None = None
 

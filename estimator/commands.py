@@ -31,6 +31,8 @@ def obey(state: State, command: Command) -> None:
         T_map_base = se2.identity() if T_map_base is None else T_map_base
     if T_map_base is not None:
         place(state, T_map_base)
+        if state.atlas.adrift is not None:
+            adrift.hinted(state)
 
 
 def forget(state: State) -> None:

@@ -212,7 +212,8 @@ def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -
 
     ``turned``: (headings, points, 2) cells of the scan at each heading. ``box``: first and last column, first and last
     row in which the sensor may stand, and 1 if the headings go all round. ``how``: least score, cap on nodes, cells and
-    headings within which two hits are one. ``found``: rows of column, row, heading, score.
+    headings within which two hits are one, share of the best hit's score that the others need. ``found``: rows of
+    column, row, heading, score.
     """
     headings, top = len(turned), pyramid.shape[0] - 1
     step = 1 << top
@@ -232,6 +233,8 @@ def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -
         if opened > how[1]:
             return hits, opened, False
         score, level, column, row, h = keys[0], nodes[0, 0], nodes[0, 1], nodes[0, 2], nodes[0, 3]
+        if hits > 0 and score < how[4] * found[0, 3]:
+            return hits, opened, True
         pop(keys, nodes, count)
         count -= 1
         if near_hit(found, hits, (level, column, row, h), around, how):
@@ -261,13 +264,15 @@ class SearchSettings:
     """How to search.
 
     Attributes:
-        least: score below which no place is worth having. hits: most to return. nodes: most to open.
+        least: score below which no place is worth having; ratio: the same, as a share of the best one's.
+        hits: most to return. nodes: most to open.
         apart_m, apart_rad: hits nearer than this in both are one.
         points: of the scan at most. heading_rad: step of the headings; 0: what moves the farthest point by a cell.
         around: where; everywhere and at every heading if None.
     """
 
     least: float = 0.4
+    ratio: float = 0.0
     hits: int = 4
     nodes: int = 20_000_000
     apart_m: float = 0.5
@@ -302,7 +307,7 @@ def search(field: Field, points: Array, settings: SearchSettings = SearchSetting
     cells = np.floor(turned / field.resolution + 0.5).astype(np.int32)
     found = np.empty((settings.hits, 4))
     apart = (settings.apart_m / field.resolution, settings.apart_rad / step)
-    how = np.array((settings.least, float(settings.nodes), *apart))
+    how = np.array((settings.least, float(settings.nodes), *apart, settings.ratio))
     hits, nodes, complete = branch(field.pyramid, np.ascontiguousarray(cells), box, how, found)
     return Search(tuple(_hit(field, row, yaw) for row in found[:hits]), int(nodes), bool(complete))
 

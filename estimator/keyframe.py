@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -112,6 +113,12 @@ class Keyframe:
     def beams(self) -> Beams:
         """Beams as seen from the scan's end."""
         return unturned(self.bearing_rad, self.turned_rad), self.range_m.astype(np.float64), self.beam
+
+
+def square_of(T_map_keyframe: Array) -> tuple[int, int, int]:
+    """Half metre square and eighth of a turn."""
+    x, y, yaw = T_map_keyframe.tolist()
+    return math.floor(2.0 * x), math.floor(2.0 * y), math.floor((yaw + math.pi) * 4.0 / math.pi) % 8
 
 
 def unturned(bearing_rad: Array, turned_rad: float) -> Array:

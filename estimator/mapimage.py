@@ -17,9 +17,8 @@ import numpy as np
 from estimator import livemap, se2
 from estimator.atlas import Constraints
 from estimator.fusion import covariance
-from estimator.keyframe import Keyframe, Submap
+from estimator.keyframe import Keyframe, Submap, square_of
 from estimator.lamps import Lamp
-from estimator.mapping import square_of
 from estimator.records import Array
 from estimator.state import Settings, State, new_state
 from estimator.submap import Settled, settle

@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
-from estimator import absolute, keyframe, localmap, se2
+from estimator import absolute, adrift, keyframe, localmap, se2
 from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
-from estimator.keyframe import Keyframe, Submap
+from estimator.keyframe import Keyframe, Submap, square_of
 from estimator.lines import lines_of
 from estimator.matchers import Matcher
 from estimator.records import Array, Scan
 from estimator.result import MatchResult
 from estimator.scanpoints import ScanPoints
-from estimator.state import Place, State
+from estimator.state import State
 
 PATIENCE = 3
 """Scans in a row that may fail to match before the local map is begun anew from the present one."""
@@ -82,7 +82,11 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
     if state.absolute is not None:
         state.absolute.X = np.zeros((3, 3))
         frame.virtual = absolute.virtual(state)
-    keyframe_laid(state, frame, P, noise_of(state, scan), lost(state))
+    anew = lost(state)
+    if anew and state.local is not None:
+        adrift.local_map_lost(state)
+    keyframe_laid(state, frame, P, noise_of(state, scan), anew)
+    adrift.keyframe_laid(state, frame)
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key
@@ -132,9 +136,3 @@ def retire(state: State, newest: Keyframe) -> None:
         if state.settings.history:
             state.retired[gone.key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)
     state.places[place] = older + here
-
-
-def square_of(T_map_keyframe: Array) -> Place:
-    """Half metre square and eighth of a turn."""
-    x, y, yaw = T_map_keyframe.tolist()
-    return math.floor(2.0 * x), math.floor(2.0 * y), math.floor((yaw + math.pi) * 4.0 / math.pi) % 8

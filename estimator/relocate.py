@@ -30,11 +30,15 @@ from estimator.result import MatchResult
 from estimator.scanpoints import oriented
 from estimator.submap import Settled, points_of_frame
 
-CELL_M, CELLS = 0.1, 6e6
-"""Resolution of the field, and how many cells it may have before it is made coarser."""
+CELL_M, BLUR, CELLS = 0.1, 0.7, 6e6
+"""Resolution of the field, its deviation in cells, and how many cells it may have before it is made coarser."""
 
-HITS, NODES, POINTS, LEAST = 16, 3_000_000, 120, 0.45
-"""Of the search: places at most, nodes at most, points of the scan, least score of a place."""
+HITS, NODES, POINTS = 24, 4_000_000, 120
+"""Of the search: places at most, nodes at most, points of the scan."""
+
+LEAST, RATIO = 0.45, 0.75
+"""Least score of a place, and least share of the best one's. A scan scores 0.9 to 1 where it was taken (random places
+of a simulated office); what people and moved furniture hide is left room for."""
 
 AROUND, NEAR_M = 6, 10.0
 """Submaps that a place is matched with: so many at most, and the nearest, and none farther than that but one."""
@@ -84,7 +88,7 @@ class Fit:
 
     Attributes:
         T_map_keyframe: the place as matched. P: covariance, 3x3, axes of the map.
-        share, against, residual_m: how well, as of `loop.Found`. key: submap nearest to it.
+        share, against, residual_m: how well, as of `loop.Found`. key: submap nearest to it, and the place in that one.
     """
 
     T_map_keyframe: Array
@@ -93,6 +97,7 @@ class Fit:
     against: float
     residual_m: float
     key: int
+    T_submap_keyframe: Array
     verdict: Verdict
 
 
@@ -104,7 +109,7 @@ class Query:
         frame: keyframe to look for. pieces: where. before: terrain of an earlier look.
         guesses: where it should be by what was found earlier: T_map_keyframe each.
         past: earlier keyframes, of which a new place has to be true as well.
-        windows: where to search; everywhere if None.
+        search: whether new places are searched for. windows: where; everywhere if None.
     """
 
     frame: Keyframe
@@ -112,6 +117,7 @@ class Query:
     before: Terrain | None
     guesses: tuple[Array, ...]
     past: tuple[Keyframe, ...]
+    search: bool = True
     windows: tuple[Around, ...] | None = None
 
 
@@ -121,13 +127,14 @@ class Looked:
 
     Attributes:
         terrain: for the next one. guesses: a fit for each guess. fresh: further places, each with its fits in the past.
-        complete: no place was left out: neither the cap on nodes nor that on places ended the search.
+        complete: no place was left out: neither the cap on nodes nor that on places ended the search; None: there was
+            none.
     """
 
     terrain: Terrain
     guesses: tuple[Fit, ...]
     fresh: tuple[tuple[Fit, tuple[Fit, ...]], ...]
-    complete: bool
+    complete: bool | None
     nodes: int
 
 
@@ -136,8 +143,8 @@ def look(query: Query, told: LoopSettings) -> Looked:
     terrain = terrain_of(query.pieces, query.before)
     view = view_of(query.frame, told)
     guesses = tuple(fit(view, terrain, T, told) for T in query.guesses)
-    if view is None:
-        return Looked(terrain, guesses, (), False, 0)
+    if view is None or not query.search:
+        return Looked(terrain, guesses, (), None, 0)
     hits, complete, nodes = searched(query, terrain, view)
     known = [one.T_map_keyframe for one in guesses]
     past = [(frame, view_of(frame, told)) for frame in query.past] if hits else []
@@ -168,7 +175,7 @@ def terrain_of(pieces: tuple[Piece, ...], before: Terrain | None) -> Terrain:
     points = np.vstack([some[:, :2] for some in elements])
     width, height = np.ptp(points, axis=0) + 2.0
     cell = max(CELL_M, math.sqrt(float(width * height) / CELLS))
-    return Terrain(pieces, elements, field_of(points, cell, cell, 1.0))
+    return Terrain(pieces, elements, field_of(points, cell, BLUR * cell, 1.0))
 
 
 def placed(piece: Piece) -> Array:
@@ -197,7 +204,7 @@ def searched(query: Query, terrain: Terrain, view: View) -> tuple[list[Array], b
     hits: list[Array] = []
     complete, nodes = True, 0
     for window in around:
-        asked = SearchSettings(least=LEAST, hits=HITS, nodes=NODES - nodes, points=POINTS, around=window)
+        asked = SearchSettings(LEAST, RATIO, HITS, NODES - nodes, points=POINTS, around=window)
         found = search(terrain.field, seen, asked)
         hits += [se2.compose(hit.T_map_lidar, lidar_base) for hit in found.hits]
         complete &= found.complete and len(found.hits) < HITS
@@ -214,28 +221,26 @@ def same(T: Array, other: Array) -> bool:
 def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings) -> Fit:
     """Match a scan at a place of the map, and judge it."""
     near = nearest(terrain, T)
-    key = terrain.pieces[near[0]].key
+    piece = terrain.pieces[near[0]]
     if view is None:
-        return Fit(T, np.eye(3), 0.0, 0.0, 0.0, key, Verdict.OPEN)
+        return Fit(T, np.eye(3), 0.0, 0.0, 0.0, piece.key, se2.between(piece.T_map_submap, T), Verdict.OPEN)
     local = local_of(terrain, near, T)
     result = match(view, local, Prior(T, GUESS), 60, MatchSettings())
-    if not result.ok:
-        against = worst(terrain, near, local, T, view)
-        return Fit(T, np.eye(3), 0.0, against, 0.0, key, Verdict.NO if against > POSSIBLE else Verdict.OPEN)
-    T_found = result.T_odom_base
+    T_found = result.T_odom_base  # the prediction where the match is none
     against = worst(terrain, near, local, T_found, view)
-    share = result.inliers / max(1, result.queries)
+    share = result.inliers / max(1, result.queries) if result.ok else 0.0
     extra = np.diag((told.extra_m**2, told.extra_m**2, told.extra_rad**2))
-    P = invert3(result.information) + extra
-    verdict = judged(result, share, against, told)
-    return Fit(T_found, P, share, against, result.residual_m, key, verdict if same(T, T_found) else Verdict.NO)
+    P = invert3(result.information) + extra if result.ok else np.eye(3)
+    verdict = judged(result, share, against, told) if same(T, T_found) else Verdict.NO
+    T_submap_keyframe = se2.between(piece.T_map_submap, T_found)
+    return Fit(T_found, P, share, against, result.residual_m, piece.key, T_submap_keyframe, verdict)
 
 
 def judged(result: MatchResult, share: float, against: float, told: LoopSettings) -> Verdict:
     """What a match says of its place."""
     if against > POSSIBLE:
         return Verdict.NO
-    sure = share >= told.share and against <= told.against and result.residual_m <= told.sse_m
+    sure = result.ok and share >= told.share and against <= told.against and result.residual_m <= told.sse_m
     return Verdict.HOLDS if sure and result.known_axes.all() else Verdict.OPEN
 
 

@@ -1,0 +1,132 @@
+"""Places where a robot that is adrift may be: found by looks in the map, carried along by odometry, ruled out by looks.
+
+A place is a hypothesis of where the odom frame lies. Every look at a later keyframe tests each of them where odometry
+says that the robot must be by now; a place that is found later has to be true of the earlier keyframes too. The laser
+alone has decided when one place is left over, of all that a complete search has offered, and has held from places far
+enough apart. It never has while two are left.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from estimator import se2
+from estimator.keyframe import Keyframe
+from estimator.records import Array
+from estimator.relocate import Fit, Looked, Terrain, Verdict, same
+
+HELD, HELD_M = 3, 1.0
+"""So many looks, from places so far apart, have to hold a place before the laser alone is believed."""
+
+PAST, PAST_M = 4, 0.6
+"""Earlier keyframes that a new place has to be true of, and how far apart they are."""
+
+IDLE: Final = 8
+"""Looks in a row that may leave a place open; one that holds comes back with the next search."""
+
+MOST: Final = 32
+"""Hypotheses carried at most."""
+
+AGAIN_M, AGAIN_RAD = 1.0, 1.0
+"""Way or turn after which it is searched again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A place that nothing has ruled out.
+
+    Attributes:
+        T_map_odom: where the odom frame then lies, by the latest look that held it. held: those looks, oldest first.
+        looks: at it so far; idle: how many of them in a row have left it open. share: mean share of the beams.
+    """
+
+    T_map_odom: Array
+    held: tuple[tuple[Keyframe, Fit], ...] = ()
+    looks: int = 0
+    idle: int = 0
+    share: float = 0.0
+
+    def after(self, frame: Keyframe, fit: Fit) -> Hypothesis:
+        """The hypothesis after one look more."""
+        share = (self.share * self.looks + fit.share) / (self.looks + 1)
+        if fit.verdict is not Verdict.HOLDS:
+            return replace(self, looks=self.looks + 1, idle=self.idle + 1, share=share)
+        held = (*self.held[:1], *self.held[1:][-HELD:], (frame, fit))
+        return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share)
+
+    def apart(self) -> float:
+        """Metres between the places it was held from."""
+        at = np.array([frame.T_odom_keyframe[:2] for frame, _ in self.held]).reshape(-1, 2)
+        return float(np.hypot(*np.ptp(at, axis=0))) if len(at) else 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Seek:
+    """What has been found since the robot is adrift.
+
+    Attributes:
+        alive: places left. past: some earlier keyframes that were looked for. complete: the latest search was; then
+            nothing but ``alive`` is left. searched: where that was (odom frame). terrain: of the latest look.
+        job: ID of the look under way. looks: so far. hint: T_map_odom by a person who has said where the robot is, and
+            how many looks have not found it there.
+    """
+
+    alive: tuple[Hypothesis, ...] = ()
+    past: tuple[Keyframe, ...] = ()
+    complete: bool = False
+    searched: Array | None = None
+    terrain: Terrain | None = None
+    job: int = 0
+    looks: int = 0
+    hint: tuple[Array, int] | None = field(default=None)
+
+    def due(self, frame: Keyframe) -> bool:
+        """Whether a keyframe is to be searched for, and not only looked at where it should be."""
+        if self.searched is None or not self.alive or not self.complete:
+            return True
+        x, y, yaw = se2.between(self.searched, frame.T_odom_keyframe).tolist()
+        return math.hypot(x, y) > AGAIN_M or abs(yaw) > AGAIN_RAD
+
+    def take(self, frame: Keyframe, asked: tuple[Hypothesis, ...], looked: Looked) -> None:
+        """Take in a look at ``frame``, which was asked for the hypotheses ``asked``."""
+        fits = zip(asked, looked.guesses, strict=True)
+        alive = [one.after(frame, fit) for one, fit in fits if fit.verdict is not Verdict.NO]
+        for fit, earlier in looked.fresh:
+            found = Hypothesis(carried(frame, fit))
+            for before, past in zip(self.past, earlier, strict=True):
+                found = found.after(before, past)
+            alive.append(replace(found, T_map_odom=carried(frame, fit)).after(frame, fit))
+        alive = distinct([one for one in alive if one.idle < IDLE], frame)
+        self.alive, self.terrain, self.looks = tuple(alive[:MOST]), looked.terrain, self.looks + 1
+        if looked.complete is not None:
+            self.complete, self.searched = looked.complete, frame.T_odom_keyframe
+        self.complete &= len(alive) <= MOST
+        if not self.past or math.hypot(*(frame.T_odom_keyframe - self.past[-1].T_odom_keyframe)[:2].tolist()) > PAST_M:
+            self.past = (*self.past, frame)[-PAST:]
+
+    def sure(self, witnessed: bool) -> bool:
+        """Whether the one place that is left is the robot's; ``witnessed``: something else than the laser says so."""
+        if len(self.alive) != 1 or not self.complete:
+            return False
+        (one,) = self.alive
+        held = witnessed or (len(one.held) >= HELD and one.apart() >= HELD_M)
+        return held and bool(one.held) and one.idle == 0
+
+
+def carried(frame: Keyframe, fit: Fit) -> Array:
+    """``T_map_odom`` that puts a keyframe where it was found."""
+    return se2.compose(fit.T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
+
+
+def distinct(found: list[Hypothesis], frame: Keyframe) -> list[Hypothesis]:
+    """Of those that put the robot into the same place the one that was held most."""
+    kept: list[Hypothesis] = []
+    for one in sorted(found, key=lambda one: (-len(one.held), -one.share)):
+        T = se2.compose(one.T_map_odom, frame.T_odom_keyframe)
+        if not any(same(T, se2.compose(other.T_map_odom, frame.T_odom_keyframe)) for other in kept):
+            kept.append(one)
+    return kept
