@@ -203,6 +203,30 @@ class LightsConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     ] = ""
 
 
+NO_FOLDER = "none"
+"""A map folder that is not there: maps end with the process."""
+
+
+class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """The map that outlives the process."""
+
+    folder: Annotated[
+        str, Meta(description="folder in which maps are kept; empty: the state directory; none: maps are not kept")
+    ] = ""
+    localise: Annotated[
+        bool, Meta(description="true to use the stored map as it is: it is never changed and never written")
+    ] = False
+
+    def __post_init__(self) -> None:
+        if self.localise and not self.kept:
+            raise ValueError("Expected a folder that holds a map in `folder` where `localise` is true, got `none`")
+
+    @property
+    def kept(self) -> bool:
+        """Whether maps are kept at all."""
+        return self.folder != NO_FOLDER
+
+
 class OdometryConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """Optional input of wheel odometry and gyro readings."""
 
@@ -259,6 +283,7 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     lidar: LidarConfig = LidarConfig()
     photodiode: PhotodiodeConfig = PhotodiodeConfig()
     lights: LightsConfig = LightsConfig()
+    map: MapConfig = MapConfig()
     odometry: OdometryConfig = OdometryConfig()
     cycle: CycleConfig = CycleConfig()
     modbus: ModbusConfig = ModbusConfig()
