@@ -211,7 +211,8 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """The map that outlives the process."""
 
     folder: Annotated[
-        str, Meta(description="folder in which maps are kept; empty: the state directory; none: maps are not kept")
+        str,
+        Meta(description="folder for maps, relative to this file; empty: the state directory; none: maps are not kept"),
     ] = ""
     localise: Annotated[
         bool, Meta(description="true to use the stored map as it is: it is never changed and never written")

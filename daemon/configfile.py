@@ -71,12 +71,18 @@ def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
 
 
 def _anchored(config: Config, file: Path | None) -> Config:
-    """The same with the survey's path as seen from the configuration file, not from wherever the process runs."""
-    survey = config.lights.survey
-    if file is None or not survey or Path(survey).is_absolute():
+    """The same with paths as seen from the configuration file, not from wherever the process runs."""
+    if file is None:
         return config
-    lights = msgspec.structs.replace(config.lights, survey=str(file.resolve().parent / survey))
-    return msgspec.structs.replace(config, lights=lights)
+    here = file.resolve().parent  # an absolute path stays what it is
+    if config.lights.survey:
+        lights = msgspec.structs.replace(config.lights, survey=str(here / config.lights.survey))
+        config = msgspec.structs.replace(config, lights=lights)
+    if config.map.folder and config.map.kept:
+        config = msgspec.structs.replace(
+            config, map=msgspec.structs.replace(config.map, folder=str(here / config.map.folder))
+        )
+    return config
 
 
 def options() -> list[Option]:

@@ -1,0 +1,201 @@
+"""The container of a map file: named arrays with checksums. Pure: bytes in, bytes out.
+
+Little-endian throughout. A head of 24 bytes, a table with one row of 48 bytes per array, and the arrays, each a chain of
+blocks that are packed by themselves:
+
+    head    magic (8 bytes), version (u16), arrays (u16), CRC-32 of the table, begun with the version (u32), file length (u64)
+    row     name (16 bytes), dtype (4), columns (u32, 0: one-dimensional), rows (u64), packed length (u64),
+            CRC-32 (u32), packing (u8: 1 zlib of the bytes sorted by significance, 2 the same of differences), 3 zeros
+    block   length as packed (u32), rows (u32), content
+
+The magic is chosen as PNG's is: whoever sends the file as text breaks it where it shows. A CRC-32 finds every damage of
+up to 32 bits in a row, and overlooks one of 4e9 others.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+AnyArray = npt.NDArray[Any]
+Content = AnyArray | Sequence[AnyArray]
+"""An array, or pieces of it that follow one another."""
+
+MAGIC: Final = b"\x8bLUMI\r\n\x1a"
+VERSION: Final = 1
+HEAD: Final = struct.Struct("<8sHHIQ")
+ROW: Final = struct.Struct("<16s4sIQQIB3x")
+BLOCK: Final = struct.Struct("<II")
+BLOCK_BYTES: Final = 1 << 18
+"""A block of about this much is packed in less than a millisecond without letting others run."""
+DTYPES: Final = ("|u1", "<i4", "<i8", "<f4", "<f8")
+MOST_BYTES: Final = 1 << 31
+"""No map is larger; a table that says otherwise is damaged."""
+SORTED, DIFFERENCES = 1, 2
+LEVEL: Final = 1
+"""Of zlib: higher ones take five times as long for a twentieth less."""
+
+
+class BadMap(Exception):
+    """A map that cannot be used. The text says what is wrong with it, without the file's name.
+
+    Attributes:
+        remedy: what a person can do.
+    """
+
+    remedy = "it is kept; the generation before it is used"
+
+
+class Foreign(BadMap):
+    """It is no map file at all."""
+
+
+class Newer(BadMap):
+    """A newer version of this software has written it."""
+
+    remedy = "install that version again, or move the file away"
+
+
+class Damaged(BadMap):
+    """It is not as it was written."""
+
+
+def nothing() -> None:
+    """Between two pieces of work: nobody has to be let in."""
+
+
+def pack(arrays: Mapping[str, Content], breathe: Callable[[], None] = nothing) -> bytes:
+    """A file with these arrays; ``breathe`` is called between pieces of work so that others may run."""
+    rows, contents = [], []
+    for name, content in arrays.items():
+        pieces = [content] if isinstance(content, np.ndarray) else list(content)
+        first = pieces[0]
+        dtype = first.dtype.newbyteorder("<").str
+        packing = DIFFERENCES if dtype == "<i4" else SORTED
+        length, crc, count = 0, 0, 0
+        for block, n in _blocks(pieces, packing):
+            contents.append(block)
+            length, crc, count = length + len(block), zlib.crc32(block, crc), count + n
+            breathe()
+        columns = first.shape[1] if first.ndim == 2 else 0
+        rows.append(ROW.pack(name.encode("ascii"), dtype.encode(), columns, count, length, crc, packing))
+    table = b"".join(rows)
+    total = HEAD.size + len(table) + sum(map(len, contents))
+    return b"".join((HEAD.pack(MAGIC, VERSION, len(rows), _checksum(VERSION, table), total), table, *contents))
+
+
+def _checksum(version: int, table: bytes) -> int:
+    return zlib.crc32(table, version)
+
+
+def unpack(data: bytes) -> dict[str, AnyArray]:
+    """The arrays of a file, each of its own memory.
+
+    Raises:
+        Foreign: not a map file. Newer: of a version to come. Damaged: anything else; names the place.
+    """
+    version, count, crc = _head(data)
+    table = data[HEAD.size : HEAD.size + count * ROW.size]
+    if len(table) != count * ROW.size or _checksum(version, table) != crc:
+        raise Damaged("its table of contents is damaged (checksum)")
+    at, arrays = HEAD.size + len(table), {}
+    for name, dtype, columns, rows, length, crc, packing in ROW.iter_unpack(table):
+        title = name.rstrip(b"\0").decode("ascii", "replace")
+        packed = memoryview(data)[at : at + length]
+        at += length
+        if len(packed) != length or zlib.crc32(packed) != crc:
+            raise Damaged(f"the part `{title}`, bytes {at - length} to {at}, is damaged (checksum)")
+        arrays[title] = _array(title, packed, dtype.decode("ascii", "replace").rstrip("\0"), (columns, rows, packing))
+    if at != len(data):
+        raise Damaged(f"{len(data) - at} bytes follow its last part")
+    return arrays
+
+
+def _head(data: bytes) -> tuple[int, int, int]:
+    """Version, number of arrays, and the table's checksum."""
+    if len(data) < HEAD.size:
+        if not MAGIC.startswith(data[: len(MAGIC)]):
+            raise Foreign("it is not a map file of lumiloop")
+        raise Damaged(f"it ends within its head, after {len(data)} bytes")
+    magic, version, count, crc, total = HEAD.unpack_from(data)
+    if magic != MAGIC:
+        raise Foreign("it is not a map file of lumiloop")
+    if version > VERSION:
+        raise Newer(f"it is of version {version}, and this software knows them up to {VERSION}")
+    if version < 1:
+        raise Damaged(f"there is no version {version}")
+    if len(data) != total:
+        raise Damaged(f"it is {len(data)} bytes long and should be {total}: cut off, or lengthened")
+    return version, count, crc
+
+
+def _blocks(pieces: Sequence[AnyArray], packing: int) -> Iterator[tuple[bytes, int]]:
+    """The blocks of an array that comes in pieces, with the rows in each."""
+    held: list[AnyArray] = []
+    size = 0
+    for piece in pieces:
+        step = max(1, BLOCK_BYTES // max(1, piece.itemsize * (piece.shape[1] if piece.ndim == 2 else 1)))
+        for begin in range(0, len(piece), step):
+            part = piece[begin : begin + step]
+            if held and size + part.nbytes > BLOCK_BYTES:
+                yield _block(held, packing)
+                held, size = [], 0
+            held.append(part)
+            size += part.nbytes
+    if held:
+        yield _block(held, packing)
+
+
+def _block(parts: Sequence[AnyArray], packing: int) -> tuple[bytes, int]:
+    array = np.concatenate(parts)
+    flat = array.astype(array.dtype.newbyteorder("<"), copy=False).reshape(-1)
+    if packing == DIFFERENCES:
+        flat = np.diff(flat, prepend=flat.dtype.type(0))
+    by_place = np.ascontiguousarray(flat.view(np.uint8).reshape(-1, flat.itemsize).T)
+    packed = zlib.compress(by_place.tobytes(), LEVEL)
+    return BLOCK.pack(len(packed), len(array)) + packed, len(array)
+
+
+def _array(title: str, packed: memoryview, dtype: str, row: tuple[int, int, int]) -> AnyArray:
+    """One array out of its blocks; everything that a table could say wrongly is checked before it is believed."""
+    columns, rows, packing = row
+    if dtype not in DTYPES or packing not in (SORTED, DIFFERENCES):
+        raise Damaged(f"the part `{title}` is of an unknown kind ({dtype}, packing {packing})")
+    kind = np.dtype(dtype)
+    width = max(1, columns)
+    if rows * width * kind.itemsize > MOST_BYTES:
+        raise Damaged(f"the part `{title}` is said to have {rows} rows")
+    array = np.empty(rows * width, kind)
+    at = done = 0
+    while at < len(packed):
+        if at + BLOCK.size > len(packed):
+            raise Damaged(f"the part `{title}` ends within a block")
+        length, count = BLOCK.unpack_from(packed, at)
+        at += BLOCK.size
+        if done + count > rows or count == 0:
+            raise Damaged(f"the part `{title}` has more rows than it says")
+        content = _unpacked(title, packed[at : at + length], count * width * kind.itemsize)
+        by_place = np.frombuffer(content, np.uint8).reshape(kind.itemsize, -1)
+        flat = np.ascontiguousarray(by_place.T).reshape(-1).view(kind)
+        if packing == DIFFERENCES:
+            flat = np.cumsum(flat, dtype=kind)
+        array[done * width : (done + count) * width] = flat
+        at, done = at + length, done + count
+    if done != rows:
+        raise Damaged(f"the part `{title}` has {done} rows and should have {rows}")
+    return array.reshape(rows, columns) if columns else array
+
+
+def _unpacked(title: str, content: memoryview, size: int) -> bytes:
+    try:
+        found = zlib.decompressobj().decompress(content, size + 1)
+    except zlib.error as error:
+        raise Damaged(f"the part `{title}` cannot be unpacked ({error})") from None
+    if len(found) != size:
+        raise Damaged(f"a block of the part `{title}` unpacks to {len(found)} bytes and should to {size}")
+    return found
