@@ -1,9 +1,10 @@
 """The container of a map file: named arrays with checksums. Pure: bytes in, bytes out.
 
-Little-endian throughout. A head of 24 bytes, a table with one row of 48 bytes per array, and the arrays, each a chain of
-blocks that are packed by themselves:
+Little-endian throughout. A head of 24 bytes, a table with one row of 48 bytes per array, and the arrays, each a chain
+of blocks that are packed by themselves:
 
-    head    magic (8 bytes), version (u16), arrays (u16), CRC-32 of the table, begun with the version (u32), file length (u64)
+    head    magic (8 bytes), version (u16), arrays (u16), CRC-32 of the table, begun with the version (u32),
+            length of the file (u64)
     row     name (16 bytes), dtype (4), columns (u32, 0: one-dimensional), rows (u64), packed length (u64),
             CRC-32 (u32), packing (u8: 1 zlib of the bytes sorted by significance, 2 the same of differences), 3 zeros
     block   length as packed (u32), rows (u32), content

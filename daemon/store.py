@@ -1,0 +1,261 @@
+"""The folder in which maps are kept: generations of whole files, of which the newest good one is loaded.
+
+A map is written beside, synced, moved to a name of its own, read back and compared; only then do older generations go.
+A power cut, or a kill at any moment, therefore leaves the old map or the new one. A file that is not as it was written is
+moved aside under the same name with ``.broken`` and never deleted.
+
+Kept of the map in use are the two newest generations, of which one may fail, and the one that this run began with: it
+is the last that a whole run has proved, should this run spoil the map. Of every other map (RESET begins one, and each
+building has its own) the newest generation is kept, of the seven latest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+from daemon.sampleclock import state_folder
+from daemon.store_file import BadMap, Damaged, Foreign
+from daemon.store_tables import OtherBuilding, Stored, read
+from daemon.wholefile import sync_folder, write_whole
+
+log = logging.getLogger(__name__)
+
+NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap")
+BROKEN: Final = ".broken"
+MAPS: Final = "maps"
+"""Folder below the state directory."""
+NEWEST: Final = 2
+OTHERS: Final = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Generation:
+    """One file."""
+
+    number: int
+    map_id: int
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The map that a run begins with.
+
+    Attributes:
+        content: of the file. stored: what it holds. changed: lamps whose gains are not believed, because the survey has
+            changed since.
+    """
+
+    content: bytes
+    stored: Stored
+    changed: frozenset[int] = frozenset()
+
+
+Judge = Callable[[Stored], tuple[str, frozenset[int]]]
+"""Whether a map fits the configured survey: see `store_tables.against_survey`."""
+
+
+def unjudged(stored: Stored) -> tuple[str, frozenset[int]]:
+    """Every map fits where there is no survey."""
+    return "", frozenset()
+
+
+def folder_of(configured: str) -> Path:
+    """Where maps are kept."""
+    return Path(configured) if configured else state_folder() / MAPS
+
+
+class Store:
+    """A folder of maps, used by one process at a time.
+
+    Attributes:
+        refused: whether a map was found and could not be used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Nothing is touched yet."""
+        self.folder = folder
+        self.refused = False
+        self._origin: Path | None = None
+        self._lock: int | None = None
+
+    def generations(self) -> list[Generation]:
+        """All that are there, newest first."""
+        found = []
+        with contextlib.suppress(FileNotFoundError):
+            for path in self.folder.iterdir():
+                if match := NAME.fullmatch(path.name):
+                    found.append(Generation(int(match[2]), int(match[1], 16), path))
+        return sorted(found, key=lambda one: one.number, reverse=True)
+
+    def load(self, judge: Judge = unjudged) -> Start | None:
+        """The newest good map that fits; None where there is none. What cannot be used is said in the log.
+
+        Where a generation is damaged the one before it counts. Another map than the latest is taken only if that one
+        belongs to another building: what a person has begun anew does not come back by itself.
+        """
+        try:
+            generations = self.generations()
+        except OSError as error:
+            log.error("maps in %s cannot be read: %s; mend that, or name another `map.folder`", self.folder, said(error))
+            self.refused = True
+            return None
+        by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
+        for _, files in groupby(by_map, key=lambda one: one.map_id):
+            elsewhere = True
+            for generation in files:
+                try:
+                    start = self._read(generation, judge)
+                except OtherBuilding as error:
+                    self._refuse(generation.path, error)
+                except (BadMap, OSError) as error:
+                    self._refuse(generation.path, error)
+                    elsewhere = False
+                else:
+                    self._origin = generation.path
+                    return start
+            if not elsewhere:
+                log.error("no map in %s can be used; a new one is begun", self.folder)
+                return None
+        return None
+
+    def _read(self, generation: Generation, judge: Judge) -> Start:
+        content = generation.path.read_bytes()
+        stored = read(content)
+        if stored.meta.map_id != generation.map_id:
+            raise Foreign(f"it holds map {stored.meta.map_id:08x}, another than its name says")
+        words, changed = judge(stored)
+        if words:
+            log.warning("%s: %s; what was learned of them is forgotten, the map is used", generation.path, words)
+        if stored.isolated:
+            log.warning(
+                "%s: %d of its submaps are joined with the rest by nothing and are left out",
+                self._copy_aside(generation.path, content),
+                stored.isolated,
+            )
+        return Start(content, stored, changed)
+
+    def _copy_aside(self, path: Path, content: bytes) -> Path:
+        """Keep a torn map for who wants to know: what is saved next lacks a part of it."""
+        aside = path.with_name(path.name + ".torn")
+        with contextlib.suppress(OSError):
+            if not aside.exists():
+                write_whole(aside, content)
+            return aside
+        return path
+
+    def _refuse(self, path: Path, error: BadMap | OSError) -> None:
+        """Say why a file is not used; one that is damaged gets out of the way."""
+        self.refused = True
+        if isinstance(error, OSError):
+            log.error("%s cannot be read: %s; mend that, or move it away", path, said(error))
+            return
+        where = path
+        if isinstance(error, Damaged | Foreign):
+            aside = path.with_name(path.name + BROKEN)
+            with contextlib.suppress(OSError):
+                where = path.replace(aside)
+        log.error("%s is refused: %s; %s", where, error, error.remedy)
+
+    def save(self, content: bytes, map_id: int) -> Path:
+        """Write a generation, verify it by reading it back, then let older ones go; returns its path.
+
+        Raises:
+            OSError: it cannot be written or read, or another process uses the folder; what was there before stays.
+            BadMap: what was read back is not what was written; the file is kept aside.
+        """
+        self._use()
+        path = self.folder / f"map-{map_id:08x}-{self._next():08d}.lumimap"
+        write_whole(path, content)
+        try:
+            verify(path, content)
+        except BadMap:
+            path.replace(path.with_name(path.name + BROKEN))
+            raise
+        self._let_go(map_id)
+        return path
+
+    def _use(self) -> None:
+        """Make the folder and take it for this process; what a killed one has left half written goes."""
+        if self._lock is not None and self.folder.is_dir():
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            raise
+        if self._lock is not None:
+            os.close(self._lock)
+        self._lock = lock
+        for part in self.folder.glob(".map-*.part"):
+            part.unlink(missing_ok=True)
+
+    def _next(self) -> int:
+        """The number after all that were ever given, broken ones too."""
+        numbers = [int(match[2]) for path in self.folder.iterdir() if (match := NAME.match(path.name))]
+        return 1 + max(numbers, default=0)
+
+    def _let_go(self, map_id: int) -> None:
+        for generation in self._superfluous(map_id):
+            log.debug("%s: an older generation goes", generation.path)
+            generation.path.unlink(missing_ok=True)
+        sync_folder(self.folder)
+
+    def _superfluous(self, map_id: int) -> Iterator[Generation]:
+        mine = others = 0
+        seen: set[int] = set()
+        for generation in self.generations():
+            if generation.map_id == map_id:
+                mine += 1
+                if mine > NEWEST and generation.path != self._origin:
+                    yield generation
+            elif generation.map_id in seen:
+                yield generation
+            else:
+                seen.add(generation.map_id)
+                others += 1
+                if others > OTHERS:
+                    log.warning("%s goes: %d maps of other places are newer", generation.path, OTHERS)
+                    yield generation
+
+    def close(self) -> None:
+        """Let others use the folder; idempotent."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def verify(path: Path, content: bytes) -> None:
+    """Whether a file on the disk is what was written, and loads.
+
+    Raises:
+        Damaged: it is not. OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # from the disk, not from what we just gave it
+        found = file.read()
+    if found != content:
+        raise Damaged("what was read back is not what was written: the disk is failing")
+    read(found)
+
+
+def said(error: OSError) -> str:
+    """What is wrong, for people."""
+    if isinstance(error, BlockingIOError):
+        return "another process keeps its maps there"
+    return error.strerror or str(error)
+
+
+def _newest(generations: list[Generation], map_id: int) -> int:
+    return max(one.number for one in generations if one.map_id == map_id)
