@@ -134,6 +134,13 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the files")
     _config_arguments(export)
     export.set_defaults(body=_estimating("daemon.export", "main"))
+    info = verbs.add_parser("info", help="say what a map file holds")
+    info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    info.add_argument("--json", action="store_true", help="machine-readable output")
+    info.set_defaults(body=_loaded("daemon.store_cli", "info"))
+    verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
+    verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
+    verify.set_defaults(body=_loaded("daemon.store_cli", "verify"))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:

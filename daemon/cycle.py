@@ -182,6 +182,11 @@ class Cycle:
         self._publish(self._painter.paint(None, self.verdict, self._facts(self.parts.clock.now())))
 
     @property
+    def map_id(self) -> int:
+        """Identity of the map frame, another one after every RESET."""
+        return self._painter.map_id
+
+    @property
     def budget_us(self) -> float:
         """Microseconds that a cycle may take."""
         return self.parts.budget_us or OWN_SHARE * self.period.seconds * 1e6

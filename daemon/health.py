@@ -51,6 +51,8 @@ class Fault(IntEnum):
     WORKER_FAILED = 303
     PUBLISHER_FAILED = 401
     RECORDER_FAILED = 402
+    MAP_NOT_SAVED = 403
+    MAP_REFUSED = 404
 
 
 FAULTS: Final[dict[Fault, tuple[str, str]]] = {
@@ -144,6 +146,14 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "read the log; is the port taken by another program?",
     ),
     Fault.RECORDER_FAILED: ("the recording cannot be written", "free disk space, or name another directory"),
+    Fault.MAP_NOT_SAVED: (
+        "the map cannot be saved; what was saved before stays",
+        "read the log; free disk space, or name another `map.folder` that may be written",
+    ),
+    Fault.MAP_REFUSED: (
+        "a stored map cannot be used",
+        "the log names the file, why, and what to do; without one a new map is begun",
+    ),
 }
 """For every fault what it means and what a person can do."""
 
@@ -284,8 +294,15 @@ def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.WORKER_FAILED
 
 
+STORE: Final = {"map": Fault.MAP_NOT_SAVED, "stored map": Fault.MAP_REFUSED}
+"""Parts of the store, by name, and what it means that they are down."""
+
+
 def _outputs(now: Vitals) -> Iterable[Fault]:
     if "recorder" in now.failed:
         yield Fault.RECORDER_FAILED
-    if now.failed - {"recorder"}:
+    for part, fault in STORE.items():
+        if part in now.failed:
+            yield fault
+    if now.failed - {"recorder", *STORE}:
         yield Fault.PUBLISHER_FAILED

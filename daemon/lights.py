@@ -22,6 +22,8 @@ from estimator.cdma_profile import PROFILES, Profile
 from estimator.lamps import Survey
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from daemon.store import Start
+    from estimator.light import LightsSetup
     from estimator.pipeline import Settings, State
     from estimator.residual import ResidualMap
 
@@ -126,18 +128,26 @@ def _digest(residuals: bytes) -> str:
     return hashlib.sha256(residuals).hexdigest() if residuals else ""
 
 
-def new_state(lights: Lights | None, settings: Settings | None = None) -> State:
-    """The estimator's state for a robot that has just been switched on; loads the estimator.
+def new_state(lights: Lights | None, settings: Settings | None = None, start: Start | None = None) -> State:
+    """The estimator's state for a robot that has just been switched on, and the map it begins with; loads the estimator.
 
     A residual map that cannot be used is named in the log, and the robot drives without.
     """
     from estimator import pipeline
 
-    if lights is None:
-        return pipeline.new_state(settings)
+    setup = None if lights is None else _setup(lights)
+    if start is None:
+        return pipeline.new_state(settings, setup)
+    from daemon.store_image import image_from
+    from estimator.mapimage import restored
+
+    return restored(image_from(start.stored, start.changed), settings, setup)
+
+
+def _setup(lights: Lights) -> LightsSetup:
     from estimator.light import LightsSetup
 
-    return pipeline.new_state(settings, LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights)))
+    return LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights))
 
 
 def _learned(lights: Lights) -> ResidualMap | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import logging
 import secrets
 import signal
@@ -34,6 +35,9 @@ from daemon.photodiode import AdcMaker, BlockWatch, make_adc
 from daemon.publish.snapshot import Snapshot, State
 from daemon.realtime import claim
 from daemon.sampleclock import SampleClock
+from daemon.store import NoMap, Start, Store, started
+from daemon.store_keeper import About, Keeper
+from daemon.store_tables import digest_of
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.warmup import CannotLoad, Warmth, warm_up
@@ -49,6 +53,7 @@ from hal.port import PortOpener
 
 if TYPE_CHECKING:
     from daemon.record import Recorder
+    from estimator.state import State as Estimate
 
 log = logging.getLogger(__name__)
 
@@ -112,6 +117,7 @@ class World:
         warm_up: loads the estimator. draw_map_id: identity of a new map frame.
         lights: survey and sample clock; None: as configured, and a sample clock that is to be found.
         sample_clock: keeps the sample clock; None: it is not kept.
+        store: keeps maps; None: they are not kept. start: the map that the run begins with.
     """
 
     clock: Clock
@@ -127,6 +133,8 @@ class World:
     make_adc: AdcMaker = make_adc
     lights: Lights | None = None
     sample_clock: SampleClock | None = None
+    store: Store | None = None
+    start: Start | None = None
 
 
 class Daemon:
@@ -145,10 +153,11 @@ class Daemon:
         fitted = settings.lidar.fitted
         self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
         self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
+        self._estimator = _Estimator(lights, world.start)
         self.cycle = Cycle(
             Parts(
                 clock=world.clock,
-                step=_Estimator(lights),
+                step=self._estimator,
                 scans=ScanBridge(settings.lidar),
                 budget=world.make_budget(),
                 worker=world.make_worker(),
@@ -160,10 +169,11 @@ class Daemon:
                 budget_us=1e3 * settings.cycle.budget_ms,
                 stopwatch=world.stopwatch,
                 tap=None if recorder is None else recorder.on_cycle,
-                map_id=world.draw_map_id(),
+                map_id=world.draw_map_id() if world.start is None else world.start.stored.meta.map_id,
                 alert_m=settings.integrity.alert_m,
             )
         )
+        self.keeper = self._keeper(settings, lights)
         self.pacemaker = Pacemaker(self.cycle)
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
         on_samples = self.pacemaker.on_samples
@@ -193,11 +203,14 @@ class Daemon:
             notify("STOPPING=1")
             log.info("stopping")
             self._keep_sample_clock()
-            for name in ("cycle", "lidar", *tasks):  # the lidar before what only listens: its laser is to go off
+            await _stop(tasks.get("cycle"))
+            saving = asyncio.create_task(self.keeper.finish(), name="map at the stop")
+            for name in ("lidar", *tasks):  # the lidar before what only listens: its laser is to go off
                 await _stop(tasks.get(name))
             for task in (stopped, warming):
                 await _stop(task)
             self.cycle.parts.worker.close()
+            await saving
             if self._recorder is not None:
                 self._recorder.close()
 
@@ -205,10 +218,22 @@ class Daemon:
         warmth = await self._world.warm_up()
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
+        if self._world.start is not None:
+            self._estimator.load()
+            gc.freeze()  # the map stays
+            self.keeper.loaded()
+
+    def _keeper(self, settings: Config, lights: Lights | None) -> Keeper:
+        survey = "" if lights is None else digest_of(lights.survey)
+        about = About(settings.name, survey, settings.map.localise)
+        world, cycle = self._world, self.cycle
+        return Keeper(world.store, world.start, lambda: self._estimator.state, lambda: cycle.map_id, about, world.clock)
 
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
         parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._on_scan)}
+        if self._world.store is not None:
+            parts["map"] = self.keeper.run
         if (adc := self.adc) is not None:
             parts["photodiode"] = lambda: adc.run(self._on_samples)
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
@@ -217,8 +242,9 @@ class Daemon:
     def _feeds(self) -> Feeds:
         inbox, recorder = self.cycle.inbox, self._recorder
         if recorder is None:
-            return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command)
-        return Feeds(recorder.on_odometry(inbox.put_odometry), recorder.on_imu(inbox.put_imu), inbox.put_command)
+            return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command, self.keeper.ask)
+        on_odometry, on_imu = recorder.on_odometry(inbox.put_odometry), recorder.on_imu(inbox.put_imu)
+        return Feeds(on_odometry, on_imu, inbox.put_command, self.keeper.ask)
 
     def _keep_sample_clock(self) -> None:
         result, store = self.cycle.result, self._world.sample_clock
@@ -233,22 +259,37 @@ class Daemon:
         failed = set(self.supervisor.failed)
         if self._recorder is not None and self._recorder.error:
             failed.add("recorder")
+        if self.keeper.error:
+            failed.add("map")
+        if self.keeper.refused:
+            failed.add("stored map")
         return vitals(self.cycle, failed, lateness)
 
 
 class _Estimator:
-    """The estimator with its state; loaded with the first step, which the warm-up has made quick."""
+    """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
 
-    def __init__(self, lights: Lights | None) -> None:
+    Attributes:
+        state: None until then.
+    """
+
+    def __init__(self, lights: Lights | None, start: Start | None) -> None:
+        self.state: Estimate | None = None
         self._lights = lights
+        self._start = start
         self._step: Step | None = None
 
-    def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
-        if self._step is None:
-            from estimator import pipeline
+    def load(self) -> Step:
+        """Load the estimator, and the map into it."""
+        from estimator import pipeline
 
-            self._step = partial(pipeline.step, new_state(self._lights))
-        return self._step(records, limits)
+        self.state = new_state(self._lights, start=self._start)
+        self._step = partial(pipeline.step, self.state)
+        return self._step
+
+    def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
+        step = self._step or self.load()
+        return step(records, limits)
 
 
 class _FirstPose:
@@ -294,24 +335,27 @@ def main(args: argparse.Namespace) -> int:
         if args.record is not None:
             from daemon.record import Recorder
 
-            recorder = Recorder(args.record, settings, world.clock, world.lights)
+            recorder = Recorder(args.record, settings, world.clock, world.lights, world.start)
         asyncio.run(_run_until_signal(settings, world, recorder))
     except SurveyError as error:
         log.error("%s", error)
         return USAGE
-    except (HalError, CannotLoad) as error:
+    except (HalError, CannotLoad, NoMap) as error:
         log.error("%s", error)
         return FAILED
     return OK
 
 
 def _world(settings: Config) -> World:
-    """The real one, with what is stored and surveyed of the lights; raises `SurveyError`."""
+    """The real one, with what is stored and surveyed of map and lights; raises `SurveyError` and `NoMap`."""
     if not settings.photodiode.fitted:
-        return World(SystemClock())
+        store, start = started(settings.map, None)
+        return World(SystemClock(), store=store, start=start)
     sample_clock = SampleClock(settings.photodiode)
     lights = load_lights(settings, sample_clock.ppm)
-    return World(SystemClock(), warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=sample_clock)
+    store, start = started(settings.map, lights)
+    warm = partial(warm_up, lights=lights)
+    return World(SystemClock(), warm_up=warm, lights=lights, sample_clock=sample_clock, store=store, start=start)
 
 
 def _whereabouts(settings: Config, record: Path | None) -> str:

@@ -30,17 +30,23 @@ log = logging.getLogger(__name__)
 SILENT_S: Final = 1.0
 """Another sender of odometry is listened to once the present one has been silent for this long."""
 
+SAVE_MAP: Final = "SAVE_MAP"
+
 Run = Callable[[], Awaitable[None]]
 OnOdometry = Callable[[RawOdometry], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Feeds:
-    """Who takes what comes in."""
+    """Who takes what comes in.
+
+    ``on_save`` is asked to save the map, and tells the end of it: empty, or why it came to nothing.
+    """
 
     on_odometry: OnOdometry
     on_imu: Callable[[RawImu], None]
     on_command: Callable[[Command], None]
+    on_save: Callable[[Callable[[str], None]], None]
 
 
 class OneSender:
@@ -121,12 +127,25 @@ class Network:
         return lambda reading: self._odometry.take(sender, reading)
 
     def _command(self, request: Request) -> None:
-        """An order written over Modbus; carried out by the next cycle."""
+        """An order written over Modbus; carried out by the next cycle, but for one that is none of the estimator's."""
+        if request.code.name == SAVE_MAP:
+            log.info("Modbus: %s", SAVE_MAP)
+            self._feeds.on_save(lambda reason: self._saved(request.number, reason))
+            return
         order = Order[request.code.name]
         pose = np.array(request.pose) if order is Order.SET_POSE else None
         log.info("Modbus: %s %s", order.name, request.pose if pose is not None else "")
         self._feeds.on_command(Command(self._clock.now(), order, pose))
         self._asked.append(request.number)
+
+    def _saved(self, number: int, reason: str) -> None:
+        """The map is on the disk, or not: ``reason``."""
+        from daemon.publish.holding import Outcome
+
+        if reason:
+            log.warning("Modbus: %s refused: %s", SAVE_MAP, reason)
+        if self.modbus is not None:
+            self.modbus.acknowledge(number, Outcome.REFUSED if reason else Outcome.DONE)
 
     def _acknowledge(self, snapshot: Snapshot) -> None:
         """The cycle that took the orders has published: they are done."""

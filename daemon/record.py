@@ -7,6 +7,7 @@ same caps. The published pose is kept too, so that a replay can say whether it i
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +20,7 @@ from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.disk import SegmentWriter
 from daemon.lights import RESIDUALS, Lights
+from daemon.store import Start
 from daemon.versions import versions
 from daemon.wholefile import write_whole
 from estimator.records import Array, Command, Limits, Order
@@ -31,6 +33,11 @@ from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 from hal.port import OnData, OnLost, Port, PortOpener
 from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_samples, pack_scan
+
+MAP: Final = "map"
+"""Key of a recording's head where the run began with a map."""
+START: Final = "start.lumimap"
+"""File of a recording's folder: that map."""
 
 LIDAR, PHOTODIODE = 0, 0
 """Channels: which device of its kind."""
@@ -130,10 +137,13 @@ class Recorder:
     :meth:`on_imu` to the sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
     """
 
-    def __init__(self, folder: Path, config: Config, clock: Clock, lights: Lights | None = None) -> None:
+    def __init__(
+        self, folder: Path, config: Config, clock: Clock, lights: Lights | None = None, start: Start | None = None
+    ) -> None:
         """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
 
-        ``lights``: what the estimator is told of lights, which a replay has to tell it again.
+        ``lights``, ``start``: what the estimator is told of lights, and the map that it begins with: a replay has to
+        tell it again.
 
         Raises:
             DeviceRefused: the folder cannot be made or written.
@@ -146,16 +156,19 @@ class Recorder:
             "versions": versions(),
             "config": msgspec.to_builtins(config),
             **({} if lights is None else lights.header()),
+            **({} if start is None else {MAP: {"sha256": hashlib.sha256(start.content).hexdigest()}}),
         }
         self._clock = clock
         self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header)
         if lights is not None and lights.residuals:
-            self._keep_residuals(lights.residuals)
+            self._keep(RESIDUALS, lights.residuals)
+        if start is not None:
+            self._keep(START, start.content)
 
-    def _keep_residuals(self, residuals: bytes) -> None:
-        """Once beside the segments: they are too large for every head."""
+    def _keep(self, name: str, content: bytes) -> None:
+        """Once beside the segments: it is too large for every head."""
         try:
-            write_whole(self.disk.folder / RESIDUALS, residuals)
+            write_whole(self.disk.folder / name, content)
         except OSError as error:
             self.disk.close()
             problem = f"cannot be recorded into: {error.strerror or error}"

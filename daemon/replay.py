@@ -11,6 +11,7 @@ import json
 import math
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -23,17 +24,24 @@ from daemon import cli, warmup
 from daemon.config import Config, Mount
 from daemon.ledger import Ledger
 from daemon.lights import Lights, SurveyError, from_header, load_lights, lost_residuals
+from daemon.record import MAP, START
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused, map_files, tum
 from daemon.sources import Source, open_log, sha256_of
+from daemon.store import NoMap, Start, recorded_start, started
+from daemon.store_file import BadMap
+from daemon.store_image import meta_of, packed
 from daemon.versions import versions
 from estimator.grid import Grid
+from estimator.mapimage import Identity
 from hal.errors import DataInvalid, HalError
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
     from daemon.matchjournal import MatchJournal
 
 PROGRESS_S: Final = 1.0
+LONGEST_NAME: Final = 64
+"""Of a map."""
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
 
 
@@ -108,7 +116,8 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: Ma
     lights = lights_for(source, used, given)
     if lights is not None:
         warmup.load_aloud(cli.say, "warm-lights", partial(warmup.load, lights))
-    outcome = Outcome(source, used, Rerun(source, used, lights, journal), journal)
+    start = start_for(source, used, lights, given)
+    outcome = Outcome(source, used, Rerun(source, used, lights, journal, start), journal)
     outcome.seconds["read"] = time.perf_counter() - begun
     begun = time.perf_counter()
     try:
@@ -153,6 +162,24 @@ def lights_for(source: Source, used: Config, given: Given) -> Lights | None:
         return load_lights(used, _recorded_clock(source, used)) if asked else _recorded_lights(source)
     except (SurveyError, ValueError) as error:
         raise DataInvalid(str(source.path), str(error), "name a survey with --set lights.survey=FILE") from error
+
+
+def start_for(source: Source, used: Config, lights: Lights | None, given: Given) -> Start | None:
+    """The map that the run began with; that of ``map.folder`` only where a person has asked for it. None: with none.
+
+    Raises:
+        DataInvalid: the map asked for, or recorded, cannot be used.
+    """
+    try:
+        named = given.file and used.map.folder and not source.recorded
+        if named or any(key.startswith("map.") for key in given.keys):
+            return started(used.map, lights, mend=False)[1]
+        if not source.recorded or MAP not in source.header:
+            return None
+        return recorded_start(source.files[0].parent / START, source.header[MAP]["sha256"], lights)
+    except (NoMap, BadMap, OSError) as error:
+        remedy = "replay the recording with the files that it was written with, or name a map with --set map.folder=DIR"
+        raise DataInvalid(str(source.path), f"the map it began with cannot be used: {error}", remedy) from error
 
 
 def _recorded_lights(source: Source) -> Lights | None:
@@ -240,6 +267,7 @@ def _write_all(folder: Folder, outcome: Outcome) -> None:
         ("trajectory.tum", tum(final)),
         ("online.tum", tum(ledger.online())),
         ("loops.csv", _loops(ledger)),
+        ("map.lumimap", _map(outcome)),
         *map_files(grid, final.poses, outcome.rerun.lamps()),
         ("summary.json", _json(summary(outcome, grid))),
     ]
@@ -251,6 +279,13 @@ def _write_all(folder: Folder, outcome: Outcome) -> None:
     finally:
         outcome.seconds["write"] = time.perf_counter() - begun
         folder.write("timing.json", _json(timing(outcome)))
+
+
+def _map(outcome: Outcome) -> bytes:
+    """The map as ``lumiloop run`` keeps it, the same each time."""
+    map_id = zlib.crc32(outcome.source.path.name.encode()) | 1
+    image = outcome.rerun.image(Identity(map_id, outcome.source.path.name[:LONGEST_NAME], session=1))
+    return packed(image, meta_of(image, 0.0, outcome.config.name, versions()["lumiloop"]))
 
 
 def _loops(ledger: Ledger) -> bytes:

@@ -19,9 +19,11 @@ from daemon.lights import Lights, new_state
 from daemon.photodiode import BlockWatch
 from daemon.record import CycleEntry, light_of
 from daemon.sources import Event, Source, Turn
+from daemon.store import Start
 from daemon.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
 from estimator.grid import Grid
+from estimator.mapimage import Identity, MapImage, image_of
 from estimator.records import UNLIMITED, Array, Limits, Order, Record
 from estimator.result import StepResult
 from hal.adc import AdcStatus, RawSamples
@@ -93,7 +95,12 @@ class Rerun:
     """One log through one fresh daemon cycle: feed it every event, then ask for the results."""
 
     def __init__(
-        self, source: Source, config: Config, lights: Lights | None = None, journal: MatchJournal | None = None
+        self,
+        source: Source,
+        config: Config,
+        lights: Lights | None = None,
+        journal: MatchJournal | None = None,
+        start: Start | None = None,
     ) -> None:
         self.ledger = Ledger()
         self.comparison = Comparison()
@@ -103,7 +110,7 @@ class Rerun:
         self.t_first = math.inf
         self._source = source
         self._clock = ReplayClock()
-        self._state = new_state(lights, pipeline.Settings(history=True))
+        self._state = new_state(lights, pipeline.Settings(history=True), start)
         self._journal = journal
         if journal is not None:
             journal.attach(self._state)
@@ -170,6 +177,10 @@ class Rerun:
             except ValueError:
                 continue
         return pipeline.render_map(self._state, RESOLUTIONS_M[-1])
+
+    def image(self, identity: Identity) -> MapImage:
+        """The map as it is kept on a disk."""
+        return image_of(self._state, identity)
 
     def lamps(self) -> Array | None:
         """(k, 2) surveyed places of the lamps in the map frame; None until light has told where the map lies."""

@@ -13,19 +13,25 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import logging
 import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from daemon.config import MapConfig
 from daemon.sampleclock import state_folder
 from daemon.store_file import BadMap, Damaged, Foreign
-from daemon.store_tables import OtherBuilding, Stored, read
+from daemon.store_tables import OtherBuilding, Stored, against_survey, read
 from daemon.wholefile import sync_folder, write_whole
+
+if TYPE_CHECKING:
+    from daemon.lights import Lights
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +66,10 @@ class Start:
     changed: frozenset[int] = frozenset()
 
 
+class NoMap(Exception):
+    """There is no map, and nothing can be done without one; names the folder and the remedy."""
+
+
 Judge = Callable[[Stored], tuple[str, frozenset[int]]]
 """Whether a map fits the configured survey: see `store_tables.against_survey`."""
 
@@ -67,6 +77,46 @@ Judge = Callable[[Stored], tuple[str, frozenset[int]]]
 def unjudged(stored: Stored) -> tuple[str, frozenset[int]]:
     """Every map fits where there is no survey."""
     return "", frozenset()
+
+
+def judge_for(lights: Lights | None) -> Judge:
+    """Whether a map fits what is configured of lights."""
+    return unjudged if lights is None else partial(against_survey, survey=lights.survey)
+
+
+def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tuple[Store | None, Start | None]:
+    """The folder of maps and the map that a run begins with, as far as there are such.
+
+    Raises:
+        NoMap: a map is to be used as it is, and there is none that can be.
+    """
+    if not config.kept:
+        return None, None
+    store = Store(folder_of(config.folder), mend)
+    start = store.load(judge_for(lights))
+    if start is None and config.localise:
+        raise NoMap(
+            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make one, "
+            "or import one: lumiloop map import"
+        )
+    if start is not None:
+        meta = start.stored.meta
+        named = f" ({meta.name})" if meta.name else ""
+        log.info("map %08x%s of %d submaps loaded", meta.map_id, named, len(start.stored.tables["submap.key"]))
+    return store, start
+
+
+def recorded_start(path: Path, sha256: str, lights: Lights | None) -> Start:
+    """The map in a recording's folder.
+
+    Raises:
+        OSError: it cannot be read. BadMap: it is not the one that the run began with, or not good.
+    """
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise Damaged(f"{path.name} is not the map that the recorded run began with")
+    stored = read(content)
+    return Start(content, stored, judge_for(lights)(stored)[1])
 
 
 def folder_of(configured: str) -> Path:
@@ -81,9 +131,10 @@ class Store:
         refused: whether a map was found and could not be used.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Nothing is touched yet."""
+    def __init__(self, folder: Path, mend: bool = True) -> None:
+        """Nothing is touched yet. ``mend``: what is broken may be moved aside."""
         self.folder = folder
+        self._mend = mend
         self.refused = False
         self._origin: Path | None = None
         self._lock: int | None = None
@@ -106,7 +157,9 @@ class Store:
         try:
             generations = self.generations()
         except OSError as error:
-            log.error("maps in %s cannot be read: %s; mend that, or name another `map.folder`", self.folder, said(error))
+            log.error(
+                "maps in %s cannot be read: %s; mend that, or name another `map.folder`", self.folder, said(error)
+            )
             self.refused = True
             return None
         by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
@@ -148,9 +201,9 @@ class Store:
         """Keep a torn map for who wants to know: what is saved next lacks a part of it."""
         aside = path.with_name(path.name + ".torn")
         with contextlib.suppress(OSError):
-            if not aside.exists():
+            if self._mend and not aside.exists():
                 write_whole(aside, content)
-            return aside
+            return aside if aside.exists() else path
         return path
 
     def _refuse(self, path: Path, error: BadMap | OSError) -> None:
@@ -160,7 +213,7 @@ class Store:
             log.error("%s cannot be read: %s; mend that, or move it away", path, said(error))
             return
         where = path
-        if isinstance(error, Damaged | Foreign):
+        if self._mend and isinstance(error, Damaged | Foreign):
             aside = path.with_name(path.name + BROKEN)
             with contextlib.suppress(OSError):
                 where = path.replace(aside)

@@ -5,6 +5,7 @@ Nothing here needs the estimator, so that ``lumiloop map info`` loads no compile
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 from typing import Any, Final
@@ -259,12 +260,18 @@ def lamp_tables(lamps: tuple[Lamp, ...]) -> Tables:
     return {"lamp.id": np.array(ids, "<i8").reshape(-1, 2), "lamp": np.array(rows, "<f8").reshape(-1, 8)}
 
 
-def against_survey(stored: Stored, survey: Survey, digest: str) -> tuple[str, frozenset[int]]:
+def digest_of(survey: Survey) -> str:
+    """What tells one survey from another; empty for one without lamps."""
+    return hashlib.sha256(msgspec.json.encode(survey)).hexdigest() if survey.lamps else ""
+
+
+def against_survey(stored: Stored, survey: Survey) -> tuple[str, frozenset[int]]:
     """What has changed in the survey since the map was made: in words, and the lamps it concerns; "" and none if not.
 
     Raises:
         OtherBuilding: the two have next to nothing in common.
     """
+    digest = digest_of(survey)
     if not digest or not stored.meta.survey or digest == stored.meta.survey:
         return "", frozenset()
     then = {lamp.lamp_id: lamp for lamp in lamps_of(stored.tables)}

@@ -24,6 +24,7 @@ class CommandCode(IntEnum):
 
     SET_POSE = 1  # the robot is at (x, y, yaw) in the map frame
     RESET = 2  # forget map and pose, start anew
+    SAVE_MAP = 3  # write the map to the disk; done when it is there and has been read back
     RELOCALISE = 4  # the robot was carried off: look for it everywhere in the map
 
 
