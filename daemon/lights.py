@@ -129,7 +129,7 @@ def _digest(residuals: bytes) -> str:
 
 
 def new_state(lights: Lights | None, settings: Settings | None = None, start: Start | None = None) -> State:
-    """The estimator's state for a robot that has just been switched on, and the map it begins with; loads the estimator.
+    """The estimator's state for a robot just switched on, and the map it begins with; loads the estimator.
 
     A residual map that cannot be used is named in the log, and the robot drives without.
     """

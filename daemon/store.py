@@ -1,8 +1,8 @@
 """The folder in which maps are kept: generations of whole files, of which the newest good one is loaded.
 
 A map is written beside, synced, moved to a name of its own, read back and compared; only then do older generations go.
-A power cut, or a kill at any moment, therefore leaves the old map or the new one. A file that is not as it was written is
-moved aside under the same name with ``.broken`` and never deleted.
+A power cut, or a kill at any moment, therefore leaves the old map or the new one. A file that is not as it was written
+is moved aside under the same name with ``.broken`` and never deleted.
 
 Kept of the map in use are the two newest generations, of which one may fail, and the one that this run began with: it
 is the last that a whole run has proved, should this run spoil the map. Of every other map (RESET begins one, and each
@@ -96,8 +96,8 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
     start = store.load(judge_for(lights))
     if start is None and config.localise:
         raise NoMap(
-            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make one, "
-            "or import one: lumiloop map import"
+            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
+            "one, or import one: lumiloop map import"
         )
     if start is not None:
         meta = start.stored.meta
@@ -141,11 +141,11 @@ class Store:
 
     def generations(self) -> list[Generation]:
         """All that are there, newest first."""
-        found = []
-        with contextlib.suppress(FileNotFoundError):
-            for path in self.folder.iterdir():
-                if match := NAME.fullmatch(path.name):
-                    found.append(Generation(int(match[2]), int(match[1], 16), path))
+        try:
+            named = [(path, NAME.fullmatch(path.name)) for path in self.folder.iterdir()]
+        except FileNotFoundError:
+            return []
+        found = [Generation(int(match[2]), int(match[1], 16), path) for path, match in named if match]
         return sorted(found, key=lambda one: one.number, reverse=True)
 
     def load(self, judge: Judge = unjudged) -> Start | None:

@@ -1,7 +1,8 @@
 """Saves the map while the robot drives: on a schedule, when asked, and at the stop.
 
-The loop's thread only gathers references (`estimator.mapimage.image_of`). Packing and writing is for a thread of its own,
-which lets the loop in between slices of a fraction of a millisecond: Python's lock is held by one of them at a time.
+The loop's thread only gathers references (`estimator.mapimage.image_of`). Packing and writing is for a thread of its
+own, which lets the loop in between slices of a fraction of a millisecond: Python's lock is held by one of them at a
+time.
 """
 
 from __future__ import annotations

@@ -39,6 +39,12 @@ def warm_kernels() -> None:
 
 
 @pytest.fixture(autouse=True)
+def maps_of_its_own(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a daemon keeps from one run to the next must not reach another test, nor a person's own maps."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+
+
+@pytest.fixture(autouse=True)
 def compiled_before_the_clock_runs(request: pytest.FixtureRequest) -> None:
     """Tests of real processes in real time start warm, whichever test happens to come first."""
     if request.node.get_closest_marker("realtime") or request.node.get_closest_marker("system"):
