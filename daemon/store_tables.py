@@ -290,8 +290,9 @@ def against_survey(stored: Stored, survey: Survey) -> tuple[str, frozenset[int]]
         for what, which in (("moved", moved), ("gone", gone), ("new", new), ("of other strength", other))
         if which
     ]
-    return f"the survey has changed since, lamps {'; '.join(words) or 'of other receiver'}", frozenset(
-        moved | gone | other
+    return (
+        f"the survey has changed since, lamps {'; '.join(words) or 'none, but the receiver or the floor'}",
+        frozenset(moved | gone | other),
     )
 
 
