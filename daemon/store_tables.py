@@ -290,10 +290,8 @@ def against_survey(stored: Stored, survey: Survey) -> tuple[str, frozenset[int]]
         for what, which in (("moved", moved), ("gone", gone), ("new", new), ("of other strength", other))
         if which
     ]
-    return (
-        f"the survey has changed since, lamps {'; '.join(words) or 'none, but the receiver or the floor'}",
-        frozenset(moved | gone | other),
-    )
+    said = "; ".join(words) or "none, but the receiver or the floor"
+    return f"the survey has changed since, lamps {said}", frozenset(moved | gone | other)
 
 
 def _apart(a: Lamp, b: Lamp) -> float:

@@ -35,6 +35,7 @@ class Shape:
     loose: int = 0
     map_id: int = 0x1234
     survey: str = ""
+    lamps: tuple[Lamp, ...] = LAMPS
 
 
 def image(shape: Shape, seed: int = 0) -> MapImage:
@@ -63,9 +64,9 @@ def image(shape: Shape, seed: int = 0) -> MapImage:
         submaps=tuple(pieces),
         constraints=constraints,
         frames=tuple(frames),
-        gains={lamp.lamp_id: (rng.normal(size=3), rng.random(3) + 0.01) for lamp in LAMPS} if shape.lit else {},
+        gains={lamp.lamp_id: (rng.normal(size=3), rng.random(3) + 0.01) for lamp in shape.lamps} if shape.lit else {},
         sensors=(rng.normal(size=9), rng.random(9)) if shape.lit else None,
-        lamps=LAMPS if shape.lit else (),
+        lamps=shape.lamps if shape.lit else (),
         T_map_base=pose(rng),
         P=np.diag(rng.random(3)),
     )

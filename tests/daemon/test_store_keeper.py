@@ -1,0 +1,299 @@
+"""When a map is saved, what is answered to who asks for it, and what is said when it cannot be."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from daemon import store_keeper
+from daemon.store import Start, Store
+from daemon.store_keeper import ADRIFT, EVERY_S, FIRST_S, FIXED, NO_FOLDER, NO_MAP, RETRY_S, About, Keeper
+from daemon.store_tables import read
+from estimator.mapimage import restored
+from estimator.state import State, new_state
+from tests.daemon.mapmaker import Shape, content, image
+
+
+@dataclass
+class Clock:
+    t: float = 100.0
+
+    def now(self) -> float:
+        return self.t
+
+    def utc(self) -> float:
+        return 1.5e9 + self.t
+
+
+@dataclass
+class Bench:
+    """A keeper with everything around it in hand."""
+
+    folder: Path
+    state: State | None = field(default_factory=lambda: restored(image(Shape())))
+    about: About = field(default_factory=lambda: About("robot", "digest"))
+    start: Start | None = None
+    map_id: int = 0x77
+    clock: Clock = field(default_factory=Clock)
+    told: list[str] = field(default_factory=list)
+    kept: bool = True
+
+    def __post_init__(self) -> None:
+        self.store = Store(self.folder) if self.kept else None
+        self.keeper = Keeper(self.store, self.start, lambda: self.state, lambda: self.map_id, self.about, self.clock)
+
+    async def turn(self, seconds: float = 0.0) -> None:
+        """Let so much time go by, one beat, and whatever save it has begun."""
+        self.clock.t += seconds
+        self.keeper._go_on()
+        await asyncio.wait_for(self.keeper._over.wait(), 20.0)
+
+    def drive(self) -> None:
+        assert self.state is not None
+        self.state.next_key += 1
+        self.state.atlas.adrift = None
+
+    @property
+    def files(self) -> int:
+        return len(list(self.folder.glob("*.lumimap"))) if self.folder.is_dir() else 0
+
+
+def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(tmp_path: Path) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        await bench.turn(FIRST_S - 1.0)
+        assert bench.files == 0
+        await bench.turn(1.0)
+        assert bench.keeper.saves == 1
+        await bench.turn(2.0 * EVERY_S)
+        assert bench.keeper.saves == 1, "nothing has changed"
+        bench.drive()
+        await bench.turn(0.0)
+        assert bench.keeper.saves == 2
+        bench.drive()
+        await bench.turn(EVERY_S - 1.0)
+        assert bench.keeper.saves == 2
+        await bench.turn(1.0)
+        assert bench.keeper.saves == 3
+
+    asyncio.run(run())
+
+
+def test_what_is_saved_says_whose_it_is(tmp_path: Path) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        await bench.turn(FIRST_S)
+        start = Store(tmp_path).load()
+        assert start is not None
+        meta = start.stored.meta
+        assert (meta.map_id, meta.robot, meta.survey, meta.session) == (0x77, "robot", "digest", 1)
+        assert meta.saved == pytest.approx(1.5e9 + bench.clock.t)
+        assert bench.store is not None
+        bench.store.close()
+        later = Bench(tmp_path, about=About(), start=start)
+        later.drive()
+        await later.turn(FIRST_S)
+        again = Store(tmp_path).load()
+        assert again is not None
+        assert (again.stored.meta.session, again.stored.meta.survey) == (2, "digest")
+
+    asyncio.run(run())
+
+
+def test_done_is_said_when_it_is_on_the_disk(tmp_path: Path) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        bench.keeper.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
+        bench.keeper.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
+        assert bench.told == []
+        for _ in range(2):
+            await bench.turn()
+        assert bench.told == ["1", "2"], "the second was asked while the first was under way: it may know more"
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda bench: setattr(bench, "state", None), NO_MAP),
+        (lambda bench: setattr(bench, "state", new_state()), NO_MAP),
+        (lambda bench: bench.keeper.loaded(), ADRIFT),
+    ],
+)
+def test_what_cannot_be_saved_is_refused_with_the_reason(
+    tmp_path: Path, change: Callable[[Bench], None], reason: str
+) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path, start=Start(content(), read(content())))
+        change(bench)
+        bench.keeper.ask(bench.told.append)
+        assert bench.told == [reason]
+
+    asyncio.run(run())
+
+
+def test_without_a_folder_and_for_localisation_only_it_is_refused(tmp_path: Path) -> None:
+    async def run() -> None:
+        for bench, reason in (
+            (Bench(tmp_path, kept=False), NO_FOLDER),
+            (Bench(tmp_path, about=About(localise=True)), FIXED),
+        ):
+            bench.drive()
+            bench.keeper.ask(bench.told.append)
+            await bench.turn(10.0 * EVERY_S)
+            await bench.keeper.finish()
+            assert bench.told == [reason]
+            assert bench.files == 0
+
+    asyncio.run(run())
+
+
+def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        save = bench.store.save
+
+        def full(data: bytes, map_id: int) -> Path:
+            raise OSError(errno.EROFS, "Read-only file system")
+
+        monkeypatch.setattr(bench.store, "save", full)
+        bench.drive()
+        bench.keeper.ask(bench.told.append)
+        for _ in range(3):
+            await bench.turn(RETRY_S)
+        assert "Read-only file system" in bench.told[0]
+        assert "Read-only file system" in bench.keeper.error
+        assert caplog.text.count("the map cannot be saved") == 1
+        monkeypatch.setattr(bench.store, "save", save)
+        with caplog.at_level(logging.INFO):
+            await bench.turn(RETRY_S)
+        assert bench.keeper.error == ""
+        assert bench.keeper.saves == 1
+        assert "map saved" in caplog.text
+
+    asyncio.run(run())
+
+
+def test_a_defect_in_the_packing_is_told_in_full_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        monkeypatch.setattr(bench.keeper, "_packed", lambda image: 1 // 0)
+        await bench.turn(FIRST_S)
+        assert "ZeroDivisionError" in bench.keeper.error
+        assert "Traceback" in caplog.text
+        monkeypatch.undo()
+        await bench.turn(RETRY_S)
+        assert bench.keeper.saves == 1
+
+    asyncio.run(run())
+
+
+def test_reset_is_kept_at_once_so_that_the_old_map_does_not_come_back(tmp_path: Path) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        await bench.turn(FIRST_S)
+        bench.state, bench.map_id = new_state(), 0x78
+        await bench.turn(1.0)
+        assert bench.keeper.saves == 2
+        start = Store(tmp_path).load()
+        assert start is not None
+        assert start.stored.meta.map_id == 0x78
+        assert len(start.stored.tables["submap.key"]) == 0
+        assert bench.files == 2, "the old one stays as a map of its own"
+        await bench.turn(10.0 * EVERY_S)
+        assert bench.keeper.saves == 2
+
+    asyncio.run(run())
+
+
+def test_a_reset_that_could_not_be_kept_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        await bench.turn(FIRST_S)
+        bench.state, bench.map_id = new_state(), 0x78
+        packed = bench.keeper._packed
+        monkeypatch.setattr(bench.keeper, "_packed", lambda image: 1 // 0)
+        await bench.turn(1.0)
+        monkeypatch.setattr(bench.keeper, "_packed", packed)
+        await bench.turn(RETRY_S)
+        assert bench.keeper.saves == 2
+        assert bench.files == 2
+
+    asyncio.run(run())
+
+
+def test_a_map_just_loaded_is_not_saved_until_the_robot_knows_its_place_in_it(tmp_path: Path) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path, start=Start(content(), read(content())))
+        bench.keeper.loaded()
+        assert bench.state is not None
+        bench.state.next_key += 9
+        await bench.turn(EVERY_S)
+        await bench.keeper.finish()
+        assert bench.files == 0
+        bench.drive()
+        await bench.turn(EVERY_S)
+        assert bench.files == 1
+
+    asyncio.run(run())
+
+
+def test_at_the_stop_what_is_new_is_saved_and_the_folder_is_free(tmp_path: Path) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        await bench.keeper.finish()
+        assert bench.files == 1
+        await bench.keeper.finish()
+        assert bench.files == 1
+        Store(tmp_path).save(content(), 5)
+
+    asyncio.run(run())
+
+
+def test_a_stop_does_not_wait_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        monkeypatch.setattr(store_keeper, "STOP_S", 0.1)
+        monkeypatch.setattr(bench.keeper, "_packed", lambda image: time.sleep(0.6))
+        await bench.keeper.finish()
+        assert "the one before stays" in caplog.text
+        await asyncio.sleep(0.7)
+
+    asyncio.run(run())
+
+
+def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) -> None:
+    async def run() -> None:
+        tmp_path.joinpath("map-00000077-00000001.lumimap").write_bytes(b"x")
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        bench.store.load()
+        assert bench.keeper.refused
+        bench.drive()
+        await bench.turn(FIRST_S)
+        assert not bench.keeper.refused
+
+    asyncio.run(run())
