@@ -45,7 +45,11 @@ OTHERS: Final = 7
 
 @dataclass(frozen=True, slots=True)
 class Generation:
-    """One file."""
+    """One file.
+
+    Attributes:
+        number: counts all saves in the folder; 0: somebody has put it there. map_id: by its name; negative: not told.
+    """
 
     number: int
     map_id: int
@@ -142,10 +146,15 @@ class Store:
     def generations(self) -> list[Generation]:
         """All that are there, newest first."""
         try:
-            named = [(path, NAME.fullmatch(path.name)) for path in self.folder.iterdir()]
+            paths = sorted(self.folder.glob("*.lumimap")) if self.folder.is_dir() else []
+            if not paths and self.folder.exists():
+                os.scandir(self.folder).close()  # says why there is nothing to be seen
         except FileNotFoundError:
             return []
-        found = [Generation(int(match[2]), int(match[1], 16), path) for path, match in named if match]
+        found = []
+        for foreign, path in enumerate(paths):
+            match = NAME.fullmatch(path.name)
+            found.append(Generation(int(match[2]), int(match[1], 16), path) if match else Generation(0, ~foreign, path))
         return sorted(found, key=lambda one: one.number, reverse=True)
 
     def load(self, judge: Judge = unjudged) -> Start | None:
@@ -184,7 +193,7 @@ class Store:
     def _read(self, generation: Generation, judge: Judge) -> Start:
         content = generation.path.read_bytes()
         stored = read(content)
-        if stored.meta.map_id != generation.map_id:
+        if generation.number and stored.meta.map_id != generation.map_id:
             raise Foreign(f"it holds map {stored.meta.map_id:08x}, another than its name says")
         words, changed = judge(stored)
         if words:
@@ -269,6 +278,8 @@ class Store:
         mine = others = 0
         seen: set[int] = set()
         for generation in self.generations():
+            if generation.number == 0:
+                continue
             if generation.map_id == map_id:
                 mine += 1
                 if mine > NEWEST and generation.path != self._origin:

@@ -105,7 +105,7 @@ def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) 
     text = (
         f'name = "demo"\nbind = "127.0.0.1"\n\n'
         f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
-        f"[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\n"
+        f'[map]\nfolder = "none"\n\n[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\n'
     )
     if lights:
         text += f'\n[photodiode]\nbus = "unix:{folder / BUS}"\n\n[lights]\nsurvey = "{SURVEY}"\n'

@@ -254,3 +254,19 @@ def test_a_folder_that_cannot_be_read_is_said(tmp_path: Path, caplog: pytest.Log
         assert store.load() is None
     assert f"maps in {file} cannot be read: Not a directory; mend that, or name another `map.folder`" in caplog.text
     assert store.refused
+
+
+def test_a_map_that_somebody_has_put_there_is_loaded_where_there_is_no_other_and_never_removed(tmp_path: Path) -> None:
+    given = tmp_path / "second floor.lumimap"
+    given.write_bytes(content(seed=3))
+    store = Store(tmp_path)
+    start = store.load()
+    assert start is not None
+    assert start.content == content(seed=3)
+    for seed in range(4, 8):
+        store.save(content(seed=seed), MAP)
+    assert names(tmp_path) == [name(3), name(4), given.name]
+    store.close()
+    start = Store(tmp_path).load()
+    assert start is not None
+    assert start.content == content(seed=7)

@@ -37,7 +37,7 @@ def started(lidar: Path) -> tuple[float, float]:
 
 def _started(lidar: Path, poses: socket.socket) -> tuple[float, float]:
     receiver = f"127.0.0.1:{poses.getsockname()[1]}"
-    settings = [f"lidar.device={lidar}", "modbus.port=0", f'pose.receivers=["{receiver}"]']
+    settings = [f"lidar.device={lidar}", "modbus.port=0", "map.folder=none", f'pose.receivers=["{receiver}"]']
     command = [sys.executable, "-m", "daemon", "run", *(w for s in settings for w in ("--set", s))]
     begun = time.monotonic()
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as daemon:
