@@ -32,6 +32,8 @@ HINT_M, HINT_RAD = 1.0, 0.5
 """How far the robot may be from where a person has said that it is."""
 HINT_LOOKS: Final = 4
 """Looks after which the map says that it is not there."""
+PATIENCE_S: Final = 1.0
+"""Light is waited for so long before the whole map is searched."""
 SURPRISE: Final = 16.3
 """Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
 
@@ -81,15 +83,59 @@ def keyframe_laid(state: State, frame: Keyframe) -> None:
     atlas, told = state.atlas, state.settings.loops
     if atlas.adrift is None or told is None or atlas.seek.job in atlas.asked:
         return
+    around = windows(state, frame)
+    if around is None and light_is_coming(state):
+        return
+    atlas.seek.lit = frame.key, len(around or ())
+    look_for(state, frame, around)
+
+
+def look_for(state: State, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
+    """Hand out a look for a keyframe."""
+    atlas, told = state.atlas, state.settings.loops
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
-    if not pieces:
+    if not pieces or told is None:
         return
     seek, asked = atlas.seek, atlas.seek.alive
     guesses = tuple(se2.compose(one.T_map_odom, frame.T_odom_keyframe) for one in asked)
-    around = windows(state, frame)
     query = Query(frame, pieces, seek.terrain, guesses, seek.past, seek.due(frame), around)
     then = partial(take_look, state, seek, frame, asked)
     seek.job = atlas.ask(LOOK, partial(look, query, told), then)
+
+
+def step_done(state: State) -> None:
+    """Look again at the newest keyframe when light has come to say where it is, or says otherwise: robots may stand.
+
+    And decide, when light has become a witness since.
+    """
+    atlas, frame = state.atlas, state.keyframes.get(state.anchor)
+    if atlas.adrift is None or state.light is None or frame is None or frame.key < atlas.since:
+        return
+    seek = atlas.seek
+    if seek.job in atlas.asked or seek.hint is not None:
+        return
+    decide(state)
+    if state.atlas.adrift is None:
+        return
+    allowed = windows(state, frame)
+    if allowed is None and not (seek.looks == 0 and state.fused.t_mono - seek.t_begin > PATIENCE_S):
+        return
+    asked = frame.key, len(allowed or ())
+    if asked != seek.lit:
+        seek.lit, seek.searched = asked, None
+        look_for(state, frame, allowed)
+
+
+def light_is_coming(state: State) -> bool:
+    """Whether light may tell within a moment, so that the whole map need not be searched: it has just come on."""
+    seek = state.atlas.seek
+    if not math.isfinite(seek.t_begin):
+        seek.t_begin = state.fused.t_mono
+    if state.light is None or seek.looks or state.fused.t_mono - seek.t_begin > PATIENCE_S:
+        return False
+    from estimator import relocate_light
+
+    return relocate_light.told(state)
 
 
 def windows(state: State, frame: Keyframe) -> tuple[Around, ...] | None:
@@ -103,7 +149,7 @@ def windows(state: State, frame: Keyframe) -> tuple[Around, ...] | None:
     from estimator import relocate_light  # costs nothing where there is no photodiode
 
     lever = math.hypot(*frame.T_base_lidar[:2].tolist())
-    allowed = relocate_light.windows(state)
+    allowed = relocate_light.windows(state, se2.between(state.fused.T_odom_base, frame.T_odom_keyframe))
     return tuple(Around(np.array((one.x, one.y, 0.0)), one.reach_m + lever, math.pi) for one in allowed) or None
 
 
@@ -117,8 +163,14 @@ def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis
         T_map_odom, looks = seek.hint
         seek.hint = (T_map_odom, looks + 1) if looks + 1 < HINT_LOOKS else None
     seek.alive = tuple(one for one in seek.alive if said(state, one) is not False)
-    if len(seek.alive) == 1 and seek.sure(said(state, seek.alive[0]) is True):
-        land(state, seek.alive[0])
+    decide(state)
+
+
+def decide(state: State) -> None:
+    """Take the robot to the place that is sure, if one is."""
+    one = state.atlas.seek.favourite()
+    if one is not None and state.atlas.seek.sure(one, said(state, one) is True):
+        land(state, one)
 
 
 def said(state: State, one: Hypothesis) -> bool | None:
@@ -181,8 +233,14 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
     atlas.marginal = R @ P @ R.T
     state.P_anchor = atlas.spread(state.T_odom_anchor)
     tie = state.absolute
-    if tie is not None and tie.placed:
+    if tie is None:
+        return
+    from estimator.relocate_light import told
+
+    if tie.placed or told(state):  # the map's frame is the survey's
         tie.P, tie.X = state.P_anchor + state.fused.P, state.fused.P.copy()
+        tie.placed, tie.proved, tie.broken = True, True, False
+        tie.gap, tie.odd_since, tie.since = None, None, state.next_key
 
 
 def rehang(state: State, since: int) -> None:

@@ -31,6 +31,9 @@ IDLE: Final = 8
 MOST: Final = 32
 """Hypotheses carried at most."""
 
+BEHIND: Final = 0.15
+"""Share of the beams by which a place that was never held must fit worse than the one that was, to be no rival."""
+
 AGAIN_M, AGAIN_RAD = 1.0, 1.0
 """Way or turn after which it is searched again."""
 
@@ -72,7 +75,8 @@ class Seek:
         alive: places left. past: some earlier keyframes that were looked for. complete: the latest search was; then
             nothing but ``alive`` is left. searched: where that was (odom frame). terrain: of the latest look.
         job: ID of the look under way. looks: so far. hint: T_map_odom by a person who has said where the robot is, and
-            how many looks have not found it there.
+            how many looks have not found it there. lit: keyframe and number of light's windows of the latest look.
+        t_begin: instant of the first keyframe.
     """
 
     alive: tuple[Hypothesis, ...] = ()
@@ -83,6 +87,8 @@ class Seek:
     job: int = 0
     looks: int = 0
     hint: tuple[Array, int] | None = field(default=None)
+    lit: tuple[int, int] = (0, 0)
+    t_begin: float = math.inf
 
     def due(self, frame: Keyframe) -> bool:
         """Whether a keyframe is to be searched for, and not only looked at where it should be."""
@@ -108,13 +114,22 @@ class Seek:
         if not self.past or math.hypot(*(frame.T_odom_keyframe - self.past[-1].T_odom_keyframe)[:2].tolist()) > PAST_M:
             self.past = (*self.past, frame)[-PAST:]
 
-    def sure(self, witnessed: bool) -> bool:
-        """Whether the one place that is left is the robot's; ``witnessed``: something else than the laser says so."""
-        if len(self.alive) != 1 or not self.complete:
+    def favourite(self) -> Hypothesis | None:
+        """The only place that a look has held, if there is one and all others are well behind it."""
+        held = [one for one in self.alive if one.held]
+        if len(held) != 1:
+            return None
+        behind = [one.share < held[0].share - BEHIND for one in self.alive if one is not held[0]]
+        return held[0] if all(behind) else None
+
+    def sure(self, one: Hypothesis, witnessed: bool) -> bool:
+        """Whether a place is the robot's; ``witnessed``: something else than the laser says so.
+
+        The laser alone is believed only where nothing else is left.
+        """
+        if not self.complete or one.idle:
             return False
-        (one,) = self.alive
-        held = witnessed or (len(one.held) >= HELD and one.apart() >= HELD_M)
-        return held and bool(one.held) and one.idle == 0
+        return witnessed or (len(self.alive) == 1 and len(one.held) >= HELD and one.apart() >= HELD_M)
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

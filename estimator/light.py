@@ -9,6 +9,7 @@ from estimator.cdma_epoch import LightEpoch, SampleBlock
 from estimator.cdma_profile import PROFILE_A, Profile
 from estimator.lamps import Survey
 from estimator.lights_residual import Learned
+from estimator.lights_start import Place
 from estimator.records import Array, Imu, Odometry, Record
 from estimator.residual import ResidualMap
 from estimator.result import LightsResult
@@ -36,7 +37,7 @@ class Light:
 
     Attributes:
         setup: as given. decoder: of the photodiode's blocks. filter: see estimator/lights.py. result: after the latest
-            epoch. epoch: that epoch, None before the first.
+            epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
@@ -47,6 +48,7 @@ class Light:
         self.filter = lights.new_lights(setup.survey, corrections=learned)
         self.result = lights.result(self.filter)
         self.epoch: LightEpoch | None = None
+        self.glimpse: tuple[LightEpoch, tuple[Place, ...]] | None = None
         self._decoded = self._decoded_before = False
         self._spared = 0
 

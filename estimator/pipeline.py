@@ -52,6 +52,7 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
                 keyframe = lay_keyframe(state, record, points)
                 update_map(state, record, points)
     look_for_lamps(state, limits)
+    adrift.step_done(state)
     return report(state, match, keyframe)
 
 

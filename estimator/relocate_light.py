@@ -18,6 +18,7 @@ import numpy as np
 from estimator import se2
 from estimator.absolute import ACROSS_M, ROW_M
 from estimator.cdma_epoch import UNUSABLE
+from estimator.light import Light
 from estimator.lights_start import Place, places, probabilities
 from estimator.lights_state import Lights, Track
 from estimator.linear3 import invert3
@@ -80,12 +81,20 @@ def windows(state: State, T_base_frame: Array | None = None) -> tuple[Window, ..
     if epoch is None or lights.course.t_mono - lights.t_epoch > SILENT_S:
         return ()
     if contradicted(lights):
-        if epoch.block & UNUSABLE or len(epoch.ids) == 0:
-            return ()
-        return tuple(about(lights, place) for place in places(lights, epoch))
+        return tuple(about(lights, place) for place in glimpsed(state.light))
     if lights.result is not None and lights.result.fix is Fix.HELD:
         return ()
     return clustered(lights, se2.identity() if T_base_frame is None else T_base_frame)
+
+
+def glimpsed(light: Light) -> tuple[Place, ...]:
+    """Places at which the latest epoch fits, whatever was known before; read once."""
+    epoch = light.epoch
+    if epoch is None or epoch.block & UNUSABLE or len(epoch.ids) == 0:
+        return ()
+    if light.glimpse is None or light.glimpse[0] is not epoch:
+        light.glimpse = epoch, tuple(places(light.filter, epoch))
+    return light.glimpse[1]
 
 
 def contradicted(lights: Lights) -> bool:
@@ -177,7 +186,10 @@ def witness(state: State, T_map_base: Array) -> bool:
         return False
     assert state.light is not None
     lights = state.light.filter
-    if contradicted(lights) or lights.result is None:
+    if contradicted(lights):
+        (place,) = glimpsed(state.light)
+        return place.of - place.fits <= AGAINST * place.of
+    if lights.result is None:
         return False
     states = [link.state for link in lights.result.links]
     used = states.count(LinkState.ACCEPTED)

@@ -105,7 +105,8 @@ def test_a_robot_carried_off_is_looked_for_where_the_latest_light_came_from() ->
     (window,) = windows(state)
     assert inside(window, HERE)
     assert compatible(state, HERE) is True
-    assert not witness(state, HERE)
+    assert witness(state, HERE)
+    assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
 
 
 def test_light_that_has_gone_says_nothing() -> None:
