@@ -1,0 +1,286 @@
+"""The local stream: one unix socket from which every tap (web page, converter, logger) takes what it wants.
+
+Frames are a little-endian length and that many bytes of msgpack, a map with at least ``topic``. A client says once what
+it wants. What is the latest of its kind replaces what a slow client has not taken yet (and is counted); what happens
+once (a loop, a change of state) is kept for it, up to a bound. Nothing here waits for a client, and without clients
+nothing is encoded: a tap that hangs costs the daemon a buffer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from daemon.publish.snapshot import Snapshot
+from hal.errors import DeviceRefused
+from hal.lidar import VALID, RawScan
+
+log = logging.getLogger(__name__)
+
+SCHEMA: Final = 1
+"""Version of all that follows. A field never changes its meaning under the same number; readers skip unknown ones."""
+
+LATEST: Final = {
+    "pose": "after each cycle: the whole snapshot, with the state in words",
+    "lights": "after each cycle: what lights alone say, with every link",
+    "scan": "each scan: ranges in m as little-endian float32, not a number where there is none",
+}
+"""Topics of which a slow client gets the latest only."""
+ONCE: Final = {
+    "state": "a change of state or reason, with meaning and remedy",
+    "loop": "a loop closed: counter, both keyframes, residual, reason",
+}
+"""Topics of which a client gets every one, up to :data:`KEPT`."""
+TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE}
+
+CLIENTS: Final = 32
+KEPT: Final = 64
+BUFFER_BYTES: Final = 256 << 10
+"""Bytes that may wait in this process for one client, and one frame."""
+LONGEST_REQUEST: Final = 4096
+STUCK_S: Final = 60.0
+"""A client that has taken nothing for so long is let go."""
+
+_encode: Final = msgspec.msgpack.Encoder().encode
+_request: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
+
+
+def framed(message: Mapping[str, object]) -> bytes:
+    """One frame."""
+    body = _encode(message)
+    return len(body).to_bytes(4, "little") + body
+
+
+def scan_message(scan: RawScan) -> dict[str, object]:
+    """A scan in SI units: bearings in rad from the lidar's front axis, counter-clockwise, evenly spaced."""
+    bearing = scan.geometry.bearings(scan.first_step, scan.stride, 2)
+    valid = scan.code == VALID
+    ranges = np.where(valid, scan.ranges * scan.geometry.range_unit_m, np.nan).astype("<f4")
+    return {
+        "seq": scan.seq,
+        "t_mono": scan.t_mono,
+        "bearing_first": float(bearing[0]),
+        "bearing_step": float(bearing[1] - bearing[0]),
+        "ranges": ranges.tobytes(),
+    }
+
+
+class StreamServer:
+    """Serves the stream at a path in the file system.
+
+    Args:
+        path: of the socket; its folder is made. name: of the robot.
+        explain: meaning and remedy of a reason's number.
+    """
+
+    def __init__(self, path: Path, name: str, explain: Callable[[int], tuple[str, str]]) -> None:
+        self.path = path
+        self.clients: set[Client] = set()
+        self._name = name
+        self._explain = explain
+        self._state: tuple[int, int] | None = None
+        self._loops = 0
+
+    async def run(self) -> None:
+        """Serve until cancelled.
+
+        Raises:
+            DeviceRefused: another program serves it, or it cannot be made.
+        """
+        try:
+            listening = self._bind()
+        except OSError as error:
+            problem = error.strerror or str(error)
+            remedy = "free the path, or give write access to its folder"
+            raise DeviceRefused(f"stream {self.path}", problem, remedy) from None
+        server = await asyncio.get_running_loop().create_unix_server(lambda: Client(self), sock=listening)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            server.close()
+            for client in list(self.clients):
+                client.drop()
+            self.path.unlink(missing_ok=True)
+
+    def _bind(self) -> socket.socket:
+        """The listening socket; what a dead program has left in its place is removed."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.is_socket():
+            if _alive(self.path):
+                raise DeviceRefused(f"stream {self.path}", "another program serves it", "stop that one")
+            self.path.unlink()
+        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            listening.bind(str(self.path))
+            self.path.chmod(0o666)  # it only tells; who may reach the folder may listen
+            listening.listen(CLIENTS)
+        except OSError:
+            listening.close()
+            raise
+        return listening
+
+    def hello(self) -> dict[str, object]:
+        """What a client is told first."""
+        return {"topic": "hello", "schema": SCHEMA, "name": self._name, "pid": os.getpid(), "topics": dict(TOPICS)}
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Tell a snapshot; a sink of the cycle."""
+        if self.clients:
+            meaning, remedy = self._explain(snapshot.reason)
+            told = {"state_name": snapshot.state.name, "meaning": meaning, "remedy": remedy}
+            self._tell("pose", lambda: {**told, **_fields(snapshot)})
+            self._tell("lights", lambda: {} if snapshot.light is None else _fields(snapshot.light))
+            if (snapshot.state, snapshot.reason) != self._state:
+                self._tell("state", lambda: {"t_mono": snapshot.t_mono, "state": snapshot.state, **told})
+            if snapshot.loop_counter != self._loops:
+                self._tell("loop", lambda: _loop(snapshot))
+        self._state, self._loops = (snapshot.state, snapshot.reason), snapshot.loop_counter
+
+    def on_scan(self, scan: RawScan) -> None:
+        """Tell a scan."""
+        self._tell("scan", lambda: scan_message(scan))
+
+    def _tell(self, topic: str, data: Callable[[], Mapping[str, object]]) -> None:
+        """Encode once for all that want it."""
+        wanting = [client for client in self.clients if topic in client.wants]
+        if wanting:
+            body = _encode(data())
+            for client in wanting:
+                client.tell(topic, body)
+
+
+class Client(asyncio.Protocol):
+    """One tap.
+
+    Attributes:
+        wants: topics. replaced: frames that a newer one has replaced before it took them.
+    """
+
+    def __init__(self, server: StreamServer) -> None:
+        self.wants: frozenset[str] = frozenset()
+        self.replaced = 0
+        self._server = server
+        self._transport: asyncio.Transport | None = None
+        self._received = b""
+        self._latest: dict[str, bytes] = {}
+        self._events: deque[tuple[str, bytes]] = deque(maxlen=KEPT)
+        self._stuck: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Greet, or say that there are too many."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=BUFFER_BYTES)
+        if len(self._server.clients) >= CLIENTS:
+            self._refuse(f"{CLIENTS} clients are being served; close one")
+            return
+        self._server.clients.add(self)
+        transport.write(framed(self._server.hello()))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget it."""
+        self._server.clients.discard(self)
+        if self._stuck is not None:
+            self._stuck.cancel()
+
+    def data_received(self, data: bytes) -> None:
+        """Take requests."""
+        self._received += data
+        while len(self._received) >= 4:
+            length = int.from_bytes(self._received[:4], "little")
+            if length > LONGEST_REQUEST:
+                self._refuse(f"a request of {length} bytes; the longest is {LONGEST_REQUEST}")
+                return
+            if len(self._received) < 4 + length:
+                return
+            body, self._received = self._received[4 : 4 + length], self._received[4 + length :]
+            self._ask(body)
+
+    def pause_writing(self) -> None:
+        """It does not take what it has asked for."""
+        self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._let_go)
+
+    def resume_writing(self) -> None:
+        """It has caught up: it gets what has happened, and the latest of the rest."""
+        if self._stuck is not None:
+            self._stuck.cancel()
+            self._stuck = None
+        events, latest = list(self._events), self._latest
+        self._events.clear()
+        self._latest = {}
+        for topic, body in [*events, *latest.items()]:
+            self.tell(topic, body)
+
+    def tell(self, topic: str, body: bytes) -> None:
+        """Send, or keep for when it has caught up."""
+        if self._stuck is None and self._transport is not None:
+            head = _encode({"topic": topic, "replaced": self.replaced})
+            # a map of three with the data's bytes as they are: encoded once, whoever wants it
+            joined = b"\x83" + head[1:] + b"\xa4data" + body
+            self._transport.write(len(joined).to_bytes(4, "little") + joined)
+        elif topic in ONCE:
+            self.replaced += len(self._events) == KEPT
+            self._events.append((topic, body))
+        else:
+            self.replaced += topic in self._latest
+            self._latest[topic] = body
+
+    def drop(self) -> None:
+        """Close without waiting for it."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def _ask(self, body: bytes) -> None:
+        try:
+            wanted = _request(body).get("want")
+        except msgspec.DecodeError as error:
+            self._refuse(f"a request that is no msgpack map: {error}")
+            return
+        if not isinstance(wanted, list) or not all(isinstance(topic, str) for topic in wanted):
+            self._refuse("a request without `want`, a list of topics")
+        elif unknown := sorted(set(wanted) - set(TOPICS)):
+            self._refuse(f"no such topic: {', '.join(unknown)[:100]}; there are {', '.join(TOPICS)}")
+        else:
+            self.wants = frozenset(wanted)
+
+    def _refuse(self, text: str) -> None:
+        self.wants = frozenset()
+        if self._transport is not None:
+            self._transport.write(framed({"topic": "error", "text": text}))
+            self._transport.close()
+
+    def _let_go(self) -> None:
+        log.info("a client of the stream has taken nothing for %.0f s and is let go", STUCK_S)
+        self.drop()
+
+
+def _alive(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as sock:
+        return sock.connect_ex(str(path)) in (0, errno.EAGAIN)  # again: it is there, and has many waiting
+
+
+def _fields(record: object) -> dict[str, Any]:
+    built = msgspec.to_builtins(record)
+    assert isinstance(built, dict)
+    return built
+
+
+def _loop(snapshot: Snapshot) -> dict[str, object]:
+    return {
+        "t_mono": snapshot.t_mono,
+        "counter": snapshot.loop_counter,
+        "keyframe_new": snapshot.loop_new,
+        "keyframe_old": snapshot.loop_old,
+        "reason": snapshot.loop_reason,
+        "residual": snapshot.loop_residual,
+    }

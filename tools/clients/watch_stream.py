@@ -1,0 +1,71 @@
+"""Watch what a lumiloop on this computer says on its local stream. Needs `msgpack` or `msgspec`, nothing of lumiloop.
+
+    python watch_stream.py SOCKET [TOPIC...]        topics: pose, lights, scan, state, loop
+
+Written from docs/stream.md alone, so it can be copied into any program.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+try:
+    from msgspec.msgpack import decode, encode
+except ImportError:
+    from msgpack import packb as encode  # type: ignore[import-not-found, no-redef]  # either will do
+    from msgpack import unpackb as decode  # type: ignore[no-redef]
+
+
+def frames(sock: socket.socket) -> Iterator[dict[str, Any]]:
+    """Every frame until the daemon closes."""
+    file = sock.makefile("rb")
+    while len(head := file.read(4)) == 4:
+        body = file.read(struct.unpack("<I", head)[0])
+        yield decode(body)
+
+
+def ask(sock: socket.socket, topics: list[str]) -> None:
+    """Say what is wanted; may be said again at any time."""
+    body = encode({"want": topics})
+    sock.sendall(struct.pack("<I", len(body)) + body)
+
+
+def line_of(topic: str, data: dict[str, Any]) -> str:
+    """One line for a person."""
+    if topic == "pose":
+        pose = data["pose"]
+        where = "no pose" if pose is None else f"x {pose[0]:.3f} m, y {pose[1]:.3f} m, yaw {pose[2]:.4f} rad"
+        return f"{data['t_mono']:.3f} {data['state_name']:10s} {where}"
+    if topic == "scan":
+        ranges = struct.unpack(f"<{len(data['ranges']) // 4}f", data["ranges"])
+        seen = [r for r in ranges if r == r]
+        nearest = min(seen, default=0.0)
+        return f"{data['t_mono']:.3f} scan {data['seq']}: {len(seen)} of {len(ranges)} beams, nearest {nearest:.2f} m"
+    return f"{topic}: {data}"
+
+
+def main() -> int:
+    """Print frames until interrupted."""
+    if len(sys.argv) < 2:
+        print(__doc__)
+        return 2
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.connect(sys.argv[1])
+        ask(sock, sys.argv[2:] or ["pose", "state", "loop"])
+        for frame in frames(sock):
+            if frame["topic"] in ("hello", "error"):
+                print(frame, flush=True)
+            else:
+                print(line_of(frame["topic"], frame["data"]), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)
