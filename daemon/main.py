@@ -14,7 +14,7 @@ import secrets
 import signal
 import time
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -34,7 +34,7 @@ from daemon.notify import notify
 from daemon.photodiode import AdcMaker, BlockWatch, make_adc
 from daemon.publish.snapshot import Snapshot, State
 from daemon.realtime import claim
-from daemon.sampleclock import SampleClock
+from daemon.sampleclock import SampleClock, runtime_folder
 from daemon.store import NoMap, Start, Store, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
@@ -118,6 +118,7 @@ class World:
         lights: survey and sample clock; None: as configured, and a sample clock that is to be found.
         sample_clock: keeps the sample clock; None: it is not kept.
         store: keeps maps; None: they are not kept. start: the map that the run begins with.
+        stream: path of the local stream; None: there is none.
     """
 
     clock: Clock
@@ -135,6 +136,7 @@ class World:
     sample_clock: SampleClock | None = None
     store: Store | None = None
     start: Start | None = None
+    stream: Path | None = None
 
 
 class Daemon:
@@ -178,7 +180,7 @@ class Daemon:
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
         on_samples = self.pacemaker.on_samples
         self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
-        self.network = Network(settings, world.clock, self._feeds())
+        self.network = Network(settings, world.clock, self._feeds(), world.stream)
         self.cycle.parts.sinks += [*self.network.sinks, *world.sinks, _FirstPose()]
         self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle))
         self.cycle.parts.fault = self.heartbeat.fault
@@ -231,13 +233,18 @@ class Daemon:
 
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
-        parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._on_scan)}
+        parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._take_scan)}
         if self._world.store is not None:
             parts["map"] = self.keeper.run
         if (adc := self.adc) is not None:
             parts["photodiode"] = lambda: adc.run(self._on_samples)
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
+
+    def _take_scan(self, scan: RawScan) -> None:
+        self._on_scan(scan)
+        if self.network.stream is not None:
+            self.network.stream.on_scan(scan)
 
     def _feeds(self) -> Feeds:
         inbox, recorder = self.cycle.inbox, self._recorder
@@ -328,10 +335,10 @@ def main(args: argparse.Namespace) -> int:
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
-    log.info("%s", _whereabouts(settings, args.record))
     recorder = None
     try:
         world = _world(settings)
+        log.info("%s", _whereabouts(settings, args.record, world.stream))
         if args.record is not None:
             from daemon.record import Recorder
 
@@ -348,21 +355,23 @@ def main(args: argparse.Namespace) -> int:
 
 def _world(settings: Config) -> World:
     """The real one, with what is stored and surveyed of map and lights; raises `SurveyError` and `NoMap`."""
+    stream = runtime_folder() / f"{settings.name}.stream"
     if not settings.photodiode.fitted:
         store, start = started(settings.map, None)
-        return World(SystemClock(), store=store, start=start)
-    sample_clock = SampleClock(settings.photodiode)
-    lights = load_lights(settings, sample_clock.ppm)
+        return World(SystemClock(), store=store, start=start, stream=stream)
+    clock = SampleClock(settings.photodiode)
+    lights = load_lights(settings, clock.ppm)
     store, start = started(settings.map, lights)
-    warm = partial(warm_up, lights=lights)
-    return World(SystemClock(), warm_up=warm, lights=lights, sample_clock=sample_clock, store=store, start=start)
+    world = World(SystemClock(), store=store, start=start, stream=stream)
+    return replace(world, warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=clock)
 
 
-def _whereabouts(settings: Config, record: Path | None) -> str:
+def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> str:
     """One line for the person at the terminal: where the pose can be read, what is kept, how to stop."""
     modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
     said = [modbus if settings.modbus.port else "no Modbus"]
     said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
+    said += [f"stream {stream}"] if stream is not None else []
     said += [f"recording into {record}"] if record is not None else []
     return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 

@@ -9,6 +9,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from daemon.config import Config
 from daemon.cycle import Sink
 from daemon.publish.snapshot import Snapshot
+from daemon.state import REASONS, Reason
 from estimator.records import Command, Order
 from hal.clock import Clock
 from hal.imu import RawImu
@@ -24,6 +26,7 @@ from hal.odometry import RawOdometry
 if TYPE_CHECKING:
     from daemon.publish.holding import Request
     from daemon.publish.modbus import ModbusPublisher
+    from daemon.publish.stream import StreamServer
 
 log = logging.getLogger(__name__)
 
@@ -73,10 +76,10 @@ class Network:
     """Everything that listens or sends.
 
     Attributes:
-        sinks: take every snapshot. parts: by name, for the supervisor.
+        sinks: take every snapshot. parts: by name, for the supervisor. stream: the local one, None: there is none.
     """
 
-    def __init__(self, settings: Config, clock: Clock, feeds: Feeds) -> None:
+    def __init__(self, settings: Config, clock: Clock, feeds: Feeds, stream: Path | None = None) -> None:
         self.sinks: list[Sink] = []
         self.parts: dict[str, Run] = {}
         self._settings = settings
@@ -91,6 +94,9 @@ class Network:
             self._add_pose()
         if settings.odometry.port:
             self._add_inputs()
+        self.stream: StreamServer | None = None
+        if stream is not None:
+            self._add_stream(stream)
 
     def _add_modbus(self) -> None:
         from daemon.publish.modbus import ModbusPublisher
@@ -113,6 +119,14 @@ class Network:
         sender = PoseSender(self._settings.pose.receivers)
         self.sinks.append(sender.publish)
         self.parts["pose"] = lambda: _open(sender.start, sender.close)
+
+    def _add_stream(self, path: Path) -> None:
+        from daemon.publish.stream import StreamServer
+
+        server = StreamServer(path, self._settings.name, lambda reason: REASONS[Reason(reason)])
+        self.stream = server
+        self.sinks.append(server.publish)
+        self.parts["stream"] = server.run
 
     def _add_inputs(self) -> None:
         from hal.inputs import InputPort

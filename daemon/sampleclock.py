@@ -33,6 +33,14 @@ def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
     return Path(home) / "lumiloop"
 
 
+def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where sockets are: the service manager's RuntimeDirectory, else the user's own, else beside what is learned."""
+    if named := environment.get("RUNTIME_DIRECTORY", "").partition(":")[0]:
+        return Path(named)
+    user = environment.get("XDG_RUNTIME_DIR", "")
+    return Path(user) / "lumiloop" if user else state_folder(environment)
+
+
 class SampleClock:
     """The stored sample clock of one converter.
 

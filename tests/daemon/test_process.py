@@ -195,3 +195,22 @@ def test_a_recording_is_made_beside(tmp_path: Path) -> None:
     compared = json.loads((out / "summary.json").read_text())["recorded_run"]
     assert compared["cycles"] > 50
     assert compared["differ"] == 0, compared["first_difference"]
+
+
+def test_a_tap_on_this_computer_gets_poses_and_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = tmp_path / "lidar"
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    client = str(ROOT / "tools/clients/watch_stream.py")
+    with fake_lidar(link), running(link) as daemon:
+        daemon.until(PATIENCE_S, "state", State.MAPPING, State.TRACKING)
+        command = [sys.executable, client, str(tmp_path / "lumiloop" / "lumiloop.stream"), "pose", "scan"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as tap:
+            assert tap.stdout is not None
+            lines = [tap.stdout.readline() for _ in range(9)]
+            tap.terminate()
+        assert "'schema': 1" in lines[0]
+        assert sum(" scan " in line and "of 1081 beams" in line for line in lines) >= 3
+        assert sum("MAPPING" in line or "TRACKING" in line for line in lines) >= 3
+        assert not daemon.process.poll()
+        daemon.stop()
+    assert not (tmp_path / "lumiloop" / "lumiloop.stream").exists()
