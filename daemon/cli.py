@@ -129,11 +129,26 @@ def _status(parser: argparse.ArgumentParser) -> None:
 
 def _map(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    export = verbs.add_parser("export", help="write map.pgm, map.yaml and map.png")
-    export.add_argument("log", type=Path, metavar="LOG", help="a log or a recording to take the map from")
+    export = verbs.add_parser("export", help="write a map as other programs read it")
+    export.add_argument("log", type=Path, metavar="SOURCE", help="a map file, *.lumimap; or a log or a recording")
     export.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the files")
+    export.add_argument("--pgm", action="store_true", help="map.pgm, map.yaml, map.png; what is written by default")
+    export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
+    export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
     _config_arguments(export)
     export.set_defaults(body=_estimating("daemon.export", "main"))
+    taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
+    taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
+    taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
+    taken.add_argument("--out", type=Path, metavar="FILE", help="default: the configured folder of maps")
+    _config_arguments(taken)
+    taken.set_defaults(body=_estimating("daemon.mapfile", "take_in", "warm-plan"))
+    render = verbs.add_parser("render", help="draw a map file as a picture")
+    render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
+    _config_arguments(render)
+    render.set_defaults(body=_estimating("daemon.mapfile", "render", "warm-plan"))
+    _map_changes(verbs)
     info = verbs.add_parser("info", help="say what a map file holds")
     info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     info.add_argument("--json", action="store_true", help="machine-readable output")
@@ -141,6 +156,18 @@ def _map(parser: argparse.ArgumentParser) -> None:
     verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
     verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
     verify.set_defaults(body=_loaded("daemon.store_cli", "verify"))
+
+
+def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    align = verbs.add_parser("align", help="move a map so that points of it lie where they should")
+    align.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    align.add_argument("--point", action="append", default=[], metavar="X,Y=X',Y'", help="from, to, in m; two or more")
+    name = verbs.add_parser("name", help="say which floor or building a map is of")
+    name.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    name.add_argument("text", metavar="NAME", help="at most 64 characters")
+    for parser, verb in ((align, "align"), (name, "name")):
+        parser.add_argument("--out", type=Path, metavar="FILE", help="default: the next generation beside FILE")
+        parser.set_defaults(body=_loaded("daemon.mapstore", verb))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _RGB: Final = 2
 _UP: Final = 2
 
@@ -24,7 +24,7 @@ def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
     lines[:, 1:] = (pixels - above).reshape(rows, -1)
     head = struct.pack(">IIBBBBB", columns, rows, 8, _RGB, 0, 0, 0)
     data = zlib.compress(lines.tobytes(), 6)
-    return _SIGNATURE + _chunk(b"IHDR", head) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
+    return SIGNATURE + _chunk(b"IHDR", head) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

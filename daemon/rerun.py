@@ -6,6 +6,7 @@ import math
 import time
 from array import array
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from daemon.ledger import Ledger
 from daemon.lights import Lights, new_state
 from daemon.photodiode import BlockWatch
 from daemon.record import CycleEntry, light_of
+from daemon.results import finest
 from daemon.sources import Event, Source, Turn
 from daemon.store import Start
 from daemon.worker import CycleWorker, ScheduledWorker
@@ -33,9 +35,6 @@ from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
     from daemon.matchjournal import MatchJournal
-
-RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
-"""Metres per cell of an exported map: the finest that the map's extent allows."""
 
 
 class ReplayClock:
@@ -170,13 +169,8 @@ class Rerun:
         self.ledger.settle(pipeline.keyframe_poses(self._state))
 
     def render(self) -> Grid:
-        """The map at the finest resolution of :data:`RESOLUTIONS_M` that its extent allows."""
-        for resolution in RESOLUTIONS_M[:-1]:
-            try:
-                return pipeline.render_map(self._state, resolution)
-            except ValueError:
-                continue
-        return pipeline.render_map(self._state, RESOLUTIONS_M[-1])
+        """The map at the finest resolution that its extent allows."""
+        return finest(partial(pipeline.render_map, self._state))
 
     def image(self, identity: Identity) -> MapImage:
         """The map as it is kept on a disk."""

@@ -6,7 +6,7 @@ Each file appears whole or not at all: it is written beside its place and moved 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.mapimage import draw
+from daemon import mapimage
 from daemon.png import encode_png
 from estimator.grid import Grid
 from estimator.records import Array
@@ -22,6 +22,9 @@ from estimator.records import Array
 OCCUPIED: Final = 0.65
 FREE: Final = 0.196
 """map_server's trinary thresholds; 205 reads as 0.19608, just above FREE, so that unknown stays unknown."""
+
+RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
+"""Metres per cell of an exported map."""
 
 _PROBE: Final = ".lumiloop-probe"
 _UNKNOWN_GREY: Final = 205
@@ -104,6 +107,16 @@ def tum(trajectory: Trajectory) -> bytes:
     return (_TUM_HEAD + "".join(lines)).encode()
 
 
+def finest(draw: Callable[[float], Grid]) -> Grid:
+    """The map at the finest of :data:`RESOLUTIONS_M` that its extent allows: ``draw`` raises `ValueError` beyond."""
+    for resolution in RESOLUTIONS_M[:-1]:
+        try:
+            return draw(resolution)
+        except ValueError:
+            continue
+    return draw(RESOLUTIONS_M[-1])
+
+
 def greys(grid: Grid) -> npt.NDArray[np.uint8]:
     """Trinary pixels of a map, top row (largest y) first: 0 occupied, 254 free, 205 unknown."""
     probability = grid.probability[::-1]
@@ -142,5 +155,5 @@ def map_files(grid: Grid, path: Array, lamps: Array | None = None) -> list[tuple
     return [
         ("map.pgm", pgm(grid)),
         ("map.yaml", map_yaml(grid, "map.pgm")),
-        ("map.png", encode_png(draw(grid, path, lamps))),
+        ("map.png", encode_png(mapimage.draw(grid, path, lamps))),
     ]

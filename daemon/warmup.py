@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 ROOM: Final = Path(__file__).resolve().parents[1] / "estimator"
 LIGHT: Final = ("cdma", "codes", "ekf", "light", "links", "optics", "residual")
 """Beginnings of the names of files that are loaded only where there is a photodiode."""
-OFFLINE: Final = ("calibrate", "survey")
+OFFLINE: Final = ("calibrate", "floorplan", "survey")
 """Of those that no daemon loads."""
 TIMED_CODES: Final = 129
 TIMED_TURNS: Final = 5

@@ -1,0 +1,117 @@
+"""``lumiloop map export|render|import``: a map file as other programs read it, and one made of what they wrote."""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from daemon import cli
+from daemon.carmenfile import carmen
+from daemon.mapimage import draw
+from daemon.mapserver import BadMapServer, load
+from daemon.mapstore import keep, opened
+from daemon.png import encode_png
+from daemon.results import Folder, OutputRefused, Trajectory, finest, map_yaml, pgm, tum
+from daemon.store_file import BadMap
+from daemon.store_image import image_from, meta_of, packed
+from daemon.versions import versions
+from daemon.wholefile import write_whole
+from estimator import se2
+from estimator.floorplan import image_of_cells
+from estimator.grid import Grid
+from estimator.keyframe import Keyframe, Submap
+from estimator.livemap import at_once
+from estimator.mapimage import Identity, MapImage, finished
+from estimator.records import Array
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write what is asked for of a map file; returns the exit code."""
+    try:
+        image = image_from(opened(args.log))
+        folder = Folder(args.out)
+        frames = placed(image)
+        if args.pgm or not (args.tum or args.carmen):
+            grid = grid_of(image)
+            picture = encode_png(draw(grid, np.zeros((0, 3)), lamps_of(image)))
+            files = [("map.pgm", pgm(grid)), ("map.yaml", map_yaml(grid, "map.pgm")), ("map.png", picture)]
+            folder.write_each(files)
+        if args.tum:
+            stamps = np.array([frame.key for frame, _ in frames], dtype=np.float64)
+            folder.write("keyframes.tum", tum(Trajectory(stamps, np.array([T for _, T in frames]).reshape(-1, 3))))
+        if args.carmen:
+            scans = ((frame.key, T, frame.T_base_lidar, frame.beams()) for frame, T in frames)
+            folder.write("keyframes.clf", carmen(scans))
+    except (BadMap, OutputRefused, OSError) as error:
+        return cli.fail(str(error))
+    return cli.OK
+
+
+def render(args: argparse.Namespace) -> int:
+    """Draw a map file as a picture; returns the exit code."""
+    try:
+        image = image_from(opened(args.map))
+        pixels = draw(grid_of(image), np.zeros((0, 3)), lamps_of(image))
+        Folder(args.out.parent).write(args.out.name, encode_png(pixels))
+    except (BadMap, OutputRefused, OSError) as error:
+        return cli.fail(str(error))
+    return cli.OK
+
+
+def take_in(args: argparse.Namespace) -> int:
+    """Make a map file of one of map_server's; returns the exit code."""
+    try:
+        described, cells = load(args.yaml)
+        identity = Identity(1 + secrets.randbelow(2**32 - 1), (args.name or args.yaml.stem)[:64])
+        origin = np.array(described.origin)
+        image = image_of_cells(cells, described.resolution, origin, identity)
+        content = packed(image, meta_of(image, time.time(), "", versions()["lumiloop"]))
+        if args.out is None:
+            path = keep(args.settings, content, identity.map_id)
+        else:
+            path = args.out
+            write_whole(path, content)
+    except (BadMapServer, BadMap) as error:
+        return cli.fail(str(error))
+    except ValueError as error:
+        return cli.fail(f"{args.yaml}: {error}")
+    except OSError as error:
+        return cli.fail(f"the map cannot be written: {error}; name another place with --out FILE")
+    wide, tall = cells.shape[1] * described.resolution, cells.shape[0] * described.resolution
+    sys.stdout.write(f"{path}: map {identity.map_id:08x} of {wide:.1f} x {tall:.1f} m, {len(image.submaps)} submaps\n")
+    return cli.OK
+
+
+def placed(image: MapImage) -> list[tuple[Keyframe, Array]]:
+    """Keyframes with T_map_keyframe, by number."""
+    places = {piece.key: piece.T_map_submap for piece in image.submaps}
+    found = [(hung.frame, se2.compose(places[hung.submap], hung.T_submap_keyframe)) for hung in image.keyframes()]
+    return sorted(found, key=lambda one: one[0].key)
+
+
+def pieces_of(image: MapImage) -> Iterator[tuple[Submap, list[Keyframe]]]:
+    """Submaps, oldest first, with what hangs on each."""
+    hung: dict[int, list[Keyframe]] = {}
+    for one in image.keyframes():
+        hung.setdefault(one.submap, []).append(one.frame)
+    for piece in image.submaps:
+        if piece.key in hung:
+            yield Submap(*piece), hung[piece.key]
+
+
+def grid_of(image: MapImage) -> Grid:
+    """The map at the finest resolution that its extent allows."""
+    return finest(partial(at_once, list(pieces_of(finished(image)))))
+
+
+def lamps_of(image: MapImage) -> Array | None:
+    """(k, 2) places of the lamps; None where the map does not lie in their frame."""
+    if not image.identity.surveyed or not image.lamps:
+        return None
+    return np.array([(lamp.x, lamp.y) for lamp in image.lamps])
