@@ -262,6 +262,7 @@ class Atlas:
         self.since_look += 1
         self.give_up()
         if frame.virtual is not None:
+            frame.submap.lamps |= frame.virtual.accepted
             T_keyframe_submap = se2.between(T, frame.submap.T_odom_submap)
             P_map = se2.carry(frame.virtual.T_map_base, T_keyframe_submap, frame.virtual.covariance)
             if frame.submap.light is None or np.trace(P_map) < np.trace(frame.submap.light[1]):

@@ -17,7 +17,7 @@ from estimator import livemap, se2
 from estimator.atlas import LOOK, SOLVE, Atlas, Ints, Waiting
 from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
-from estimator.loop import Candidate, Found, LoopSettings, look
+from estimator.loop import Candidate, Found, LoopSettings, look, told_by_light
 from estimator.mapframe import move_map
 from estimator.posegraph import UPPER, Graph, Solution, optimise
 from estimator.records import Answer, Array
@@ -85,7 +85,8 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
     made = []
     for _, key, submap, settled in near[: told.candidates]:
         R = se2.rotation(-submap.T_map_submap[2])
-        made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T))
+        said = told_by_light(frame, submap, told)
+        made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T, said))
     return tuple(made)
 
 
@@ -105,7 +106,8 @@ def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found)
     if found.key not in atlas.submaps or frame.submap.key not in atlas.submaps:
         return
     x, y, yaw = found.moved.tolist()
-    if math.hypot(x, y) > told.supported_m or abs(yaw) > told.supported_rad:
+    far = math.hypot(x, y) > told.supported_m or abs(yaw) > told.supported_rad
+    if far and found.reason is not LoopReason.LIT:  # there light is the second witness
         T_found_odom = se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe))
         one = Waiting(found, frame, T_found_odom)
         friends = [other for other in atlas.waiting if agree(atlas, told, one, other)]
@@ -168,11 +170,11 @@ def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
     edges = np.searchsorted(keys, joined.between)
     if not lit(state):
         return Graph(poses, edges, joined.T, joined.information, joined.loop)
-    anchored, at, certainty = told_by_light(state, atlas, keys)
+    anchored, at, certainty = anchors(state, atlas, keys)
     return Graph(poses, edges, joined.T, joined.information, joined.loop, anchored, at, certainty)
 
 
-def told_by_light(state: State, atlas: Atlas, keys: Ints) -> tuple[Ints, Array, Array]:
+def anchors(state: State, atlas: Atlas, keys: Ints) -> tuple[Ints, Array, Array]:
     """Absolute constraints: what light said at earlier submaps, and where the pose holds the newest."""
     newest, tie = atlas.newest, state.absolute
     assert newest is not None

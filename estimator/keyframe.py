@@ -46,6 +46,7 @@ class Submap:
         T_map_submap: follows every correction of the map. T_odom_submap: where it was laid, never changes.
         way_m: driven until there. settled: what it consists of, once it is finished.
         light: its place by what light alone said at its surest keyframe, with the covariance; None without.
+        lamps: IDs of the lamps used at any of its keyframes (the paper's S_M, of this stretch).
         into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
         hung: those that lie in this one and that something still hangs on.
     """
@@ -57,6 +58,7 @@ class Submap:
     way_m: float = 0.0
     settled: Settled | None = None
     light: tuple[Array, Array] | None = None
+    lamps: frozenset[int] = frozenset()
     into: tuple[Submap, Array] | None = None
     hung: WeakSet[Submap] = field(default_factory=WeakSet)
 

@@ -1,19 +1,24 @@
 """Scan to map (Sect. 4.3): whether a keyframe has been at the place of an earlier submap before, and how sure that is.
 
-A loop is accepted on overlap (the share of beams that fit), on what speaks against it (beams that look through the
-map, points that hang in free space), on rank (no axis may be left open) and on the residual. Where the pose is vague a
-wide search offers several places: if two of them are accepted, nothing is closed.
+Step 2 of the paper, where enough links are clear: the lamps in view must be among those of the submap (`IDS`), and what
+light alone said of both places must agree with the match (`LIGHT`). Where they are not, registration is by laser only.
+Step 3: data association by the matcher, and then the threshold on the residual (`SSE`), the share of beams that fit
+(`OVERLAP`), what speaks against it (`AGAINST`: beams that look through the map, points that hang in free space), no
+axis left open (`RANK`), and the place where it was expected (`PLACE`). Where the pose is vague a wide search offers
+several places: if two of them pass, nothing is closed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final
 
 import numpy as np
 
 from estimator import se2
 from estimator.globalsearch import Around, SearchSettings, field_of, search
-from estimator.keyframe import Keyframe
+from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
 from estimator.localmap import LocalMap, contradicted
 from estimator.matching import MatchSettings, Prior, View, match
@@ -22,12 +27,34 @@ from estimator.result import LoopReason, MatchResult
 from estimator.scanpoints import oriented
 from estimator.submap import Settled, points_of_frame
 
+DOUBT: Final = 2.0
+"""By how much the variance of a position from light is raised: its errors hang together farther than it knows."""
+
+BLURRED: Final = np.diag((0.05**2, 0.05**2, 0.02**2))
+"""Covariance of what stamps, lever arms and the bending of a submap make of the difference of two places by light."""
+
+
+class Condition(Enum):
+    """A judgement that a loop has to pass; any subset may be asked for (`LoopSettings.conditions`)."""
+
+    IDS = "the lamps in view are among those of the submap"
+    LIGHT = "what light alone said of both places agrees with the match"
+    PLACE = "it lies within five deviations of where it was expected"
+    SSE = "the beams that fit, fit closely"
+    OVERLAP = "most of the beams fit"
+    AGAINST = "next to nothing speaks against it"
+    RANK = "no axis is left open"
+
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
     """When a loop is one.
 
     Attributes:
+        conditions: which judgements are made at all; what follows says how strict each is.
+        links: how many links must be clear for light to have a say (Link_n).
+        light: largest squared Mahalanobis distance (3 degrees of freedom; 16.3 is 99.9 %) between the match and what
+            light alone says. place: the same between the match and the expected place.
         sse_m: largest root mean square distance of the fitting beams from the map's surfaces (the paper's threshold).
         share: least share of the beams that fit. against: largest share of the evidence that speaks against.
         extra_m, extra_rad: errors of a match that its own covariance does not know: bent submaps, moved furniture.
@@ -40,6 +67,10 @@ class LoopSettings:
             well as this.
     """
 
+    conditions: frozenset[Condition] = frozenset(Condition)
+    links: int = 4
+    light: float = 16.3
+    place: float = 25.0
     sse_m: float = 0.06
     share: float = 0.7
     against: float = 0.05
@@ -59,13 +90,31 @@ class LoopSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What light alone, at keyframe and submap, says of the one seen from the other.
+
+    Attributes:
+        T_submap_keyframe, P: where, with the covariance (3x3, axes of the submap). shared: whether all lamps in view of
+            the keyframe are known in the submap.
+    """
+
+    T_submap_keyframe: Array
+    P: Array
+    shared: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A submap in which the keyframe may be seen again: where, with the covariance of that guess (3x3, its axes)."""
+    """A submap in which the keyframe may be seen again: where, with the covariance of that guess (3x3, its axes).
+
+    ``told``: by light, None where it is paused or has never seen the submap.
+    """
 
     key: int
     submap: Settled
     T_submap_keyframe: Array
     P: Array
+    told: Told | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +124,8 @@ class Found:
     Attributes:
         T_submap_keyframe: where; P: covariance (3x3, axes of the submap). share, against, residual_m: how well.
         moved: (x, y, yaw) from where it was expected, in the keyframe's axes. reason: which conditions it passed.
+        known: whether no axis is open. off: squared Mahalanobis distance from the expected place; light: from what
+            light says, None where it says nothing. shared: as of `Told`.
     """
 
     key: int
@@ -85,6 +136,10 @@ class Found:
     residual_m: float
     moved: Array
     reason: LoopReason = LoopReason.NEAR
+    known: bool = True
+    off: float = 0.0
+    light: float | None = None
+    shared: bool = True
 
 
 def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
@@ -95,25 +150,39 @@ def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSetti
 
 def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Found | None:
     """Look for a keyframe in one submap."""
+    found = the_one([one for one in judged(frame, candidate, settings) if passed(one, settings)], settings)
+    if found is None:
+        return None
+    lit = found.light is not None and {Condition.IDS, Condition.LIGHT} <= settings.conditions
+    if lit:
+        return replace(found, reason=LoopReason.LIT)
+    return replace(found, reason=LoopReason.SEARCHED) if unsure(candidate.P, settings) else found
+
+
+def judged(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> list[Found]:
+    """All places of a submap that a matcher takes the keyframe to, with what is known about each: not yet loops."""
     sigma = candidate.submap.sigma
     points = points_of_frame(frame, sigma)
     if len(points.xy) < MatchSettings().min_points or len(candidate.submap.elements) < MatchSettings().min_points:
-        return None
+        return []
     starts = [candidate.T_submap_keyframe]
-    deviation = np.sqrt(np.diag(candidate.P))
-    if float(np.hypot(*deviation[:2])) > settings.sure_m or deviation[2] > settings.sure_rad:
+    if unsure(candidate.P, settings):
         starts += wide(frame, points.xy, candidate, settings)
     local = candidate.submap.local()
     view = View(oriented(points, settings.points), frame.T_base_lidar, frame.beams(), sigma)
     loose = np.diag((settings.sure_m**-2, settings.sure_m**-2, settings.sure_rad**-2))
     results = [match(view, local, Prior(start, loose), 60, MatchSettings()) for start in starts]
-    found = the_one([judged(view, local, result, candidate, settings) for result in results], settings)
-    return found if found is None or len(starts) == 1 else replace(found, reason=LoopReason.SEARCHED)
+    return [judgement(view, local, result, candidate, settings) for result in results if result.ok]
 
 
-def the_one(judgements: list[Found | None], settings: LoopSettings) -> Found | None:
-    """The best of several that fit, None where two of them are different places: which one cannot be told."""
-    fit = [found for found in judgements if found is not None]
+def unsure(P: Array, settings: LoopSettings) -> bool:
+    """Whether a guess is too vague for the matcher alone."""
+    deviation = np.sqrt(np.diag(P))
+    return bool(np.hypot(*deviation[:2]) > settings.sure_m or deviation[2] > settings.sure_rad)
+
+
+def the_one(fit: list[Found], settings: LoopSettings) -> Found | None:
+    """The best of several that passed, None where two of them are different places: which one cannot be told."""
     if not fit:
         return None
     best = max(fit, key=lambda found: found.share)
@@ -124,25 +193,59 @@ def the_one(judgements: list[Found | None], settings: LoopSettings) -> Found | N
     return best
 
 
-def judged(
-    view: View, local: LocalMap, result: MatchResult, candidate: Candidate, settings: LoopSettings
-) -> Found | None:
-    """The match as a loop, if it is one."""
-    share = result.inliers / max(1, result.queries)
-    if not result.ok or not result.known_axes.all() or share < settings.share or result.residual_m > settings.sse_m:
-        return None
-    T = result.T_odom_base
+def judgement(view: View, local: LocalMap, result: MatchResult, candidate: Candidate, settings: LoopSettings) -> Found:
+    """What there is to say about a match."""
+    T, told = result.T_odom_base, candidate.told
     against = contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m)
-    if against > settings.against:
-        return None
     extra = np.diag((settings.extra_m**2, settings.extra_m**2, settings.extra_rad**2))
     P = invert3(result.information) + extra
-    moved = se2.between(candidate.T_submap_keyframe, T)
-    R = se2.rotation(candidate.T_submap_keyframe[2])
-    off = R @ moved
-    if float(off @ invert3(candidate.P + P) @ off) > 25.0:
+    return Found(
+        candidate.key,
+        T,
+        P,
+        result.inliers / max(1, result.queries),
+        against,
+        result.residual_m,
+        se2.between(candidate.T_submap_keyframe, T),
+        known=bool(result.known_axes.all()),
+        off=distance(candidate.T_submap_keyframe, T, candidate.P + P),
+        light=None if told is None else distance(told.T_submap_keyframe, T, told.P + P),
+        shared=told is None or told.shared,
+    )
+
+
+def distance(T_from: Array, T_to: Array, P: Array) -> float:
+    """Squared Mahalanobis distance of two places, ``P`` in the axes that both are given in."""
+    off = se2.rotation(T_from[2]) @ se2.between(T_from, T_to)
+    return float(off @ invert3(P) @ off)
+
+
+def passed(found: Found, settings: LoopSettings) -> bool:
+    """Whether a judgement makes a loop."""
+    verdict = {
+        Condition.IDS: found.shared,
+        Condition.LIGHT: found.light is None or found.light <= settings.light,
+        Condition.PLACE: found.off <= settings.place,
+        Condition.SSE: found.residual_m <= settings.sse_m,
+        Condition.OVERLAP: found.share >= settings.share,
+        Condition.AGAINST: found.against <= settings.against,
+        Condition.RANK: found.known,
+    }
+    return all(verdict[condition] for condition in settings.conditions)
+
+
+def told_by_light(frame: Keyframe, submap: Submap, settings: LoopSettings) -> Told | None:
+    """Step 2 of Sect. 4.3: None where too few links are clear, which leaves the registration to the laser."""
+    virtual = frame.virtual
+    if virtual is None or submap.light is None or len(virtual.accepted) < settings.links:
         return None
-    return Found(candidate.key, T, P, share, against, result.residual_m, moved)
+    T_map_submap, P_submap = submap.light
+    T = se2.between(T_map_submap, virtual.T_map_base)
+    # an error of the submap's heading moves the keyframe sideways, seen from the submap
+    R = se2.rotation(-T_map_submap[2])
+    lever = np.array(((1.0, 0.0, -T[1]), (0.0, 1.0, T[0]), (0.0, 0.0, 1.0)))
+    P = R @ virtual.covariance @ R.T + lever @ R @ P_submap @ R.T @ lever.T
+    return Told(T, DOUBT * P + BLURRED, virtual.accepted <= submap.lamps)
 
 
 def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> list[Array]:
