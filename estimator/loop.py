@@ -1,7 +1,7 @@
 """Scan to map (Sect. 4.3): whether a keyframe has been at the place of an earlier submap before, and how sure that is.
 
-Step 2 of the paper, where enough links are clear: the lamps in view must be among those of the submap (`IDS`), and what
-light alone said of both places must agree with the match (`LIGHT`). Where they are not, registration is by laser only.
+Step 2 of the paper, where enough links are clear: the lamps in view must be known in the submap (`IDS`; the paper asks
+for all of them), and what light alone said of both places must agree with the match (`LIGHT`). Where they are not, registration is by laser only.
 Step 3: data association by the matcher, and then the threshold on the residual (`SSE`), the share of beams that fit
 (`OVERLAP`), what speaks against it (`AGAINST`: beams that look through the map, points that hang in free space), no
 axis left open (`RANK`), and the place where it was expected (`PLACE`). Where the pose is vague a wide search offers
@@ -37,7 +37,7 @@ BLURRED: Final = np.diag((0.05**2, 0.05**2, 0.02**2))
 class Condition(Enum):
     """A judgement that a loop has to pass; any subset may be asked for (`LoopSettings.conditions`)."""
 
-    IDS = "the lamps in view are among those of the submap"
+    IDS = "the lamps in view are known in the submap"
     LIGHT = "what light alone said of both places agrees with the match"
     PLACE = "it lies within five deviations of where it was expected"
     SSE = "the beams that fit, fit closely"
@@ -55,6 +55,7 @@ class LoopSettings:
         links: how many links must be clear for light to have a say (Link_n).
         light: largest squared Mahalanobis distance (3 degrees of freedom; 16.3 is 99.9 %) between the match and what
             light alone says. place: the same between the match and the expected place.
+        shared: least share of the lamps in view that must be known in the submap (the paper: 1).
         sse_m: largest root mean square distance of the fitting beams from the map's surfaces (the paper's threshold).
         share: least share of the beams that fit. against: largest share of the evidence that speaks against.
         extra_m, extra_rad: errors of a match that its own covariance does not know: bent submaps, moved furniture.
@@ -69,6 +70,7 @@ class LoopSettings:
 
     conditions: frozenset[Condition] = frozenset(Condition)
     links: int = 4
+    shared: float = 1.0
     light: float = 16.3
     place: float = 25.0
     sse_m: float = 0.06
@@ -94,13 +96,13 @@ class Told:
     """What light alone, at keyframe and submap, says of the one seen from the other.
 
     Attributes:
-        T_submap_keyframe, P: where, with the covariance (3x3, axes of the submap). shared: whether all lamps in view of
-            the keyframe are known in the submap.
+        T_submap_keyframe, P: where, with the covariance (3x3, axes of the submap). shared: share of the lamps in view
+            of the keyframe that are known in the submap.
     """
 
     T_submap_keyframe: Array
     P: Array
-    shared: bool
+    shared: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +141,7 @@ class Found:
     known: bool = True
     off: float = 0.0
     light: float | None = None
-    shared: bool = True
+    shared: float = 1.0
 
 
 def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
@@ -210,7 +212,7 @@ def judgement(view: View, local: LocalMap, result: MatchResult, candidate: Candi
         known=bool(result.known_axes.all()),
         off=distance(candidate.T_submap_keyframe, T, candidate.P + P),
         light=None if told is None else distance(told.T_submap_keyframe, T, told.P + P),
-        shared=told is None or told.shared,
+        shared=1.0 if told is None else told.shared,
     )
 
 
@@ -223,7 +225,7 @@ def distance(T_from: Array, T_to: Array, P: Array) -> float:
 def passed(found: Found, settings: LoopSettings) -> bool:
     """Whether a judgement makes a loop."""
     verdict = {
-        Condition.IDS: found.shared,
+        Condition.IDS: found.shared >= settings.shared,
         Condition.LIGHT: found.light is None or found.light <= settings.light,
         Condition.PLACE: found.off <= settings.place,
         Condition.SSE: found.residual_m <= settings.sse_m,
@@ -237,7 +239,7 @@ def passed(found: Found, settings: LoopSettings) -> bool:
 def told_by_light(frame: Keyframe, submap: Submap, settings: LoopSettings) -> Told | None:
     """Step 2 of Sect. 4.3: None where too few links are clear, which leaves the registration to the laser."""
     virtual = frame.virtual
-    if virtual is None or submap.light is None or len(virtual.accepted) < settings.links:
+    if virtual is None or submap.light is None or len(virtual.accepted) < max(1, settings.links):
         return None
     T_map_submap, P_submap = submap.light
     T = se2.between(T_map_submap, virtual.T_map_base)
@@ -245,7 +247,8 @@ def told_by_light(frame: Keyframe, submap: Submap, settings: LoopSettings) -> To
     R = se2.rotation(-T_map_submap[2])
     lever = np.array(((1.0, 0.0, -T[1]), (0.0, 1.0, T[0]), (0.0, 0.0, 1.0)))
     P = R @ virtual.covariance @ R.T + lever @ R @ P_submap @ R.T @ lever.T
-    return Told(T, DOUBT * P + BLURRED, virtual.accepted <= submap.lamps)
+    shared = len(virtual.accepted & submap.lamps) / len(virtual.accepted)
+    return Told(T, DOUBT * P + BLURRED, shared)
 
 
 def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> list[Array]:
