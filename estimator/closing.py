@@ -77,10 +77,13 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
     P = turned(state, tie.P if tie is not None and tie.placed else atlas.spread(frame.T_odom_keyframe))
     reach = min(told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])), told.most_m)
     for submap in atlas.of_part(frame.submap):
-        x, y, _ = submap.T_map_submap.tolist()
-        away = math.hypot(x - T[0], y - T[1])
-        if submap.settled is not None and away < reach and atlas.way_m - submap.way_m > told.recent_m:
-            near.append((away, submap.key, submap, submap.settled))
+        settled = submap.settled
+        if settled is None or atlas.way_m - submap.way_m <= told.recent_m:
+            continue
+        middle = se2.compose(submap.T_map_submap, settled.witness.T_odom_keyframe)
+        x, y, yaw = se2.between(middle, T).tolist()
+        if math.hypot(x, y) < reach:  # who looks the other way sees little of the same
+            near.append((math.hypot(x, y) + told.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled))
     near.sort(key=lambda one: one[:2])
     made = []
     for _, key, submap, settled in near[: told.candidates]:

@@ -1,7 +1,8 @@
 """Scan to map (Sect. 4.3): whether a keyframe has been at the place of an earlier submap before, and how sure that is.
 
 Step 2 of the paper, where enough links are clear: the lamps in view must be known in the submap (`IDS`; the paper asks
-for all of them), and what light alone said of both places must agree with the match (`LIGHT`). Where they are not, registration is by laser only.
+for all of them), and what light alone said of both places must agree with the match (`LIGHT`). Where they are not,
+registration is by laser only.
 Step 3: data association by the matcher, and then the threshold on the residual (`SSE`), the share of beams that fit
 (`OVERLAP`), what speaks against it (`AGAINST`: beams that look through the map, points that hang in free space), no
 axis left open (`RANK`), and the place where it was expected (`PLACE`). Where the pose is vague a wide search offers
@@ -51,7 +52,8 @@ class LoopSettings:
     """When a loop is one.
 
     Attributes:
-        conditions: which judgements are made at all; what follows says how strict each is.
+        conditions: which judgements are made at all; what follows says how strict each is. `IDS` is left out: where
+            every lamp in view must be known in one submap, every fifth right loop is lost and none that is wrong.
         links: how many links must be clear for light to have a say (Link_n).
         light: largest squared Mahalanobis distance (3 degrees of freedom; 16.3 is 99.9 %) between the match and what
             light alone says. place: the same between the match and the expected place.
@@ -61,14 +63,15 @@ class LoopSettings:
         extra_m, extra_rad: errors of a match that its own covariance does not know: bent submaps, moved furniture.
         recent_m: way back over which a submap is no loop but the way just driven.
         reach_m: how near, beyond three deviations, a submap must be to be looked at; most_m: however uncertain.
-        candidates: submaps looked at for one keyframe. every: a look for every so many keyframes.
+        candidates: submaps looked at for one keyframe. turned_m: half by how much nearer one that looks the same way is
+            than one that looks the other way. every: a look for every so many keyframes.
         sure_m, sure_rad: deviations of the expected place up to which the matcher finds it by itself.
         points: of a scan, at most. places: that a wide search may offer; two of them that fit close nothing.
         supported_m, supported_rad: a loop that moves the pose by more than this waits for a second one that agrees as
             well as this.
     """
 
-    conditions: frozenset[Condition] = frozenset(Condition)
+    conditions: frozenset[Condition] = frozenset(Condition) - {Condition.IDS}
     links: int = 4
     shared: float = 1.0
     light: float = 16.3
@@ -81,7 +84,8 @@ class LoopSettings:
     recent_m: float = 10.0
     reach_m: float = 3.0
     most_m: float = 12.0
-    candidates: int = 2
+    candidates: int = 3
+    turned_m: float = 2.0
     every: int = 3
     sure_m: float = 0.5
     sure_rad: float = 0.15
@@ -155,8 +159,7 @@ def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Fo
     found = the_one([one for one in judged(frame, candidate, settings) if passed(one, settings)], settings)
     if found is None:
         return None
-    lit = found.light is not None and {Condition.IDS, Condition.LIGHT} <= settings.conditions
-    if lit:
+    if found.light is not None and Condition.LIGHT in settings.conditions:
         return replace(found, reason=LoopReason.LIT)
     return replace(found, reason=LoopReason.SEARCHED) if unsure(candidate.P, settings) else found
 

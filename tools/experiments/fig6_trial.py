@@ -103,6 +103,7 @@ class Watcher:
         self._waiting: list[tuple[int, Found]] = []
 
     def __call__(self, state: State, result: StepResult, done: list[tuple[Any, Any]]) -> None:
+        """Take down what a step has come to."""
         self.t.append(result.t_mono)
         self.pose.append(se2.compose(result.T_map_odom, result.T_odom_base))
         self._take_accepted(state)

@@ -2,9 +2,9 @@
 
 A pair of keyframes is *positive* if they were truly laid within 0.5 m and 30 deg of each other, with 10 m of way
 between them, or if half of what the new one sees was seen from the old stretch. A detection is an accepted constraint
-from a keyframe to an earlier submap. It is *right* if the keyframe and some keyframe of that submap are a positive pair, and
-the relative pose is within 0.20 m and 1 deg of the truth (strict: 0.15 m and 0.02 rad). Precision is right detections
-by all; recall is the share of the queries which have a near positive that got a right detection.
+from a keyframe to an earlier submap. It is *right* if the keyframe and some keyframe of that submap are a positive
+pair, and the relative pose is within 0.20 m and 1 deg of the truth (strict: 0.15 m and 0.02 rad). Precision is right
+detections by all; recall is the share of the queries which have a near positive that got a right detection.
 """
 
 from __future__ import annotations
