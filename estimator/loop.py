@@ -84,7 +84,7 @@ class LoopSettings:
     recent_m: float = 10.0
     reach_m: float = 3.0
     most_m: float = 12.0
-    candidates: int = 3
+    candidates: int = 2
     turned_m: float = 2.0
     every: int = 3
     sure_m: float = 0.5
