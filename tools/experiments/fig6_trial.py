@@ -45,7 +45,7 @@ class Detection:
     """A place where a keyframe was found, with every judgement, and whether that is so.
 
     Attributes:
-        query, submap: the keyframe and where it was found. place: number of the start. by_light: whether light had told
+        query, submap: the keyframe and where it was found. place: the pose found, seen from the submap. by_light: whether light had told
             where to look (else branch and bound).
         share, against, residual_m, known, shared, light: as of `Found`; light is NaN where it says nothing.
         off_m, off_rad: error of the relative pose. positive: truly the same place. reason: of an accepted loop.
@@ -63,6 +63,7 @@ class Detection:
     off_m: float
     off_rad: float
     positive: bool
+    place: tuple[float, float, float]
     reason: str = ""
 
 
@@ -137,9 +138,10 @@ class Watcher:
         first = self.truth.member[found.key][0]
         off = self.truth.off(key, first, found.T_submap_keyframe)
         light = np.nan if found.light is None else found.light
+        x, y, yaw = found.T_submap_keyframe.tolist()
         return Detection(
             key, found.key, by_light, found.share, found.against, found.residual_m, found.known, found.shared, light,
-            *off, self.truth.positive(key, found.key), reason,
+            *off, self.truth.positive(key, found.key), (x, y, yaw), reason,
         )  # fmt: skip
 
     def _look_anywhere(self, state: State, frame: Keyframe) -> None:
@@ -178,7 +180,7 @@ def stored(task: tuple[int, float, Path]) -> Drive:
     seed, length_m, folder = task
     path = folder / f"{seed}-{length_m:g}.pickle"
     if path.exists():
-        return cast(Drive, pickle.loads(path.read_bytes()))  # noqa: S301  our own file of a moment ago
+        return cast(Drive, pickle.loads(path.read_bytes()))  # of our own, a moment ago
     drive = trial(seed, length_m)
     folder.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".new").write_bytes(pickle.dumps(drive))
