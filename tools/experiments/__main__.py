@@ -20,7 +20,7 @@ from tools.figures import table
 
 GROUPS: Final = {
     "lights": (
-        "fig4", "fig5", "claim", "adaptive", "room", "tones", "static", "walks", "survey", "beamquality",
+        "fig4", "fig5", "fig6", "claim", "adaptive", "room", "tones", "static", "walks", "survey", "beamquality",
         "relocate", "relocate_real",
     ),
 }  # fmt: skip

@@ -25,7 +25,7 @@ from estimator.pipeline import Settings, State, new_state
 from estimator.records import LightEpoch
 from estimator.result import StepResult
 from tools.experiments.fig6_truth import Truth
-from tools.experiments.loop_drives import play, room_drive, scans
+from tools.experiments.loop_drives import half, play, room_drive, scans
 from tools.experiments.trajectory import Errors, Track, errors, started
 from tools.sim.lightrun import ROOM_WALKERS, LightRun
 from tools.sim.world import Array
@@ -33,7 +33,7 @@ from tools.sim.world import Array
 LIT: Final = "laser and lights"
 LASER: Final = "laser alone"
 COVERED: Final = "laser, lamps covered"
-EVERY: Final = 150
+EVERY: Final = 40
 """Of so many keyframes one is looked for everywhere."""
 ANYWHERE: Final = np.diag((3.0, 3.0, 4.0))
 """Covariance (m^2, m^2, rad^2) that makes the search take all of the room at every heading."""
@@ -45,8 +45,8 @@ class Detection:
     """A place where a keyframe was found, with every judgement, and whether that is so.
 
     Attributes:
-        query, submap: the keyframe and where it was found. place: the pose found, seen from the submap. by_light: whether light had told
-            where to look (else branch and bound).
+        query, submap: the keyframe and where it was found. place: the pose found, seen from the submap.
+        by_light: whether light had told where to look (else branch and bound).
         share, against, residual_m, known, shared, light: as of `Found`; light is NaN where it says nothing.
         off_m, off_rad: error of the relative pose. positive: truly the same place. reason: of an accepted loop.
     """
@@ -175,9 +175,11 @@ def covered(epochs: list[LightEpoch]) -> Iterator[LightEpoch]:
         yield replace(epoch, **nothing)
 
 
-def stored(task: tuple[int, float, Path]) -> Drive:
-    """A drive as it was kept in a folder by an earlier run that was interrupted; else driven, and kept."""
+def stored(task: tuple[int, float, Path | None]) -> Drive:
+    """A drive as it was kept in a folder by an earlier run that was interrupted; else driven, and kept (None: not)."""
     seed, length_m, folder = task
+    if folder is None:
+        return trial(seed, length_m)
     path = folder / f"{seed}-{length_m:g}.pickle"
     if path.exists():
         return cast(Drive, pickle.loads(path.read_bytes()))  # of our own, a moment ago
@@ -191,7 +193,7 @@ def stored(task: tuple[int, float, Path]) -> Drive:
 def trial(seed: int, length_m: float) -> Drive:
     """A drive of some metres with one seed; every tenth one also with all lamps covered."""
     run = room_drive(seed, length_m)
-    seen, wheels, light = list(scans(run, ROOM_WALKERS)), list(run.odometry()), list(run.light())
+    seen, wheels, light = list(scans(run, ROOM_WALKERS)), list(run.odometry()), half(run.light())
     ways = {}
     places, queries = [], {}
     for name in (LIT, LASER, COVERED)[: 3 if seed % 10 == 1 else 2]:

@@ -14,18 +14,19 @@ from typing import Any, Final
 import numpy as np
 
 from estimator.pipeline import State, step
-from estimator.records import UNLIMITED, Answer, Beam, Record, Scan
+from estimator.records import UNLIMITED, Answer, Beam, LightEpoch, Record, Scan
 from estimator.result import StepResult
 from tools.sim.beams import UTM_30LX, Posture, Scanner, Sweep
 from tools.sim.ceiling_movers import lean_of
-from tools.sim.lightrun import ROOM_BODY, LightRun, room_run
+from tools.sim.lightrun import LightRun, room_run
 from tools.sim.people import Crowd, Walker
-from tools.sim.robot import Drive, Route
+from tools.sim.robot import Body, Drive, Route
 from tools.sim.scene import compose
 
 BEARING: Final = np.radians(np.linspace(-90.0, 90.0, 181))
 RATE_HZ: Final = 10.0
 SIGMA_M: Final = 0.01
+BODY: Final = Body(speed=0.9)
 LANES: Final = (-3.7, -1.1, 1.1, 3.7)
 """Where a robot may drive in the paper's room, along either axis, without touching a column."""
 HOME: Final = (-3.7, -3.7)
@@ -47,10 +48,10 @@ def room_route(seed: int, length_m: float = 160.0) -> Route:
     return Route(tuple(corners[:-1] if corners[-1] == HOME else corners), 1.2)
 
 
-def room_drive(seed: int, length_m: float = 160.0, **how: Any) -> LightRun:
+def room_drive(seed: int, length_m: float = 160.0) -> LightRun:
     """A random drive in the paper's room under its 16 lamps; wheels as those whose dead reckoning ends 1.5 m off."""
-    run = room_run(seed=seed, **how)
-    drive = Drive(room_route(seed, length_m), ROOM_BODY, 2.0, 1)
+    run = room_run(seed=seed)
+    drive = Drive(room_route(seed, length_m), BODY, 2.0, 1)
     run.ceiling.lean = lean_of(drive)
     return replace(run, drive=drive, seconds=drive.lap_s)
 
@@ -66,6 +67,11 @@ def scans(run: LightRun, walkers: tuple[Walker, ...] = ()) -> Iterator[Scan]:
         seen = scanner.measure(t, lambda at: compose(run.truth(at), body.lidar), legs, posture).range_m[:, 0].copy()
         beam = np.where(seen > 0.0, Beam.HIT, Beam.NONE).astype(np.uint8)
         yield Scan(t, t + sweep.sweep_s, k, np.array(body.lidar), BEARING, seen, beam, SIGMA_M)
+
+
+def half(epochs: Iterable[LightEpoch]) -> list[LightEpoch]:
+    """Every other epoch of light: ten a second."""
+    return list(epochs)[::2]
 
 
 Watch = Callable[[State, StepResult, list[tuple[Any, Any]]], None]
