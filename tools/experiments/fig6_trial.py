@@ -33,7 +33,7 @@ from tools.sim.world import Array
 LIT: Final = "laser and lights"
 LASER: Final = "laser alone"
 COVERED: Final = "laser, lamps covered"
-EVERY: Final = 40
+EVERY: Final = 80
 """Of so many keyframes one is looked for everywhere."""
 ANYWHERE: Final = np.diag((3.0, 3.0, 4.0))
 """Covariance (m^2, m^2, rad^2) that makes the search take all of the room at every heading."""
@@ -146,7 +146,7 @@ class Watcher:
 
     def _look_anywhere(self, state: State, frame: Keyframe) -> None:
         """Look for a keyframe in every old submap without any guess, and where light has it."""
-        told, atlas = LoopSettings(), state.atlas
+        told, atlas = LoopSettings(points=90), state.atlas
         self.queries[frame.key] = self.truth.has_positive(frame.key)
         for submap in atlas.submaps.values():
             if submap.settled is None or atlas.way_m - submap.way_m < told.recent_m:

@@ -36,7 +36,7 @@ def room_route(seed: int, length_m: float = 160.0) -> Route:
     """A random way along the lanes of the paper's room, of about that length, which returns to its start."""
     rng = np.random.default_rng((seed, 77))
     at, corners, way, along = list(HOME), [HOME], 0.0, 0
-    while way < length_m - 12.0:
+    while len(corners) < 4 or way < length_m - 12.0:
         there = float(rng.choice([lane for lane in LANES if lane != at[along]]))
         way += abs(there - at[along])
         at[along], along = there, 1 - along
