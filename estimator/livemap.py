@@ -30,7 +30,7 @@ RENDERS, TILES = 2, 4
 """Patches rendered, and tiles composed, in one job: some 20 ms."""
 
 MOVED: Final = 0.3
-"""Cells by which the farthest corner of a patch must have moved before its tiles are composed again."""
+"""Cells by which a patch must have moved, at its farthest corner, before its tiles are composed again."""
 
 EVERY: Final = 4
 """The submap that is being driven through is shown anew after so many keyframes."""
@@ -241,7 +241,7 @@ def advance(task: Task) -> Progress:
         T, shown = place.now(), task.drawn.get(key)
         if key in task.fresh:
             patch = render(task.fresh[key], T, task.resolution)
-        elif shown is not None and shift(shown, T, task.resolution) > MOVED * task.resolution:
+        elif shown is not None and shift(shown, T) > MOVED * task.resolution:
             patch = shown.patch
         else:
             continue
@@ -265,12 +265,13 @@ def composed(task: Task, fresh: dict[int, Drawn], stale: set[Tile]) -> Progress:
     return Progress(task, fresh, tiles, rest, gone)
 
 
-def shift(shown: Drawn, T_map_submap: Array, resolution: float) -> float:
-    """By how much, m, a patch's farthest corner lies elsewhere than it is drawn."""
+def shift(shown: Drawn, T_map_submap: Array) -> float:
+    """By how much, m, a patch lies elsewhere than it is drawn, at most."""
     if T_map_submap is shown.T_map_submap:
         return 0.0
-    moved = shown.patch.corners(T_map_submap, resolution) - shown.patch.corners(shown.T_map_submap, resolution)
-    return math.sqrt(float((moved * moved).sum(axis=1).max()))
+    x, y, yaw = T_map_submap.tolist()
+    u, v, w = shown.T_map_submap.tolist()
+    return math.hypot(x - u, y - v) + abs(se2.wrap(yaw - w)) * shown.patch.reach_m
 
 
 def spent(one: Drawn, stale: frozenset[Tile]) -> bool:

@@ -52,12 +52,14 @@ class Patch:
 
     Attributes:
         T_map_submap: where the submap was when this was rendered. corner: column and row, on the map's grid, of cell
-            [0, 0]. shape: rows, columns. weight: sum of the sizes of its words. packed: the cells, compressed.
+            [0, 0]. shape: rows, columns. reach_m: from the submap's origin to the farthest corner. weight: sum of the
+            sizes of its words. packed: the cells, compressed.
     """
 
     T_map_submap: Array
     corner: tuple[int, int]
     shape: tuple[int, int]
+    reach_m: float
     weight: int
     packed: bytes
 
@@ -92,8 +94,10 @@ def render(frames: Sequence[Seen], T_map_submap: Array, resolution: float) -> Pa
     cells = np.clip(np.rint(drawn.log_odds / UNIT), -WORD, WORD).astype(np.int8)
     column, row = np.rint(drawn.origin / resolution).astype(np.int64).tolist()
     rows, columns = cells.shape
+    far = np.abs(np.array([(column, row), (column + columns, row + rows)]) * resolution - T_map_submap[:2]).max(axis=0)
+    weight = int(np.abs(cells.astype(np.int64)).sum())
     packed = zlib.compress(cells.tobytes(), LEVEL)
-    return Patch(T_map_submap, (column, row), (rows, columns), int(np.abs(cells.astype(np.int64)).sum()), packed)
+    return Patch(T_map_submap, (column, row), (rows, columns), float(np.hypot(*far)), weight, packed)
 
 
 def shortened(beams: Beams) -> Beams:
