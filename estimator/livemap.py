@@ -65,14 +65,15 @@ class Task:
 
     Attributes:
         resolution: m per cell. drawn: patches as they lie in the tiles. places: of all submaps that have a patch or get
-            one. fresh: keyframes of those to be rendered. spare: keys of submaps that are out of the graph. stale:
-            tiles waiting to be composed.
+            one. fresh: keyframes of those to be rendered. more: others wait for that, too. spare: keys of
+            submaps that are out of the graph. stale: tiles waiting to be composed.
     """
 
     resolution: float
     drawn: dict[int, Drawn]
     places: dict[int, Place]
     fresh: dict[int, tuple[Seen, ...]]
+    more: bool
     spare: frozenset[int]
     stale: frozenset[Tile]
 
@@ -119,12 +120,13 @@ class LiveMap:
 
     def task(self, adrift: float = math.inf) -> Task:
         """The next piece of work; it finds out itself what has moved. Submaps from key ``adrift`` on are left out."""
-        fresh = dict(sorted((key, frames) for key, frames in self.fresh.items() if key < adrift)[:RENDERS])
+        ready = sorted(key for key in self.fresh if key < adrift)
+        fresh = {key: self.fresh[key] for key in ready[:RENDERS]}
         self.due = False
         shown = self.drawn.keys() | fresh.keys()
         places = {key: place_of(self.submaps[key]) for key in sorted(shown)}
         spare = frozenset(key for key in shown if self.submaps[key].into is not None)
-        return Task(self.resolution, dict(self.drawn), places, fresh, spare, self.stale)
+        return Task(self.resolution, dict(self.drawn), places, fresh, len(ready) > RENDERS, spare, self.stale)
 
     def take(self, done: Progress) -> None:
         """Take in what a job has done."""
@@ -254,7 +256,7 @@ def advance(task: Task) -> Progress:
 def composed(task: Task, fresh: dict[int, Drawn], stale: set[Tile]) -> Progress:
     """Compose some of the stale tiles, with the patches as they lie from now on."""
     lying = {**task.drawn, **fresh}
-    now = sorted(stale)[:TILES]
+    now = [] if task.more else sorted(stale)[:TILES]
     order = [(key, one.patch, one.T_map_submap, one.tiles) for key, one in sorted(lying.items(), reverse=True)]
     tiles, used = compose(now, order, task.resolution)
     for (key, tile), count in used.items():
