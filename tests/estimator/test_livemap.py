@@ -230,8 +230,8 @@ def furnished(table: tuple[float, float], door_shut: bool) -> Scene:
 
 
 def lap(state: State, scene: Scene, begin: int, jobs: tuple[Job, ...], rng: np.random.Generator) -> tuple[Job, ...]:
-    """Once round the room, 110 scans; ``begin``: number of the first."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 110, endpoint=False)
+    """Once round the room, 150 scans; ``begin``: number of the first."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 150, endpoint=False)
     x, y = 3.6 * np.cos(angle), 2.7 * np.sin(angle)
     truth = np.column_stack((x, y, np.arctan2(2.7 * np.cos(angle), -3.6 * np.sin(angle))))
     for k, T in enumerate(truth):
@@ -241,7 +241,7 @@ def lap(state: State, scene: Scene, begin: int, jobs: tuple[Job, ...], rng: np.r
         records: list[Record] = [Answer(t, job.job_id, job.run()) for job in jobs]
         if begin + k:
             records.append(Odometry(t - 0.1, t, se2.between(truth[k - 1], T)))
-        scan = replace(scan_in(scene, T, bearings(141, 270.0), rng, t=t), seq=begin + k)
+        scan = replace(scan_in(scene, T, bearings(181, 270.0), rng, t=t), seq=begin + k)
         jobs = step(state, [*records, scan], UNLIMITED).jobs
     return jobs
 
@@ -264,7 +264,7 @@ def test_moved_furniture_is_forgotten_in_one_pass() -> None:
     jobs: tuple[Job, ...] = ()
     for number in range(3):
         scene = furnished((0.3, -0.9), True) if number == 2 else furnished((0.0, 0.5), False)
-        jobs = lap(state, scene, 110 * number, jobs, rng)
+        jobs = lap(state, scene, 150 * number, jobs, rng)
         live, local = state.live, state.local
         assert live is not None
         assert local is not None
