@@ -16,10 +16,12 @@ log = logging.getLogger(__name__)
 def bounded(memory: Memory, evidence: Evidence) -> bool:
     """Whether a bound on the error of the pose can stand: the place is not in doubt.
 
-    A bound assumes that the pose is about right and says how wrong it may be. Of a place that is being looked for, was
-    lost, was laid upon a guess, or that light contradicts, nothing of that kind can be said.
+    A bound assumes that the pose is about right and says how wrong it may be. Nothing of that kind can be said of a
+    place that is being looked for, was lost, was laid upon a guess, that light contradicts or the latest scan does not
+    fit.
     """
-    in_doubt = memory.doubt or evidence.guessed or evidence.places is not None or memory.odd_since is not None
+    in_doubt = memory.doubt or memory.failed > 0 or evidence.guessed or evidence.places is not None
+    in_doubt = in_doubt or memory.odd_since is not None
     return memory.state in HELD and not in_doubt
 
 

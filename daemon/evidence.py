@@ -11,7 +11,7 @@ from daemon.state import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Ma
 from daemon.witness import Witnesses
 from estimator import result as light
 from estimator.records import Array, Command, LightEpoch, Odometry, Record, SampleBlock
-from estimator.result import SURPRISE, Fix, MatchResult, Reason, StepResult
+from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
 
 ENOUGH_INLIERS: Final = 0.4
@@ -24,6 +24,8 @@ LIGHT_SILENT_S: Final = 1.0
 """Samples that have not arrived for this long are missing; blocks come twenty times a second."""
 GUESS_S: Final = 0.5
 """A velocity carries the pose along an axis that nothing shows for this long; after that the pose is a guess there."""
+TELLING: Final = (LoopReason.PLACED, LoopReason.LIT)
+"""Loops that tell the place of a robot that may have been carried off."""
 EARLY: Final = 0.01
 """Part of a scan period by which a timer may be early and still stand for the whole period."""
 
@@ -49,6 +51,7 @@ class Observer:
         self._t_shown = [t_mono] * 3
         self._guessed = [False] * 3
         self._anew = 0
+        self._begun = False
 
     def odometry_ok(self, t_mono: float) -> bool | None:
         """Whether odometry is arriving; None where none is configured."""
@@ -143,14 +146,17 @@ class Observer:
 
         Without odometry, along an axis that no match shows, the pose is only carried on by its last velocity. A
         keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
-        is the place in the surroundings, not in the map. The same is true, along every axis, of a map that was begun
-        anew because nothing fitted the old one. An order or a loop closure ends that, and light that agrees.
+        is the place in the surroundings, not in the map. A loop closure ends that, an order, and light that agrees.
+        The same is true, along every axis, of a map that was begun anew because nothing fitted the old one: the robot
+        may have been carried off, so that a loop found near where it is taken to be tells nothing. That ends with a
+        place that was looked for everywhere, or that light confirms.
         """
-        if ordered or result.loop is not None or (result.placed and result.gap is not None and result.gap <= SURPRISE):
-            self._guessed = [False] * 3
+        told = ordered or _lit(result)
+        if told or (result.loop is not None and (not self._begun or result.loop.reason in TELLING)):
+            self._guessed, self._begun = [False] * 3, False
             self._t_shown = [t_mono] * 3
         if result.anew > self._anew:
-            self._guessed = [True] * 3
+            self._guessed, self._begun = [True] * 3, True
         self._anew = result.anew
         for axis, known in enumerate(match.known):
             if (match.good and known) or self.odometry_ok(t_mono):
@@ -181,6 +187,12 @@ class Observer:
             self._P_complete = P
             return 0.0, 0.0
         return sigma_m, sigma_rad
+
+
+def _lit(result: StepResult) -> bool:
+    """Whether light tells a place and the pose agrees."""
+    agrees = result.placed and result.gap is not None and result.gap <= SURPRISE
+    return agrees and result.lights is not None and result.lights.fix is Fix.GOOD
 
 
 def _axes(known: Array) -> tuple[bool, bool, bool]:

@@ -42,7 +42,7 @@ DARK_S: Final = 5.0
 CONTRADICTED_S: Final = 0.3
 """Light has to contradict the place for this long: an epoch may be spoiled by who walks by."""
 VAGUE_M: Final = 0.15
-VAGUE_RAD: Final = 0.1
+VAGUE_RAD: Final = 0.04
 """One-sigma uncertainty beyond which TRACKING is not said."""
 
 

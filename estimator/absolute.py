@@ -37,6 +37,10 @@ DRIFT = np.array((5e-5, 5e-5, 2e-6))
 TRUST, YOUNG, YOUNG_M = 2.0, 4.0, 4.0
 """By how much the variance of a position from light is raised: always, because errors of the light model hang together
 farther than it knows; and at the start, fading with the way driven, because gains and heading are being found."""
+UNGUIDED = 1.5
+"""By how much that variance is raised further where no wheels tell `lights` how the robot moves."""
+ASTRAY_RAD = 0.35
+"""A heading from light that is off by so much, without wheels, has led its position astray too."""
 SURPRISE_S = 1.0
 """Light that is sure and disagrees for longer is believed: nothing else knows where in the building the robot is."""
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
@@ -145,7 +149,10 @@ def on_lights(state: State, lights: LightsResult) -> None:
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    lights = across_the_row(state, doubted(tie, lights))
+    lights = across_the_row(state, doubted(tie, lights, state.fused.odometry))
+    held = holds_heading(state)
+    if held:
+        lights = without_heading(lights)
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     R = se2.rotation(state.T_map_odom[2])
     P = R @ tie.P @ R.T
@@ -157,7 +164,7 @@ def on_lights(state: State, lights: LightsResult) -> None:
         tie.gap = 0.0
     elif _contradicted(state, lights, off) or _surer(tie, lights):
         follow(state, lights, T_odom_base)
-    elif lights.fix is Fix.GOOD and tie.odd_since is None:
+    elif lights.fix is Fix.GOOD and tie.odd_since is None and not (held and abs(off[2]) > ASTRAY_RAD):
         gain(state, lights, T_odom_base, off)
     if lights.fix is Fix.GOOD and tie.odd_since is None:
         tie.proved, tie.broken = True, False
@@ -208,6 +215,7 @@ def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     """Take the lights' pose as it is."""
     tie = state.absolute
     assert tie is not None
+    state.frozen.forget()
     correct(state, lights.T_map_base, T_odom_base)
     R = se2.rotation(state.T_map_odom[2])
     tie.P, tie.X = R.T @ lights.covariance @ R, np.zeros((3, 3))
@@ -233,12 +241,34 @@ def virtual(state: State) -> Virtual | None:
     return Virtual(se2.compose(lights.T_map_base, moved), lights.covariance, lights.accepted)
 
 
-def doubted(tie: Absolute, lights: LightsResult) -> LightsResult:
+def doubted(tie: Absolute, lights: LightsResult, wheels: bool = True) -> LightsResult:
     """The lights' result with less trust in it; no heading is less certain than one that may be any."""
     factor = TRUST + YOUNG * math.exp((tie.way_young - tie.way) / YOUNG_M)
+    factor *= 1.0 if wheels else UNGUIDED
     P = lights.covariance * factor
     most = np.array((1.0, 1.0, math.sqrt(min(1.0, ANY_HEADING / max(float(P[2, 2]), 1e-12)))))
     return replace(lights, covariance=P * most * most[:, None], gained=lights.gained / factor)
+
+
+def holds_heading(state: State) -> bool:
+    """Whether the laser holds a heading that light has proved, and light has nothing as good.
+
+    Without wheels the `lights` filter takes a robot to drive the way it faces, and its heading may settle the wrong way
+    round whenever the robot is slow; the laser does not turn round.
+    """
+    tie = state.absolute
+    assert tie is not None
+    return tie.proved and not tie.broken and not blind(state) and not state.fused.odometry
+
+
+def without_heading(lights: LightsResult) -> LightsResult:
+    """The lights' result with a heading that may be any: its position corrects the pose's heading by the way."""
+    P = lights.covariance.copy()
+    P[2, :2] = P[:2, 2] = 0.0
+    P[2, 2] = ANY_HEADING
+    keep = invert3(P) @ lights.covariance
+    made = np.array((lights.gained_by[0], lights.gained_by[1], 0.0))
+    return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T), gained_by=made)
 
 
 def across_the_row(state: State, lights: LightsResult) -> LightsResult:
@@ -298,7 +328,8 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
         return False
     tie.odd_since = lights.t_mono if tie.odd_since is None else tie.odd_since
     held = tie.proved and not tie.broken and not blind(state)
-    far = math.hypot(off[0], off[1]) > FAR_M or abs(off[2]) > FAR_RAD
+    turned = abs(off[2]) > FAR_RAD and not holds_heading(state)
+    far = math.hypot(off[0], off[1]) > FAR_M or turned
     believed = not held or (far and lights.fix is Fix.GOOD)
     return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
 

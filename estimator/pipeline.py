@@ -25,6 +25,10 @@ from estimator.state import Settings, State, new_state
 __all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_map", "step"]
 
 
+FLOOR = np.diag((0.005**2, 0.005**2, 0.003**2))
+"""Variance of what no filter knows of: stamps, sweep and mount of a moving robot."""
+
+
 def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
     """Take the records since the last step, in the order in which they were true, and return the pose after them.
 
@@ -151,7 +155,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         t_mono=moving.t_mono,
         T_odom_base=moving.T_odom_base,
         T_map_odom=state.T_map_odom,
-        covariance=covariance(state),
+        covariance=covariance(state) + FLOOR,
         velocity=moving.velocity.copy(),
         known_axes=known_axes(state, match),
         match=match,

@@ -1,11 +1,17 @@
 """How wrong the pose may be: a protection level, as aviation calls it, at the risk :data:`RISK` a pose.
 
-If the place itself is not in doubt (who reads the result has to know that), the error of ``T_map_base`` is above the
-level with no more than that probability. The largest of these holds:
+If the place itself is not in doubt (who publishes the level knows that), the error of ``T_map_base`` is above it with
+no more than that probability. It is the largest of what three hypotheses allow (multiple hypothesis solution
+separation, Blanch et al., NAVIGATION 2010; docs/integrity.md has the derivation):
 
-* nothing is wrong: the covariance, raised by what errors that hang together make of it (:data:`ALIKE`), at its part of
-  the risk, and what neither filter knows of;
-* light is wrong, or the laser is: what the other witness says of the place (:mod:`docs/integrity.md`).
+* nothing is wrong: quantiles of the covariance, raised by what errors that hang together make of it;
+* light is wrong since lately (a lamp moved, exchanged, reflected): how far the pose has since left the one that the
+  laser alone would have, plus what that one may be wrong by;
+* the laser is wrong (it slipped, the room looks alike): how far the pose is from the one that light alone has, plus
+  what that one may be wrong by.
+
+Where there is one witness only nothing can be separated, and the first bound is widened instead. Laser and light share
+the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself.
 """
 
 from __future__ import annotations
@@ -13,35 +19,91 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import numpy as np
+
+from estimator import se2
+from estimator.absolute import doubted, pose_at
 from estimator.fusion import covariance
 from estimator.records import Array
-from estimator.result import Protection
+from estimator.result import Fix, Protection
 from estimator.state import State
 
 RISK: Final = 1e-4
 """Probability with which an error may be above its bound, a pose."""
-ALIKE: Final = 2.0
-"""By how many deviations more errors may be off that hang together: bending of the map, walls that reflect light."""
-UNKNOWN_M, UNKNOWN_RAD = 0.03, 0.005
+FAULTY: Final = 1e-3
+"""Probability that a witness is wrong without contradicting the other, a pose."""
+ALIKE: Final = 1.5
+"""By how many deviations more errors are off that hang together: bending of the map, walls that reflect light."""
+ALONE: Final = 1.5
+"""By how much a bound is wider that one witness gives which nobody watches."""
+UNKNOWN_M = 0.03
+UNKNOWN_RAD = 0.01
 """What no filter knows of: stamps, lever arms, the survey itself."""
+STRAIN_M, STRAIN_RAD = 0.02, 0.004
+"""Drift of a pose that the laser alone carries on, by the root of a metre: three times what tours have shown."""
 MOST_M: Final = 30.0
 """A bound above this says nothing."""
+
+K_PLAIN: Final = ALIKE * math.sqrt(-2.0 * math.log(0.5 * RISK))
+"""Quantile of a distance in the plane (Rayleigh), and more than Gauss's of a heading, without a fault."""
+K_FAULT: Final = ALIKE * math.sqrt(-2.0 * math.log(0.25 * RISK / FAULTY))
+"""The same with one of two witnesses wrong, each of which may take a quarter of the risk."""
 
 
 def bound(state: State) -> Protection | None:
     """Bound on the error of the pose after this step; None: there is none."""
     P = covariance(state)
     tie = state.absolute
-    horizontal, yaw = _faultless(P)
+    laser = state.local is not None and (state.fused.t_mono - state.t_match < 1.0)
+    lit = tie is not None and tie.placed and state.light is not None and state.light.result.fix is Fix.GOOD
+    _watch(state, P)
+    horizontal, yaw = spread(P, K_PLAIN if laser and lit else ALONE * K_PLAIN)
+    if laser and lit:
+        for other in (_without_light(state), _without_laser(state)):
+            horizontal, yaw = max(horizontal, other[0]), max(yaw, other[1])
+    horizontal, yaw = horizontal + UNKNOWN_M, min(yaw + UNKNOWN_RAD, math.pi)
     if not horizontal < MOST_M:
         return None
-    light = tie is not None and tie.placed and tie.gap is not None
-    laser = state.fused.t_mono - state.t_match < 1.0
-    return Protection(horizontal, min(yaw, math.pi), laser, light, state.fused.odometry)
+    return Protection(horizontal, yaw, laser, lit, state.fused.odometry)
 
 
-def _faultless(P: Array) -> tuple[float, float]:
-    """The bound where nothing is wrong: Rayleigh's quantile in the plane, Gauss's in heading."""
+def _watch(state: State, P: Array) -> None:
+    """Keep the tie that light is held against, as long as the laser carries the pose on from it."""
+    tie = state.absolute
+    if tie is None:
+        return
+    if not tie.placed or not tie.proved or tie.broken:
+        state.frozen.forget()
+    else:
+        state.frozen.take(state.T_map_odom, P, state.way)
+
+
+def _without_light(state: State) -> tuple[float, float]:
+    """What the laser alone says, light not believed since the tie was frozen: separation and spread."""
+    if not state.frozen.kept:
+        return 0.0, 0.0
+    T_map_odom, P, way = state.frozen.kept[0]
+    T_odom_base = state.fused.T_odom_base
+    off = se2.between(se2.compose(T_map_odom, T_odom_base), se2.compose(state.T_map_odom, T_odom_base))
+    strain = max(state.way - way, 0.0) * np.diag((STRAIN_M**2, STRAIN_M**2, STRAIN_RAD**2))
+    far, turned = spread(P + strain, K_FAULT)
+    return math.hypot(off[0], off[1]) + far, abs(float(off[2])) + turned
+
+
+def _without_laser(state: State) -> tuple[float, float]:
+    """What light alone says: separation and spread. Without wheels it says nothing of the heading."""
+    tie, light = state.absolute, state.light
+    assert tie is not None
+    assert light is not None
+    said = doubted(tie, light.result, state.fused.odometry)
+    here = se2.compose(state.T_map_odom, pose_at(state, max(said.t_mono, said.t_pose)))
+    off = said.T_map_base - here
+    far, turned = spread(said.covariance, K_FAULT)
+    heading = 0.0 if not state.fused.odometry else abs(se2.wrap(float(off[2]))) + turned
+    return math.hypot(off[0], off[1]) + far, heading
+
+
+def spread(P: Array, k: float) -> tuple[float, float]:
+    """``k`` deviations of a covariance (3, 3): of the larger axis in the plane, and of the heading."""
     mean, half = 0.5 * (P[0, 0] + P[1, 1]), math.hypot(0.5 * (P[0, 0] - P[1, 1]), P[0, 1])
-    k = ALIKE * math.sqrt(-2.0 * math.log(0.5 * RISK))
-    return UNKNOWN_M + k * math.sqrt(max(0.0, mean + half)), UNKNOWN_RAD + k * math.sqrt(max(0.0, float(P[2, 2])))
+    return k * math.sqrt(max(0.0, mean + half)), k * math.sqrt(max(0.0, float(P[2, 2])))

@@ -11,6 +11,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.atlas import Atlas
+from estimator.frozen import Frozen
 from estimator.keyframe import Keyframe, Submap
 from estimator.livemap import LiveMap
 from estimator.localmap import LocalMap, MapSettings
@@ -84,6 +85,7 @@ class State:
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
         kinship: sums over neighbouring residuals, product and squares, that fade (`estimator.alike`).
         guessed_s: how long the pose has been carried on by a guess, along a direction that nothing held.
+        frozen: ties of a while ago, that light is held against.
         way: metres driven, and turned as keyframes count turns, by the prediction; paces: of them, in keyframes.
         t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
         t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
@@ -116,6 +118,7 @@ class State:
     kinship: Array = field(default_factory=lambda: np.zeros(2))
     guessed_s: float = 0.0
     way: float = 0.0
+    frozen: Frozen = field(default_factory=Frozen)
     paces: int = 0
     t_scan: float = -math.inf
     t_match: float = -math.inf

@@ -10,7 +10,7 @@ import pytest
 from daemon.evidence import ENOUGH_INLIERS, ODOMETRY_SILENT_S, OPENING_S, Observer, good
 from daemon.state import VAGUE_M, Evidence
 from estimator.records import Array, Command, Odometry, Order, Record
-from estimator.result import Loop, MatchResult, Reason, StepResult
+from estimator.result import Loop, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
 
 STREAMING = LidarStatus(link=Link.STREAMING)
@@ -157,6 +157,15 @@ def test_a_map_begun_anew_is_a_guess_whatever_fits_it() -> None:
     assert not ordered.guessed
     assert not watch.see(replace(step(match()), anew=1)).guessed
     assert watch.see(replace(step(match()), anew=2)).guessed, "and begun once more"
+
+
+@pytest.mark.parametrize(("reason", "tells"), [(why, why.name in ("PLACED", "LIT")) for why in LoopReason])
+def test_after_a_map_was_begun_anew_only_a_search_everywhere_tells_the_place(reason: LoopReason, tells: bool) -> None:
+    """A robot that was carried off to where it looks alike closes loops there as it would at the right place."""
+    watch = Watch(odometry=True)
+    watch.see(step(match()))
+    watch.see(replace(step(match()), anew=1))
+    assert watch.see(replace(step(match()), anew=1, loop=Loop(1, 9, 2, 0.01, reason))).guessed is not tells
 
 
 def test_no_keyframe_no_guess() -> None:

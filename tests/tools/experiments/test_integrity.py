@@ -1,0 +1,99 @@
+"""The integrity runs' own judgement, and that scenarios repeat; a short one through the whole cycle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.publish.snapshot import State
+from tools.experiments import integrity
+from tools.experiments.integrity_plot import stanford
+from tools.experiments.integrity_report import COLUMNS, Array, judged, longest, report
+from tools.experiments.integrity_run import run
+from tools.experiments.integrity_scene import KINDS, draw
+
+AT = {name: number for number, name in enumerate(COLUMNS)}
+
+
+def track(seconds: float = 60.0, **columns: float) -> Array:
+    """Ten cycles a second, all alike: TRACKING with 1 cm of error unless said otherwise."""
+    rows = np.zeros((round(10 * seconds), len(COLUMNS)))
+    rows[:, AT["t"]] = 0.1 * np.arange(len(rows))
+    for name, value in (
+        {"state": float(State.TRACKING), "error_m": 0.01, "bound_m": 0.3, "bound_rad": 0.1} | columns
+    ).items():
+        rows[:, AT[name]] = value
+    return rows
+
+
+ALL = np.array(((10.0, 60.0),))
+
+
+def test_a_wrong_state_counts_once_it_has_lasted() -> None:
+    rows = track()
+    rows[300:304, AT["error_m"]] = 0.6
+    brief = judged("a-0", rows, ALL, (True, False, ""))
+    assert brief.wrong_s == pytest.approx(0.3)
+    assert not brief.wrong
+    rows[300:307, AT["error_m"]] = 0.6
+    assert judged("a-0", rows, ALL, (True, False, "")).wrong
+    assert not judged("a-0", rows, ALL, (False, False, "")).wrong, "with the laser alone it may last two seconds"
+    rows[300:325, AT["error_rad"]] = 0.1
+    assert judged("a-0", rows, ALL, (False, False, "")).wrong, "the heading counts too"
+    rows[:, AT["state"]] = State.DEGRADED
+    assert not judged("a-0", rows, ALL, (True, False, "")).wrong
+
+
+def test_bounds_and_shares_are_counted() -> None:
+    rows = track()
+    rows[200:210, AT["error_m"]] = 0.4
+    rows[400:500, AT["state"]] = State.DEGRADED
+    rows[450:500, AT["bound_m"]] = np.inf
+    rows[450:500, AT["error_m"]] = 3.0
+    found = judged("a-0", rows, np.array(((10.0, 40.0),)), (True, True, ""))
+    assert (found.beyond_bound, found.bounded) == (10, 550)
+    assert found.tracking == pytest.approx(0.8)
+    assert found.recoverable == 1.0
+
+
+def test_a_stretch_ends_where_cycles_are_missing() -> None:
+    t = np.array((0.0, 0.1, 0.2, 1.0, 1.1))
+    assert longest(t, np.ones(5, bool)) == pytest.approx(0.2)
+    assert longest(t, np.zeros(5, bool)) == 0.0
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_every_kind_can_be_drawn_and_repeats(kind: str) -> None:
+    one, two = draw(kind, 5), draw(kind, 5)
+    assert one.seconds >= 60.0
+    t = np.linspace(0.0, one.seconds, 50)
+    np.testing.assert_array_equal(one.pose(t), two.pose(t))
+    assert bool(one.ceilings) == one.lit == (one.told is not None)
+    assert float(one.place.world.clearance(one.pose(np.array([0.0]))[:, :2]).min()) > 0.3
+
+
+@pytest.mark.jit
+def test_a_short_drive_tracks_and_is_kept(tmp_path: Path) -> None:
+    scene = draw("clean_unlit", 0)
+    scene.seconds = 8.0
+    rows = run(scene)
+    assert rows[-1, AT["state"]] == State.TRACKING
+    assert rows[-1, AT["error_m"]] < 0.1 < 10.0
+    assert rows[-1, AT["error_m"]] < rows[-1, AT["bound_m"]] < 1.0
+    assert integrity.missing(["clean_unlit"], range(2), tmp_path) != []
+    for number in range(2):
+        np.savez(
+            tmp_path / f"clean_unlit-{number}.npz",
+            track=rows,
+            recoverable=ALL,
+            facts=np.array("{}"),
+            clean=True,
+            lit=False,
+        )
+    assert integrity.missing(["clean_unlit"], range(2), tmp_path) == []
+    found = report(tmp_path, ["clean_unlit"])
+    assert "wrong: 0 of 2; that proves at most 150.00% (95 %)" in found.text()
+    stanford(found, tmp_path / "plot.png", 1.0)
+    assert (tmp_path / "plot.png").stat().st_size > 5000
