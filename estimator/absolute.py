@@ -78,6 +78,7 @@ class Absolute:
         P, X: see above, both 3x3, odom-aligned axes.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
+        elsewhere_since: since when what is received does not fit the place.
         way, way_young: driven so far, and when light last began to find the place.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
         since: ID of the first keyframe laid after the pose was known for the last time.
@@ -91,6 +92,7 @@ class Absolute:
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
     gap: float | None = None
     odd_since: float | None = None
+    elsewhere_since: float | None = None
     way: float = 0.0
     way_young: float = 0.0
     fresh: float = 0.0

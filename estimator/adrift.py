@@ -34,6 +34,11 @@ HINT_LOOKS: Final = 4
 """Looks after which the map says that it is not there."""
 PATIENCE_S: Final = 1.0
 """Light is waited for so long before the whole map is searched."""
+ELSEWHERE_S, UNFIT = 1.0, 2
+"""Light that has the robot elsewhere for so long is believed that it was carried off; and at once when so many scans in
+a row did not fit."""
+STALE: Final = 5
+"""Scans after which a keyframe that was found nowhere is laid anew, where light says that it must be here."""
 SURPRISE: Final = 16.3
 """Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
 
@@ -51,10 +56,13 @@ def begin(state: State) -> bool:
 
 
 def local_map_lost(state: State) -> None:
-    """The local map is begun anew: the robot may have been carried off, unless light holds it where it is."""
+    """The local map is begun anew: the robot may have been carried off, unless light holds it where it is.
+
+    One that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
+    """
     tie = state.absolute
     held = tie is not None and tie.placed and tie.gap is not None and tie.gap <= SURPRISE
-    if not held:
+    if not held or state.atlas.adrift is not None:
         begin(state)
 
 
@@ -109,7 +117,12 @@ def step_done(state: State) -> None:
     And decide, when light has become a witness since.
     """
     atlas, frame = state.atlas, state.keyframes.get(state.anchor)
-    if atlas.adrift is None or state.light is None or frame is None or frame.key < atlas.since:
+    if state.light is None:
+        return
+    if atlas.adrift is None:
+        doubt(state)
+        return
+    if frame is None or frame.key < atlas.since:
         return
     seek = atlas.seek
     if seek.job in atlas.asked or seek.hint is not None:
@@ -121,9 +134,40 @@ def step_done(state: State) -> None:
     if allowed is None and not (seek.looks == 0 and state.fused.t_mono - seek.t_begin > PATIENCE_S):
         return
     asked = frame.key, len(allowed or ())
-    if asked != seek.lit:
+    stale = asked == seek.lit and seek.looks and not seek.alive and state.since_keyframe > STALE
+    if stale or (allowed and state.failures >= UNFIT):
+        afresh(state)  # it stands and was not found, or was just put down: what was kept says nothing of where it is
+    elif asked != seek.lit:
         seek.lit, seek.searched = asked, None
         look_for(state, frame, allowed)
+
+
+def doubt(state: State) -> None:
+    """Say that the robot was carried off where light says so: at once if scans fit no more, else after a second.
+
+    The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here.
+    """
+    from estimator import relocate_light
+
+    tie = state.absolute
+    assert tie is not None
+    if not relocate_light.disputed(state):
+        tie.elsewhere_since = None
+        return
+    now = state.fused.t_mono
+    tie.elsewhere_since = now if tie.elsewhere_since is None else tie.elsewhere_since
+    here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    sure = now - tie.elsewhere_since >= ELSEWHERE_S and relocate_light.elsewhere(state, here)
+    if (sure or state.failures >= UNFIT) and afresh(state):
+        tie.elsewhere_since, tie.broken = None, True
+
+
+def afresh(state: State) -> bool:
+    """Be adrift from the next scan on, with a new local map."""
+    if not begin(state):
+        return False
+    state.local, state.failures = None, 0
+    return True
 
 
 def light_is_coming(state: State) -> bool:

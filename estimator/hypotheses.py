@@ -34,6 +34,9 @@ MOST: Final = 32
 BEHIND: Final = 0.15
 """Share of the beams by which a place that was never held must fit worse than the one that was, to be no rival."""
 
+NEARLY, NEARLY_M, NEARLY_RAD = 0.75, 0.1, 0.03
+"""Share of the beams, and deviations, of a place that another witness may confirm though no look has held it."""
+
 AGAIN_M, AGAIN_RAD = 1.0, 1.0
 """Way or turn after which it is searched again."""
 
@@ -45,6 +48,7 @@ class Hypothesis:
     Attributes:
         T_map_odom: where the odom frame then lies, by the latest look that held it. held: those looks, oldest first.
         looks: at it so far; idle: how many of them in a row have left it open. share: mean share of the beams.
+        latest: the latest look, whatever it said.
     """
 
     T_map_odom: Array
@@ -52,14 +56,15 @@ class Hypothesis:
     looks: int = 0
     idle: int = 0
     share: float = 0.0
+    latest: tuple[Keyframe, Fit] | None = None
 
     def after(self, frame: Keyframe, fit: Fit) -> Hypothesis:
         """The hypothesis after one look more."""
         share = (self.share * self.looks + fit.share) / (self.looks + 1)
         if fit.verdict is not Verdict.HOLDS:
-            return replace(self, looks=self.looks + 1, idle=self.idle + 1, share=share)
+            return replace(self, looks=self.looks + 1, idle=self.idle + 1, share=share, latest=(frame, fit))
         held = (*self.held[:1], *self.held[1:][-HELD:], (frame, fit))
-        return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share)
+        return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share, (frame, fit))
 
     def apart(self) -> float:
         """Metres between the places it was held from."""
@@ -115,12 +120,15 @@ class Seek:
             self.past = (*self.past, frame)[-PAST:]
 
     def favourite(self) -> Hypothesis | None:
-        """The only place that a look has held, if there is one and all others are well behind it."""
+        """The only place that a look has held, or nearly, if there is one and all others are well behind it."""
         held = [one for one in self.alive if one.held]
-        if len(held) != 1:
+        if len(held) > 1 or not self.alive:
             return None
-        behind = [one.share < held[0].share - BEHIND for one in self.alive if one is not held[0]]
-        return held[0] if all(behind) else None
+        best = held[0] if held else max(self.alive, key=lambda one: one.share)
+        behind = [one.share < best.share - BEHIND for one in self.alive if one is not best]
+        if not all(behind):
+            return None
+        return best if held else nearly(best)
 
     def sure(self, one: Hypothesis, witnessed: bool) -> bool:
         """Whether a place is the robot's; ``witnessed``: something else than the laser says so.
@@ -130,6 +138,17 @@ class Seek:
         if not self.complete or one.idle:
             return False
         return witnessed or (len(self.alive) == 1 and len(one.held) >= HELD and one.apart() >= HELD_M)
+
+
+def nearly(one: Hypothesis) -> Hypothesis | None:
+    """A place that no look has held, as if the latest had, where only somebody who stands about spoke against it."""
+    if one.latest is None:
+        return None
+    frame, fit = one.latest
+    x, y, yaw = np.sqrt(np.diag(fit.P)).tolist()
+    if fit.share < NEARLY or math.hypot(x, y) > NEARLY_M or yaw > NEARLY_RAD:
+        return None
+    return replace(one, T_map_odom=carried(frame, fit), held=((frame, fit),), idle=0)
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

@@ -102,6 +102,16 @@ def contradicted(lights: Lights) -> bool:
     return len(lights.tracks) == 1 and (math.isfinite(lights.t_lost) or math.isfinite(lights.t_odd))
 
 
+def disputed(state: State) -> bool:
+    """Whether what is received does not fit the place that was held, or a new one has had to be looked for."""
+    return state.light is not None and (contradicted(state.light.filter) or state.light.filter.lost) and told(state)
+
+
+def elsewhere(state: State, T_map_base: Array) -> bool:
+    """Whether light has the robot in one place, and that is not here."""
+    return len(windows(state)) == 1 and compatible(state, T_map_base) is False
+
+
 def about(lights: Lights, place: Place) -> Window:
     """The window about a place of the receiver."""
     rx = lights.survey.receiver

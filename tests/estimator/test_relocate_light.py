@@ -9,11 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from estimator import adrift
 from estimator.keyframe import Submap
 from estimator.light import LightsSetup
 from estimator.pipeline import new_state, step
 from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
-from estimator.relocate_light import Window, compatible, told, windows, witness
+from estimator.relocate_light import Window, compatible, disputed, elsewhere, told, windows, witness
 from estimator.state import State
 from estimator.submap import Settled
 from tools.experiments.relocate_world import Site, Stroll, lit_house
@@ -107,6 +108,24 @@ def test_a_robot_carried_off_is_looked_for_where_the_latest_light_came_from() ->
     assert compatible(state, HERE) is True
     assert witness(state, HERE)
     assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
+
+
+def test_a_robot_that_light_has_elsewhere_is_adrift_after_a_second_and_at_once_when_scans_do_not_fit() -> None:
+    """As in a room that looks alike: the laser would go on fitting for ever."""
+    for failures, patience in ((0, True), (2, False)):
+        state = shown(robot())
+        state.light.filter.lost = True  # type: ignore[union-attr]  # it has had to look for a new place
+        state.T_map_odom, state.failures = HERE + np.array((5.0, 0.0, 0.0)), failures
+        state.atlas.adrift, state.atlas.since = None, 0
+        assert disputed(state)
+        assert elsewhere(state, state.T_map_odom)
+        assert not elsewhere(state, HERE)
+        adrift.step_done(state)
+        assert (state.atlas.adrift is None) == patience
+        if patience:
+            state.absolute.elsewhere_since -= 1.1  # type: ignore[union-attr, operator]  # a second later
+        adrift.step_done(state)
+        assert state.atlas.adrift == 2
 
 
 def test_light_that_has_gone_says_nothing() -> None:
