@@ -19,6 +19,7 @@ from daemon.config import Config, LidarConfig, ModbusConfig, Mount
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot
 from daemon.record import Recorder
+from daemon.store import Start
 from daemon.worker import CycleWorker
 from estimator import se2
 from estimator.records import Command, Limits, Order
@@ -57,6 +58,7 @@ class Bench:
 
     folder: Path
     device_name: str = USB
+    start: Start | None = None
     snapshots: list[Snapshot] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -69,7 +71,7 @@ class Bench:
         self.opener.plug(self.device_name, self.device)
         self.faults = FaultSchedule({"lidar": self.device})
         settings = configured(self.device_name)
-        self.recorder = Recorder(self.folder, settings, self.clock)
+        self.recorder = Recorder(self.folder, settings, self.clock, start=self.start)
         self.daemon = Daemon(settings, self._world(), self.recorder)
         inbox = self.daemon.cycle.inbox
         self.put_odometry = self.recorder.on_odometry(inbox.put_odometry)
@@ -90,6 +92,7 @@ class Bench:
             warm_up=warm,
             sinks=(self.snapshots.append,),
             draw_map_id=lambda: 1,
+            start=self.start,
         )
 
     async def drive(self, seconds: float) -> None:
@@ -107,9 +110,11 @@ class Bench:
                 before = yaw
 
 
-def record(folder: Path, scenario: Callable[[Bench], Awaitable[None]], device: str = USB) -> Bench:
+def record(
+    folder: Path, scenario: Callable[[Bench], Awaitable[None]], device: str = USB, start: Start | None = None
+) -> Bench:
     async def go() -> Bench:
-        bench = Bench(folder, device)
+        bench = Bench(folder, device, start)
         stop = asyncio.Event()
         running = asyncio.create_task(bench.daemon.run(stop))
         try:

@@ -1,0 +1,93 @@
+"""A run that begins with a stored map: its recording holds that map, and the replay gives the same poses."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import cli
+from daemon.config import MapConfig
+from daemon.publish.snapshot import State
+from daemon.record import START
+from daemon.store import Start, Store, started
+from daemon.store_image import meta_of, packed
+from estimator import se2
+from estimator.mapimage import Identity, image_of
+from tests.daemon.replay.test_recorded_run import Bench, calm, record, replay
+
+MAP = 0xABC
+
+
+def kept(bench: Bench, folder: Path) -> Start:
+    """What a run has mapped, saved and loaded again."""
+    state = bench.daemon._estimator.state
+    assert state is not None
+    image = image_of(state, Identity(MAP))
+    Store(folder).save(packed(image, meta_of(image, 0.0, "robot", "")), MAP)
+    start = started(MapConfig(folder=str(folder)), None)[1]
+    assert start is not None
+    return start
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Bench, Start]:
+    folder = tmp_path_factory.mktemp("run")
+    start = kept(record(folder / "first", calm), folder / "maps")
+    return folder, record(folder / "second", calm, start=start), start
+
+
+def test_a_run_begins_with_the_map_and_does_not_pretend_to_know_its_place(run: tuple[Path, Bench, Start]) -> None:
+    _, bench, start = run
+    assert len(start.stored.tables["submap.key"]) >= 1
+    assert {snapshot.map_id for snapshot in bench.snapshots} == {MAP}
+    posed = [snapshot for snapshot in bench.snapshots if snapshot.pose is not None]
+    last = start.stored.tables["pose"][0]
+    assert np.abs(se2.between(last, np.array(posed[0].pose)))[:2].max() < 0.3, "it is guessed to be where it was"
+    early = [snapshot.state for snapshot in posed if snapshot.t_mono < posed[0].t_mono + 1.0]
+    assert State.TRACKING not in early
+
+
+def test_the_replay_repeats_it_to_the_last_bit(run: tuple[Path, Bench, Start], tmp_path: Path) -> None:
+    folder, bench, start = run
+    (recording,) = (folder / "second").iterdir()
+    assert (recording / START).read_bytes() == start.content
+    summary = replay(folder / "second", tmp_path / "out")
+    assert summary["recorded_run"] == {"cycles": bench.daemon.cycle.cycles, "differ": 0, "first_difference": ""}
+
+
+def test_a_replay_without_the_map_is_refused(
+    run: tuple[Path, Bench, Start], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (recording,) = (run[0] / "second").iterdir()
+    good = (recording / START).read_bytes()
+    for content, why in ((good[:-1], "is not the map that the recorded run began with"), (None, "No such file")):
+        (recording / START).unlink()
+        if content is not None:
+            (recording / START).write_bytes(content)
+        assert cli.main(["replay", str(run[0] / "second"), "--out", str(tmp_path / "out")]) == cli.FAILED
+        said = capsys.readouterr().err
+        assert why in said
+        assert "--set map.folder=DIR" in said
+    (recording / START).write_bytes(good)
+
+
+def test_a_replay_may_begin_with_a_map_that_a_person_names(
+    run: tuple[Path, Bench, Start], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    words = ["replay", str(run[0] / "first"), "--out", str(tmp_path / "out"), "--set", f"map.folder={run[0] / 'maps'}"]
+    with caplog.at_level(logging.INFO):
+        assert cli.main(words) == cli.OK
+    assert "map 00000abc of" in caplog.text
+    assert len(list((run[0] / "maps").glob("*.lumimap"))) == 1, "a replay writes no map there"
+
+
+def test_the_map_that_a_replay_writes_is_one_to_begin_with(
+    run: tuple[Path, Bench, Start], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replay(run[0] / "first", tmp_path / "out")
+    assert cli.main(["map", "verify", str(tmp_path / "out" / "map.lumimap")]) == cli.OK
+    assert "good, map" in capsys.readouterr().out
+    assert started(MapConfig(folder=str(tmp_path / "out")), None)[1] is not None
