@@ -116,14 +116,14 @@ def image_of(state: State, identity: Identity | None = None) -> MapImage:
     """The map of this moment, without what is adrift: that lies nobody knows where in it. At most a millisecond."""
     atlas, joined = state.atlas, state.atlas.constraints
     adrift = math.inf if atlas.adrift is None else atlas.adrift
-    pieces, hung = [], {}
+    pieces: list[Piece] = []
+    hung: dict[int, tuple[int, Array]] = {}
     for submap in atlas.submaps.values():
         if submap.key >= adrift:
             break
         pieces.append(_piece(submap))
-        for other in submap.hung:
-            if other.into is not None:
-                hung[other.key] = submap.key, other.into[1]
+        if len(submap.hung):
+            hung |= {other.key: (submap.key, other.into[1]) for other in submap.hung if other.into is not None}
     tie, identity = state.absolute, identity or Identity()
     placed = tie is not None and tie.placed and atlas.adrift is None
     gains, sensors, lamps = _learned(state)

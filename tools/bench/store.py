@@ -1,4 +1,4 @@
-"""The stored map: how long it takes to be gathered in a cycle, packed, written, verified and loaded, and how large it is.
+"""The stored map: how long it takes to be gathered in a cycle, packed, written, checked and loaded; how large it is.
 
 A robot drives once through the simulated office floor (1536 m2, 1081 beams); its map is then laid side by side until it
 covers 2000 m2 and more, each copy with keys of its own, as floors of a building would be. The lateness of a loop at
