@@ -41,6 +41,8 @@ def test_all_is_well() -> None:
         ({"jobs_failed": 1}, Fault.WORKER_FAILED),
         ({"failed": frozenset(["modbus"])}, Fault.PUBLISHER_FAILED),
         ({"failed": frozenset(["recorder"])}, Fault.RECORDER_FAILED),
+        ({"failed": frozenset(["map"])}, Fault.MAP_NOT_SAVED),
+        ({"failed": frozenset(["stored map"])}, Fault.MAP_REFUSED),
     ],
 )
 def test_each_cause_has_its_fault(change: dict[str, object], fault: Fault) -> None:

@@ -131,6 +131,9 @@ def test_a_plc_sets_the_pose_and_is_told_when_it_is_done() -> None:
         await outside(lambda: plc.order(3, 99, 0, 0, 0))
         await asyncio.sleep(0.3)
         assert await outside(plc.outcome) == (3, Outcome.UNKNOWN)
+        await outside(lambda: plc.order(4, CommandCode.SAVE_MAP, 0, 0, 0))
+        await asyncio.sleep(0.3)
+        assert await outside(plc.outcome) == (4, Outcome.REFUSED), "this daemon keeps no maps"
 
     run_virtual(go())
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 def kill(folder: Path, kills: int, seed: int) -> dict[str, int]:
     command = [sys.executable, "-m", "tests.daemon.killsave", str(folder), str(kills), str(seed)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280.0, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1700.0, check=False)
     assert done.returncode == 0, done.stderr
     found: dict[str, int] = json.loads(done.stdout)
     return found
@@ -30,6 +30,7 @@ def test_100_kills_leave_the_old_map_or_the_new_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_1000_kills_leave_the_old_map_or_the_new_one(tmp_path: Path) -> None:
     found = kill(tmp_path, 1000, 2)
     assert found["old"] + found["new"] == 1000
