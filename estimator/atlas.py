@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from estimator import se2
 from estimator.hypotheses import Seek
-from estimator.keyframe import Keyframe, Submap
+from estimator.keyframe import ANYWHERE, Keyframe, Submap
 from estimator.linear3 import invert3
 from estimator.loop import Found
 from estimator.posegraph import UPPER
@@ -128,6 +128,9 @@ class Atlas:
         submaps: by key, oldest first. frames: keyframes of the newest one. constraints: between them.
         C: covariance (odom axes) of the newest keyframe's place relative to the newest submap's, T_odom_last its place.
         marginal: covariance (odom axes) of the newest submap's place in the map.
+        strayed: covariance that the way has added since the start, about the odom frame's origin (see
+            :meth:`strayed_since`).
+        ties: covariance (odom axes) of submap ``tied``'s place relative to others, by key, as the graph has it.
         way_m: driven between keyframes. laid: how many keyframes; since_look: since the last look.
         waiting: loops without support. jobs: to be handed out. asked: when, in keyframes laid, and what to do with the
             answer, by job ID. look, solution: IDs of the latest jobs of these kinds.
@@ -145,6 +148,9 @@ class Atlas:
     C: Array = field(default_factory=lambda: np.zeros((3, 3)))
     T_odom_last: Array = field(default_factory=se2.identity)
     marginal: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    strayed: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    ties: dict[int, Array] = field(default_factory=dict)
+    tied: Submap | None = None
     way_m: float = 0.0
     laid: int = 0
     since_look: int = 0
@@ -250,11 +256,13 @@ class Atlas:
         newest, T = self.newest, frame.T_odom_keyframe
         x, y, _ = (T - self.T_odom_last).tolist()
         F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
-        self.C = F @ self.C @ F.T + P + FLOOR
+        self.C = F @ self.C @ F.T
+        self.loosen(P + FLOOR, T)
         self.way_m += math.hypot(x, y) if newest is not None else 0.0
         self.T_odom_last = T
         cut = newest is not None and self.adrift is not None and newest.key < self.adrift
         if newest is None or anew or cut or len(self.frames) >= SIZE:
+            self.strayed = self.strayed + ANYWHERE * (anew or cut)
             self._begin(frame, newest, sigma)
         frame.submap = next(reversed(self.submaps.values()))
         self.frames.append(frame)
@@ -283,7 +291,7 @@ class Atlas:
                 self.marginal = self.spread(T)
             if self.frames:
                 self._settle(before, tuple(self.frames), sigma)
-        self.submaps[key] = Submap(key, frame.key, frame.T_map_keyframe, T, self.way_m)
+        self.submaps[key] = Submap(key, frame.key, frame.T_map_keyframe, T, self.way_m, strayed=self.strayed)
         self.C = np.zeros((3, 3))
         self.frames = []
 
@@ -294,6 +302,31 @@ class Atlas:
         x, y, _ = (T_odom - newest.T_odom_submap).tolist()
         F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
         return np.asarray(F @ self.marginal @ F.T + self.C)
+
+    def loosen(self, P: Array, T_odom: Array) -> None:
+        """Add to what the way has lost, at a place: covariance ``P`` in odom axes."""
+        self.C += P
+        A = swing(-T_odom)
+        self.strayed = self.strayed + A @ P @ A.T
+
+    def strayed_since(self, since: Submap, T_odom: Array) -> Array:
+        """Covariance (odom axes) of a place relative to a submap by the way between them alone: a bound from above.
+
+        Each step of the way adds its own, swung out by the lever from there to here; summed up about one origin, the
+        sums of two instants can be subtracted.
+        """
+        A = swing(T_odom)
+        return np.asarray(A @ (self.strayed - since.strayed) @ A.T)
+
+    def apart(self, other: Submap, T_odom: Array) -> Array:
+        """Covariance (odom axes) of a place relative to an earlier submap: by the way since, or by a loop since."""
+        way = self.strayed_since(other, T_odom)
+        tie = self.ties.get(other.key)
+        if tie is None or self.tied is None:
+            return way
+        A = swing(T_odom - self.tied.T_odom_submap)
+        loop = np.asarray(A @ tie @ A.T + self.strayed_since(self.tied, T_odom))
+        return loop if np.trace(loop) < np.trace(way) else way
 
     def _settle(self, submap: Submap, frames: tuple[Keyframe, ...], sigma: float) -> None:
         def then(payload: object) -> None:
@@ -320,6 +353,11 @@ class Atlas:
         submap.hang_on(hub, se2.between(hub.T_map_submap, submap.T_map_submap))
         submap.settled = None
         del self.submaps[submap.key]
+
+
+def swing(lever: Array) -> Array:
+    """What an error becomes a lever (x, y) further on: an error of heading moves the place there."""
+    return np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0]), (0.0, 0.0, 1.0)))
 
 
 def cell_of(submap: Submap) -> tuple[int, int, int]:

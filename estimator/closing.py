@@ -23,6 +23,7 @@ from estimator.posegraph import UPPER, Graph, Solution, optimise
 from estimator.records import Answer, Array
 from estimator.result import Loop, LoopReason
 from estimator.state import State
+from estimator.tied import tied
 
 PHI: Final = 25.0
 """chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real rooms bend more than noise."""
@@ -73,24 +74,34 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
     """The nearest submaps that may be where the keyframe is, and were not left only just now."""
     T, atlas = frame.T_map_keyframe, state.atlas
     near = []
-    tie = state.absolute
-    P = turned(state, tie.P if tie is not None and tie.placed else atlas.spread(frame.T_odom_keyframe))
-    reach = min(told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])), told.most_m)
     for submap in atlas.of_part(frame.submap):
         settled = submap.settled
         if settled is None or atlas.way_m - submap.way_m <= told.recent_m:
             continue
         middle = se2.compose(submap.T_map_submap, settled.witness.T_odom_keyframe)
         x, y, yaw = se2.between(middle, T).tolist()
-        if math.hypot(x, y) < reach:  # who looks the other way sees little of the same
-            near.append((math.hypot(x, y) + told.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled))
+        if math.hypot(x, y) >= told.most_m:
+            continue
+        P = certainty(state, submap, frame)
+        if math.hypot(x, y) < told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])):
+            # who looks the other way sees little of the same
+            near.append((math.hypot(x, y) + told.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled, P))
     near.sort(key=lambda one: one[:2])
     made = []
-    for _, key, submap, settled in near[: told.candidates]:
+    for _, key, submap, settled, P in near[: told.candidates]:
         R = se2.rotation(-submap.T_map_submap[2])
         said = told_by_light(frame, submap, told)
         made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T, said))
     return tuple(made)
+
+
+def certainty(state: State, submap: Submap, frame: Keyframe) -> Array:
+    """Covariance (map axes) of the newest keyframe relative to a submap: by the way, by loops, or by light."""
+    P = state.atlas.apart(submap, frame.T_odom_keyframe)
+    tie = state.absolute
+    if tie is not None and tie.placed and np.trace(tie.P) < np.trace(P):
+        P = tie.P
+    return turned(state, P)
 
 
 def lit(state: State) -> bool:
@@ -158,11 +169,21 @@ def solve_graph(state: State, atlas: Atlas) -> None:
     graph = graph_of(state, atlas, submaps)
 
     def then(payload: object) -> None:
-        assert isinstance(payload, Solution)
-        correct(state, atlas, submaps, graph.poses, payload)
+        assert isinstance(payload, tuple)
+        solution, ties = payload
+        if correct(state, atlas, submaps, graph.poses, solution):
+            R = se2.rotation(-state.T_map_odom[2])
+            atlas.tied = submaps[-1]
+            atlas.ties = {submap.key: R @ P @ R.T for submap, P in zip(submaps, ties, strict=True)}
 
-    last = len(submaps) - 1
-    atlas.solution = atlas.ask(SOLVE, lambda: optimise(graph, MOST, SETTLED, PHI, covariance_of=last), then)
+    atlas.solution = atlas.ask(SOLVE, lambda: solved(graph), then)
+
+
+def solved(graph: Graph) -> tuple[Solution, Array]:
+    """The graph's solution, and how surely the newest submap lies relative to each (`tied`)."""
+    last = len(graph.poses) - 1
+    solution = optimise(graph, MOST, SETTLED, PHI, covariance_of=last)
+    return solution, tied(graph, solution.poses, solution.trust, last)
 
 
 def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
@@ -196,10 +217,10 @@ def certainty_of(T: Array, P_map: Array) -> list[float]:
     return [float(H[i, j]) for i, j in UPPER]
 
 
-def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> None:
+def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:
     """Move the submaps to where the graph has them, and the robot with the newest one.
 
-    A solution of what has been moved meanwhile is thrown away, and the graph is solved once more.
+    Returns whether it did: a solution of what has been moved meanwhile is thrown away, the graph is solved once more.
     """
     newest = atlas.newest
     held, last = lit(state), submaps[-1]
@@ -207,7 +228,7 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
     same = np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
     if newest is None or not same or not np.isfinite(solution.poses).all():
         atlas.stale |= not same
-        return
+        return False
     moved = se2.compose(solution.poses[-1], se2.inverse(last.T_map_submap))
     first = se2.compose(solution.poses[0], se2.inverse(submaps[0].T_map_submap))
     if state.live is not None:
@@ -217,7 +238,7 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
             submap.T_map_submap = T
     state.T_map_start = se2.compose(first, state.T_map_start)
     if held:
-        return
+        return True
     for submap in atlas.submaps.values():
         if submap.key > last.key:
             submap.T_map_submap = se2.compose(moved, submap.T_map_submap)
@@ -228,3 +249,4 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
         state.P_anchor = atlas.spread(state.T_odom_anchor)
     else:
         atlas.stale = True  # the newest one's certainty is not known yet
+    return True

@@ -87,9 +87,10 @@ def guess(state: State, H: Array, dt: float) -> None:
         return
     before, state.guessed_s = state.guessed_s, state.guessed_s + min(max(dt, 0.0), motion.LONGEST_CARRY_S)
     t0, t1 = max(0.0, before - motion.LONGEST_CARRY_S), max(0.0, state.guessed_s - motion.LONGEST_CARRY_S)
-    more = float(motion.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
-    state.P_anchor[:2, :2] += more
-    state.atlas.C[:2, :2] += more  # of the way between submaps as well, or no loop could bring them together again
+    more = np.zeros((3, 3))
+    more[:2, :2] = float(motion.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
+    state.P_anchor += more
+    state.atlas.loosen(more, state.T_odom_anchor)  # the way too, or no loop could bring submaps together again
 
 
 def noise_of(state: State, scan: Scan) -> float:

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
 """Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
 
+ANYWHERE = np.diag((1e3, 1e3, 10.0))
+"""Covariance (m, m, rad) of a place that no way joins with the others."""
+
 LONGEST_M = 1e6
 """Ranges beyond are kept as this: they say the same, and fit into single precision."""
 
@@ -49,6 +52,7 @@ class Submap:
         lamps: IDs of the lamps used at any of its keyframes (the paper's S_M, of this stretch).
         into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
         hung: those that lie in this one and that something still hangs on.
+        strayed: what the way until there may have strayed, see `Atlas.strayed_since`; as given: no way is known.
     """
 
     key: int
@@ -61,6 +65,7 @@ class Submap:
     lamps: frozenset[int] = frozenset()
     into: tuple[Submap, Array] | None = None
     hung: WeakSet[Submap] = field(default_factory=WeakSet)
+    strayed: Array = field(default_factory=lambda: -ANYWHERE)
 
     def hang_on(self, hub: Submap, T_hub_submap: Array) -> None:
         """Give up its place in the graph, and let what lies in it lie in ``hub`` at once.

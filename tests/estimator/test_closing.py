@@ -271,7 +271,7 @@ def test_light_tells_where_to_look_and_how_far() -> None:
     """The odom frame's own covariance grows with the way; a pose that light holds is looked for where light has it."""
     state, _ = driven(laps=1.02, settings=None)
     frame = next(reversed(state.keyframes.values()))
-    state.atlas.marginal = np.diag((9.0, 9.0, 1.0))
+    state.atlas.strayed, state.atlas.ties = state.atlas.strayed + np.diag((9.0, 9.0, 1.0)), {}
     state.absolute = Absolute(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
     near = candidates(state, TOLD, frame)
     assert near
