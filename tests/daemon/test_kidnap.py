@@ -13,7 +13,7 @@ from tools.sim.scene_light import LINK, Lights
 
 pytestmark = [pytest.mark.slow, pytest.mark.jit]
 
-UP, DOWN, END = 34.0, 36.0, 56.0
+UP, DOWN, END = 34.0, 36.0, 54.0
 ORDER = f'[[fault]]\nwhere = "robot"\nwhat = "carry"\nwhen = {UP}\nahead = 32.0\ntakes = {DOWN - UP}\n'
 
 

@@ -31,7 +31,7 @@ from tools.sim.ceiling import Effects
 
 FOLDER: Final = Path("out/experiments/relocate")
 SEED: Final = 1
-TRIALS: Final = 1000
+TRIALS: Final = 200
 QUICK: Final = 4
 FRAME_S: Final = 3.02
 """How long a lamp takes to tell what it is."""

@@ -46,7 +46,7 @@ BESIDE_M: Final = 1.3
 """A lamp hangs where the way passes a crossing of a grid of `SPACING_M` at no more than this."""
 WALL_M: Final = 0.2
 SECONDS: Final = 5.0
-TRIALS: Final = 1000
+TRIALS: Final = 200
 KNOWN_M: Final = 1.0
 """A place counts as mapped if the first half passed within this of it."""
 EFFECTS: Final = Effects(bounces=0, people=False, sway=False)

@@ -1,6 +1,7 @@
 """Somebody who lifts the robot and puts it down elsewhere on its tour: orders for ``robot`` beside those for devices.
 
-Its wheels stand still meanwhile, and it drives on from there as if nothing had happened.
+Its wheels stand still meanwhile, its lidar, tilted against somebody's coat, sees nothing, and it drives on from there
+as if nothing had happened.
 """
 
 from __future__ import annotations
@@ -47,6 +48,10 @@ class Way:
             return
         at = float(self.clock(np.array([t]))[0])
         self.carries.append(Carry(t, t + takes_s, at, at + ahead_s))
+
+    def in_the_air(self, t: float) -> bool:
+        """Whether somebody is carrying it."""
+        return any(one.t_up <= t < one.t_down for one in self.carries)
 
     def clock(self, t: Array) -> Array:
         """(n,) seconds on the drive's clock at (n,) instants; it stands still in the air."""

@@ -136,6 +136,8 @@ class SimulatedScene:
         legs = self._crowd.legs(t + self._scanner.sweep.first_s, robot)
         posture = Posture(self.scenario.body.height, pitch, roll)
         seen = self._scanner.measure(t, lambda at: compose(self._way.poses(at + since), self.mount), legs, posture)
+        if self._way.in_the_air(t + since):
+            seen = Returns(np.zeros_like(seen.range_m), np.zeros_like(seen.intensity))
         return to_device(self.model, seen)
 
     def begin(self, t_mono: float) -> float:
