@@ -28,6 +28,9 @@ FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
 CELL_M, KEPT = 3.0, 2
 """Submaps kept of each place so large and each quarter of heading."""
 
+OWN: Final = 12
+"""Submaps of this session kept on top of a restored map that is only used."""
+
 MANY: Final = 3
 """Loops kept between the same two submaps."""
 
@@ -139,6 +142,8 @@ class Atlas:
             later ones are a part of the graph that nothing joins to the older one. since: ID of their first keyframe, 0
             where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
             T_submap_adrift and its covariance in the latter's axes. seek: the search for the place.
+        kept: ID of the first keyframe of this session, where the map is one that was restored; else 0. held: whether that
+            map is only used; see `Settings.localise`.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
@@ -165,6 +170,8 @@ class Atlas:
     since: int = 0
     bridge: tuple[int, Array, Array] | None = None
     seek: Seek = field(default_factory=Seek)
+    kept: int = 0
+    held: bool = False
     closures: int = 0
     news: Loop | None = None
 
@@ -338,9 +345,21 @@ class Atlas:
 
     def thin_out(self, latest: Submap) -> None:
         """Bound what is kept per area: of the submaps of one place and heading the newest few stay."""
-        here = [other for other in self.of_part(latest) if cell_of(other) == cell_of(latest)]
+        here = [
+            other for other in self.of_part(latest) if cell_of(other) == cell_of(latest) and not self.is_held(other)
+        ]
         for submap in here[:-KEPT]:
             self.let_go(submap)
+        if self.held:
+            own = [submap for submap in self.submaps.values() if not self.is_held(submap)]
+            for submap in own[:-OWN]:
+                self.let_go(submap)
+            stored = [submap.key for submap in self.submaps.values() if self.is_held(submap)]
+            self.constraints.keep(~np.isin(self.constraints.between, stored).all(axis=1))
+
+    def is_held(self, submap: Submap) -> bool:
+        """Whether a submap is one of a restored map that is only used."""
+        return self.held and submap.first < self.kept
 
     def let_go(self, submap: Submap) -> None:
         """Take a submap out of the graph; what hangs on it goes on hanging, on the neighbour that is surest of it."""

@@ -162,7 +162,9 @@ def join(atlas: Atlas, frame: Keyframe, found: Found) -> None:
 
 def solve_graph(state: State, atlas: Atlas) -> None:
     """Hand out the graph, if it has changed and is not being solved."""
-    if atlas.solving or not atlas.stale:
+    newest = atlas.newest
+    begun = newest is not None and (atlas.adrift is None or newest.key >= atlas.adrift)
+    if atlas.solving or not atlas.stale or not begun:
         return
     atlas.stale = False
     submaps = tuple(atlas.submaps.values())
@@ -192,6 +194,9 @@ def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
     keys = np.array([submap.key for submap in submaps])
     poses = np.array([submap.T_map_submap for submap in submaps])
     edges = np.searchsorted(keys, joined.between)
+    if atlas.held:
+        held = np.array([atlas.is_held(submap) for submap in submaps])
+        return Graph(poses, edges, joined.T, joined.information, joined.loop, held=held)
     if not lit(state):
         return Graph(poses, edges, joined.T, joined.information, joined.loop)
     anchored, at, certainty = anchors(state, atlas, keys)
@@ -223,7 +228,7 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
     Returns whether it did: a solution of what has been moved meanwhile is thrown away, the graph is solved once more.
     """
     newest = atlas.newest
-    held, last = lit(state), submaps[-1]
+    held, last = lit(state) and not atlas.held, submaps[-1]
     counts = np.array([submap.into is None and not (held and submap is last) for submap in submaps])
     same = np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
     if newest is None or not same or not np.isfinite(solution.poses).all():
@@ -247,6 +252,8 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
         R = se2.rotation(-state.T_map_odom[2])
         atlas.marginal = R @ solution.covariance @ R.T
         state.P_anchor = atlas.spread(state.T_odom_anchor)
+        if state.absolute is not None and atlas.held:
+            state.absolute.P, state.absolute.X = state.P_anchor + state.fused.P, state.fused.P.copy()
     else:
         atlas.stale = True  # the newest one's certainty is not known yet
     return True

@@ -15,24 +15,33 @@ def obey(state: State, command: Command) -> None:
     """SET_POSE moves the whole map so that the robot stands there; RESET forgets the map and begins at that pose.
 
     A map of this session has no other tie to the world than what it is told, so it moves as one piece; where the place
-    in it is not known, only what is adrift moves. A pose that is no number is ignored; RESET without a pose begins at
-    the origin. RELOCALISE looks for the robot everywhere in the map, and begins a new local map, because the old one
-    may be that of another place. ``T_odom_base`` stays as it is.
+    in it is not known, only what is adrift moves. A map that was restored stays as it is, and the robot is looked for in
+    it about that pose. A pose that is no number is ignored; RESET without a pose begins at the origin. RELOCALISE looks
+    for the robot everywhere in the map, and begins a new local map, because the old one may be that of another place.
+    ``T_odom_base`` stays as it is.
     """
     T_map_base = command.T_map_base
     if T_map_base is not None and not np.isfinite(T_map_base).all():
         return
     if command.order is Order.RELOCALISE:
         if adrift.begin(state):
-            state.local, state.failures = None, 0
+            look_at_once(state)
         return
     if command.order is Order.RESET:
         forget(state)
         T_map_base = se2.identity() if T_map_base is None else T_map_base
     if T_map_base is not None:
+        if state.atlas.kept and state.atlas.adrift is None:
+            adrift.begin(state)
         place(state, T_map_base)
         if state.atlas.adrift is not None:
             adrift.hinted(state)
+            look_at_once(state)
+
+
+def look_at_once(state: State) -> None:
+    """Begin a new local map: its first keyframe is laid with the next scan, and looked for."""
+    state.local, state.failures = None, 0
 
 
 def forget(state: State) -> None:

@@ -206,7 +206,8 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
         state.places.setdefault(square_of(frame.T_map_keyframe), []).append(frame.key)
     livemap.begin(state)
     state.next_key = 1 + max((*state.keyframes, *(piece.first for piece in image.submaps)))
-    atlas.since = state.next_key
+    atlas.since = atlas.kept = state.next_key
+    atlas.held = state.settings.localise
     if state.absolute is not None:
         state.absolute.since = state.next_key
     return state

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from estimator import absolute, adrift, keyframe, localmap, se2
+from estimator.atlas import OWN
 from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
 from estimator.keyframe import Keyframe, Submap, square_of
@@ -16,6 +17,7 @@ from estimator.records import Array, Scan
 from estimator.result import MatchResult
 from estimator.scanpoints import ScanPoints
 from estimator.state import State
+from estimator.submap import SIZE
 
 PATIENCE = 3
 """Scans in a row that may fail to match before the local map is begun anew from the present one."""
@@ -129,10 +131,20 @@ def retire(state: State, newest: Keyframe) -> None:
     place = square_of(newest.T_map_keyframe)
     here = [key for key in state.places.get(place, ()) if key in state.keyframes]
     here.append(newest.key)
-    since = state.atlas.since  # what is adrift may be anywhere: it takes the place of nothing older
+    atlas = state.atlas  # what is adrift may be anywhere: it takes the place of nothing older
+    since = max(atlas.since, atlas.kept if atlas.held else 0)
     older, here = [key for key in here if key < since], [key for key in here if key >= since]
     while len(here) > state.settings.keep:
-        gone = state.keyframes.pop(here.pop(0))
-        if state.settings.history:
-            state.retired[gone.key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)
+        drop(state, here.pop(0))
     state.places[place] = older + here
+    if atlas.held:
+        own = [key for key in state.keyframes if key >= atlas.kept]
+        for key in own[: -OWN * SIZE]:
+            drop(state, key)
+
+
+def drop(state: State, key: int) -> None:
+    """Let go of a keyframe's scan."""
+    gone = state.keyframes.pop(key)
+    if state.settings.history:
+        state.retired[key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)

@@ -45,6 +45,7 @@ class Settings:
             the beams still fit the map.
         keep: keyframes kept per half metre square and eighth of a turn.
         history: keep the pose of keyframes whose scan has been let go; for replay, which needs them once at the end.
+        localise: a map that was restored is only used: it never moves, and what is laid on top of it is let go soon.
         live_m: metres per cell of a map that is kept up to date for whoever shows it; 0: none is.
         loops: when a place counts as seen before; None: never.
         matcher: the default one, or one to compare it with. weight: of Eq. 15, where the matcher is the paper's.
@@ -57,6 +58,7 @@ class Settings:
     keyframe_share: float = 0.7
     keep: int = 2
     history: bool = False
+    localise: bool = False
     live_m: float = 0.0
     loops: LoopSettings | None = field(default_factory=LoopSettings)
     matcher: Matcher = Matcher.LINE
