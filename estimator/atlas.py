@@ -142,8 +142,8 @@ class Atlas:
             later ones are a part of the graph that nothing joins to the older one. since: ID of their first keyframe, 0
             where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
             T_submap_adrift and its covariance in the latter's axes. seek: the search for the place.
-        kept: ID of the first keyframe of this session, where the map is one that was restored; else 0. held: whether that
-            map is only used; see `Settings.localise`.
+        kept: ID of this session's first keyframe, where the map is one that was restored; else 0. held: that map is
+            only used; see `Settings.localise`.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
@@ -355,7 +355,7 @@ class Atlas:
             for submap in own[:-OWN]:
                 self.let_go(submap)
             stored = [submap.key for submap in self.submaps.values() if self.is_held(submap)]
-            self.constraints.keep(~np.isin(self.constraints.between, stored).all(axis=1))
+            self.constraints.keep(np.asarray(~np.isin(self.constraints.between, stored).all(axis=1)))
 
     def is_held(self, submap: Submap) -> bool:
         """Whether a submap is one of a restored map that is only used."""

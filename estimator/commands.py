@@ -15,10 +15,10 @@ def obey(state: State, command: Command) -> None:
     """SET_POSE moves the whole map so that the robot stands there; RESET forgets the map and begins at that pose.
 
     A map of this session has no other tie to the world than what it is told, so it moves as one piece; where the place
-    in it is not known, only what is adrift moves. A map that was restored stays as it is, and the robot is looked for in
-    it about that pose. A pose that is no number is ignored; RESET without a pose begins at the origin. RELOCALISE looks
-    for the robot everywhere in the map, and begins a new local map, because the old one may be that of another place.
-    ``T_odom_base`` stays as it is.
+    in it is not known, only what is adrift moves. A map that was restored stays as it is, and the robot is looked for
+    in it about that pose. A pose that is no number is ignored; RESET without a pose begins at the origin. RELOCALISE
+    looks for the robot everywhere in the map, and begins a new local map, because the old one may be that of another
+    place. ``T_odom_base`` stays as it is.
     """
     T_map_base = command.T_map_base
     if T_map_base is not None and not np.isfinite(T_map_base).all():

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from estimator import se2
-from estimator.pipeline import keyframe_poses, new_state, step
-from estimator.records import UNLIMITED, Command, Order
-from estimator.submap import SIZE
+from estimator.atlas import OWN
+from estimator.pipeline import Settings, keyframe_poses, new_state, step
+from estimator.records import UNLIMITED, Array, Command, Order
+from estimator.submap import SIZE, Settled
+from tests.estimator.adrift import Corners, Robot, furnished, mapped, stored, way
 from tests.estimator.test_closing import driven, lay, run_jobs
+from tools.bench._scenes import Scene, box
 
 
 def test_without_a_map_there_is_nothing_to_look_in() -> None:
@@ -61,3 +65,115 @@ def test_a_pose_that_is_given_moves_only_what_is_adrift_and_a_second_break_forge
     step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED)
     assert 1000 not in state.keyframes
     assert state.atlas.adrift == adrift
+
+
+HALL = (1.0, 6.0), (10.8, 6.0), (1.0, 6.0)
+TOUR = (*HALL, (1.85, 6.0), (1.85, 1.5), (1.85, 6.0), (5.85, 6.0), (5.85, 1.5), (5.85, 6.0), (9.05, 6.0), (9.05, 1.5))
+
+
+@pytest.fixture(scope="module")
+def floor() -> tuple[Scene, list[tuple[Array, Settled]]]:
+    scene = furnished()
+    return scene, mapped(scene, TOUR)
+
+
+@pytest.mark.jit
+@pytest.mark.parametrize("corners", [((1.85, 1.5), (1.85, 6.0), (4.0, 6.0)), ((9.0, 5.5), (9.05, 1.5)), HALL[::-1]])
+def test_switched_on_anywhere_in_a_stored_map(
+    floor: tuple[Scene, list[tuple[Array, Settled]]], corners: Corners
+) -> None:
+    scene, submaps = floor
+    robot = Robot(stored(submaps), scene)
+    said = robot.along(way(corners, 0.06))
+    assert said[0] == 0
+    assert said[-1] is None
+    assert robot.off()[0] < 0.1
+    assert robot.off()[1] < np.radians(1.0)
+    atlas = robot.state.atlas
+    crossing = (atlas.constraints.between > len(submaps)).sum(axis=1) == 1
+    assert 1 <= crossing.sum() <= 2
+    assert atlas.constraints.loop[crossing].all()
+    assert robot.state.jumps == 1
+    for key, (T, _) in enumerate(submaps, 1):
+        np.testing.assert_array_equal(atlas.submaps[key].T_map_submap, T)
+    fresh = [frame for key, frame in robot.state.keyframes.items() if key >= 1000]
+    listed = {key for keys in robot.state.places.values() for key in keys}
+    assert {frame.key for frame in fresh} <= listed
+
+
+@pytest.mark.jit
+def test_a_room_that_is_its_own_image_stays_ambiguous() -> None:
+    """Turned by half a turn it looks the same from everywhere: no way through it tells which end is which."""
+    scene = Scene(np.array(box(-3.0, -2.0, 3.0, 2.0), dtype=np.float64), (-2.5, -1.5), (2.5, 1.5))
+    about = (-1.5, -1.0), (1.5, -1.0), (1.5, 1.0), (-1.5, 1.0), (-1.5, -1.0)
+    robot = Robot(stored(mapped(scene, about)), scene)
+    said = robot.along(way(about[1:], 0.08))
+    assert set(said) == {0, 2}
+    assert said[-1] == 2
+
+
+@pytest.mark.jit
+def test_carried_to_another_room_and_what_was_mapped_since_comes_along(
+    floor: tuple[Scene, list[tuple[Array, Settled]]],
+) -> None:
+    scene, submaps = floor
+    robot = Robot(stored(submaps), scene)
+    assert robot.along(way(HALL, 0.06))[-1] is None
+    said = robot.along(way(((9.05, 1.5), (9.05, 6.0), (7.0, 6.0)), 0.06), carried=True)
+    assert 0 in said
+    assert said[-1] is None
+    assert robot.off()[0] < 0.1
+    assert robot.state.anew == 1
+
+
+@pytest.mark.jit
+def test_in_a_part_that_is_not_mapped_nothing_is_said_until_the_robot_comes_into_one_that_is() -> None:
+    scene = furnished((4.0, 3.2, 4.6, 3.8))
+    west = (1.0, 6.0), (6.0, 6.0), (1.85, 6.0), (1.85, 1.5), (1.85, 6.0), (5.85, 6.0), (5.85, 1.5)
+    robot = Robot(stored(mapped(scene, west)), scene)
+    stays = robot.along(way(((13.65, 1.5), (13.65, 3.6), (13.65, 1.5), (13.0, 1.5)), 0.08))
+    assert None not in stays
+    comes = robot.along(way(((13.65, 1.5), (13.65, 6.0), (1.85, 6.0), (1.85, 1.5)), 0.1))
+    assert comes[-1] is None
+    assert robot.off()[0] < 0.15
+    assert len(robot.state.atlas.submaps) > len(mapped(scene, west))
+
+
+@pytest.mark.jit
+def test_a_person_s_word_is_looked_at_first_and_does_not_move_a_restored_map(
+    floor: tuple[Scene, list[tuple[Array, Settled]]],
+) -> None:
+    scene, submaps = floor
+    robot, T = Robot(stored(submaps), scene), np.array((1.85, 3.0, -1.5))
+    robot.at(T)
+    about = se2.compose(T, np.array((0.3, -0.2, 0.1)))
+    said = [robot.at(T, Command(robot.t, Order.SET_POSE, about)).places] + [robot.at(T).places for _ in range(8)]
+    assert said[-1] is None  # at rest, with one look
+    assert robot.off()[0] < 0.1
+    wrong = Robot(stored(submaps), scene)
+    wrong.at(T)
+    wrong.at(T, Command(wrong.t, Order.SET_POSE, np.array((9.05, 4.0, 0.0))))
+    assert None not in [wrong.at(T).places for _ in range(8)]
+    for key, (place, _) in enumerate(submaps, 1):
+        np.testing.assert_array_equal(wrong.state.atlas.submaps[key].T_map_submap, place)
+
+
+@pytest.mark.jit
+def test_a_map_that_is_only_used_never_moves_and_what_is_laid_on_top_is_bounded(
+    floor: tuple[Scene, list[tuple[Array, Settled]]],
+) -> None:
+    scene, submaps = floor
+    state = stored(submaps, Settings(localise=True))
+    robot = Robot(state, scene)
+    assert robot.along(way(HALL, 0.06))[-1] is None
+    for T in way((*HALL, *TOUR), 0.2, 0.4):
+        robot.at(T)
+    assert robot.off()[0] < 0.06
+    assert state.atlas.closures > 3
+    own = [key for key in state.atlas.submaps if key > len(submaps)]
+    assert max(own) - len(submaps) > OWN
+    assert len(own) <= OWN + 2
+    assert len([key for key in state.keyframes if key >= 1000]) <= OWN * SIZE
+    for key, (T, settled) in enumerate(submaps, 1):
+        np.testing.assert_array_equal(state.atlas.submaps[key].T_map_submap, T)
+        assert state.atlas.submaps[key].settled is settled
