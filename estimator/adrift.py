@@ -18,7 +18,7 @@ from estimator import absolute, se2
 from estimator.atlas import LOOK, Atlas
 from estimator.closing import join
 from estimator.globalsearch import Around
-from estimator.hypotheses import Hypothesis, Seek
+from estimator.hypotheses import WATCH_M, Hypothesis, Seek, Watch
 from estimator.keyframe import Keyframe, square_of
 from estimator.linear3 import invert3
 from estimator.loop import Found
@@ -242,6 +242,8 @@ def land(state: State, one: Hypothesis) -> None:
     shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), atlas.since)
     move_map(state, T_map_odom)
     since, first = atlas.since, atlas.adrift
+    if first is not None:
+        atlas.watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain)
     atlas.adrift, atlas.since, atlas.seek = None, 0, Seek(terrain=atlas.seek.terrain)
     for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
         if it.key in atlas.submaps:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator import se2
-from estimator.hypotheses import Seek
+from estimator.hypotheses import Seek, Watch
 from estimator.keyframe import ANYWHERE, Keyframe, Submap
 from estimator.linear3 import invert3
 from estimator.loop import Found
@@ -141,7 +141,8 @@ class Atlas:
         adrift: key of the first submap whose place in the map is not known, None where the robot's place is: it and all
             later ones are a part of the graph that nothing joins to the older one. since: ID of their first keyframe, 0
             where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
-            T_submap_adrift and its covariance in the latter's axes. seek: the search for the place.
+            T_submap_adrift and its covariance in the latter's axes. seek: the search for the place; watch: of one
+            that was found.
         kept: ID of this session's first keyframe, where the map is one that was restored; else 0. held: that map is
             only used; see `Settings.localise`.
         closures: loops accepted so far. news: the latest, until it was reported.
@@ -170,6 +171,7 @@ class Atlas:
     since: int = 0
     bridge: tuple[int, Array, Array] | None = None
     seek: Seek = field(default_factory=Seek)
+    watch: Watch | None = None
     kept: int = 0
     held: bool = False
     closures: int = 0

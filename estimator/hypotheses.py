@@ -28,6 +28,9 @@ PAST, PAST_M = 4, 0.6
 IDLE: Final = 8
 """Looks in a row that may leave a place open; one that holds comes back with the next search."""
 
+WATCH_M: Final = 20.0
+"""Way for which a place is watched once it was found."""
+
 MOST: Final = 32
 """Hypotheses carried at most."""
 
@@ -39,6 +42,9 @@ NEARLY, NEARLY_M, NEARLY_RAD = 0.75, 0.1, 0.03
 
 AGAIN_M, AGAIN_RAD = 1.0, 1.0
 """Way or turn after which it is searched again."""
+
+SOONER: Final = 0.45
+"""Part of that where nothing has been found yet, or too much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +103,11 @@ class Seek:
 
     def due(self, frame: Keyframe) -> bool:
         """Whether a keyframe is to be searched for, and not only looked at where it should be."""
-        if self.searched is None or not self.alive or not self.complete:
+        if self.searched is None:
             return True
         x, y, yaw = se2.between(self.searched, frame.T_odom_keyframe).tolist()
-        return math.hypot(x, y) > AGAIN_M or abs(yaw) > AGAIN_RAD
+        part = 1.0 if self.alive and self.complete else SOONER
+        return math.hypot(x, y) > part * AGAIN_M or abs(yaw) > part * AGAIN_RAD
 
     def take(self, frame: Keyframe, asked: tuple[Hypothesis, ...], looked: Looked) -> None:
         """Take in a look at ``frame``, which was asked for the hypotheses ``asked``."""
@@ -149,6 +156,23 @@ def nearly(one: Hypothesis) -> Hypothesis | None:
     if fit.share < NEARLY or math.hypot(x, y) > NEARLY_M or yaw > NEARLY_RAD:
         return None
     return replace(one, T_map_odom=carried(frame, fit), held=((frame, fit),), idle=0)
+
+
+@dataclass(slots=True, eq=False)
+class Watch:
+    """A place that was found is watched for a while.
+
+    Attributes:
+        first: key of the first submap that is no part of the map it was found in. until_m: way until then.
+        strikes: looks that have spoken against it since one held it. job: ID of the look under way. terrain: of the
+            latest.
+    """
+
+    first: int
+    until_m: float
+    terrain: Terrain | None
+    strikes: int = 0
+    job: int = 0
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

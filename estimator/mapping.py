@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from estimator import absolute, adrift, keyframe, localmap, se2
+from estimator import absolute, adrift, keyframe, localmap, se2, watch
 from estimator.atlas import OWN
 from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
@@ -89,6 +89,7 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
         adrift.local_map_lost(state)
     keyframe_laid(state, frame, P, noise_of(state, scan), anew)
     adrift.keyframe_laid(state, frame)
+    watch.keyframe_laid(state, frame)
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key

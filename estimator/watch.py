@@ -1,0 +1,45 @@
+"""After a place was found in the whole map: whether what is seen from there on goes on being true of it.
+
+A room that is not in the map may look like one that is. While the robot stays in it nothing tells; what it sees when
+it leaves does, and then it is adrift again instead of going on in the wrong place.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+from estimator import adrift
+from estimator.atlas import LOOK
+from estimator.hypotheses import Watch
+from estimator.keyframe import Keyframe
+from estimator.relocate import Looked, Piece, Query, Verdict, look
+from estimator.state import State
+
+STRIKES: Final = 3
+"""Looks, with none between that holds the place, after which it was the wrong one."""
+
+
+def keyframe_laid(state: State, frame: Keyframe) -> None:
+    """Look whether a new keyframe is true of the map as it was before the place was found."""
+    atlas, told, watch = state.atlas, state.settings.loops, state.atlas.watch
+    if watch is None or told is None or atlas.adrift is not None or watch.job in atlas.asked:
+        return
+    if atlas.way_m > watch.until_m:
+        atlas.watch = None
+        return
+    older = [one for one in atlas.settled() if one.key < watch.first]
+    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
+    if pieces:
+        query = Query(frame, pieces, watch.terrain, (frame.T_map_keyframe,), (), search=False)
+        watch.job = atlas.ask(LOOK, partial(look, query, told), partial(take, state, watch))
+
+
+def take(state: State, watch: Watch, payload: object) -> None:
+    """Take in what a look has found."""
+    assert isinstance(payload, Looked)
+    (fit,), watch.terrain = payload.guesses, payload.terrain
+    watch.strikes = 0 if fit.verdict is Verdict.HOLDS else watch.strikes + (fit.verdict is Verdict.NO)
+    if watch.strikes >= STRIKES and state.atlas.watch is watch and state.atlas.adrift is None:
+        state.atlas.watch = None
+        adrift.begin(state)
