@@ -10,7 +10,7 @@ from estimator.atlas import OWN
 from estimator.pipeline import Settings, keyframe_poses, new_state, step
 from estimator.records import UNLIMITED, Array, Command, Order
 from estimator.submap import SIZE, Settled
-from tests.estimator.adrift import Corners, Robot, furnished, mapped, rooms, stored, way
+from tests.estimator.adrift import Corners, Robot, furnished, mapped, stored, way
 from tests.estimator.test_closing import driven, lay, run_jobs
 from tools.bench._scenes import Scene, box
 
@@ -177,19 +177,3 @@ def test_a_map_that_is_only_used_never_moves_and_what_is_laid_on_top_is_bounded(
     for key, (T, settled) in enumerate(submaps, 1):
         np.testing.assert_array_equal(state.atlas.submaps[key].T_map_submap, T)
         assert state.atlas.submaps[key].settled is settled
-
-
-@pytest.mark.jit
-def test_a_room_like_one_that_is_mapped_is_left_and_the_mistake_with_it() -> None:
-    """Nobody can tell in there; the way out does, and the robot is not left in the wrong place."""
-    scene = rooms((4.0, 4.0, 3.0))
-    robot = Robot(stored(mapped(scene, ((9.5, 6.0), (5.85, 6.0), (5.85, 1.2), (5.85, 6.0), (9.5, 6.0)))), scene)
-    within = (1.0, 1.0), (3.0, 1.0), (3.0, 4.0), (1.0, 4.0), (1.85, 1.5)
-    assert robot.along(way(within, 0.08))[-1] is None
-    assert robot.off()[0] == pytest.approx(4.0, abs=0.1)
-    out = [robot.at(T).places for T in way(((1.85, 1.5), (1.85, 6.0), (0.8, 6.0)), 0.1)]
-    assert out[0] is None
-    assert 0 in out
-    back = robot.along(way(((0.8, 6.0), (9.5, 6.0)), 0.1))
-    assert back[-1] is None
-    assert robot.off()[0] < 0.15
