@@ -106,68 +106,68 @@ def fitted(
     return np.column_stack((middle, normal, slope))[good], n[good].astype(np.int64), at[good]
 
 
+@kernel("void(i8[:, :, ::1], i8, i8, i8, u1[::1])")
+def mark(line_of: npt.NDArray[np.int64], side: int, row: int, column: int, seen: npt.NDArray[np.uint8]) -> None:
+    """Mark the lines of a cell and of those beside it as seen: beams a few metres off pass between cells."""
+    _, rows, columns = line_of.shape
+    for a in range(max(0, row - 1), min(rows, row + 2)):
+        for b in range(max(0, column - 1), min(columns, column + 2)):
+            if line_of[side, a, b] >= 0:
+                seen[line_of[side, a, b]] = 1
+
+
 @kernel(
-    "void(i1[:, ::1], f8, f8[::1], i8[:, :, ::1], f8[:, ::1], Tuple((f8[::1], f8[::1], u1[::1])), u1[::1])",
+    "void(i1[:, ::1], f8[::1], Tuple((i8[:, :, ::1], f8[:, ::1])), Tuple((f8[::1], f8[::1], u1[::1])), u1[::1])",
 )
 def look(
     cells: Cells,
-    resolution: float,
     eye: Array,
-    line_of: npt.NDArray[np.int64],
-    lines: Array,
+    surfaces: tuple[npt.NDArray[np.int64], Array],
     scan: tuple[Array, Array, npt.NDArray[np.uint8]],
     seen: npt.NDArray[np.uint8],
 ) -> None:
-    """What a lidar at ``eye`` (x, y) sees of the cells: fills in ``scan``, and marks in ``seen`` the lines it hits.
+    """What a lidar at ``eye`` (x, y, resolution) sees of the cells: fills in ``scan``, and marks the lines it hits.
 
     A beam ends on the line fitted to the side of the cell that it enters; where there is none, in the cell's middle.
+    ``surfaces``: ``line_of`` and ``lines`` of a `Plan`. ``seen``: for each of the lines.
     """
+    line_of, lines = surfaces
     bearing, distance, kind = scan
     rows, columns = cells.shape
+    resolution = eye[2]
+    ox, oy = eye[0] / resolution, eye[1] / resolution
     for i in range(len(bearing)):
         dx, dy = np.cos(bearing[i]), np.sin(bearing[i])
-        ox, oy = eye[0] / resolution, eye[1] / resolution
+        side_x, side_y = (1 if dx > 0.0 else 0), (3 if dy > 0.0 else 2)
         column, row = int(np.floor(ox)), int(np.floor(oy))
-        step_x = 1 if dx > 0.0 else -1
-        step_y = 1 if dy > 0.0 else -1
         next_x = (column + (dx > 0.0) - ox) / dx if dx != 0.0 else np.inf
         next_y = (row + (dy > 0.0) - oy) / dy if dy != 0.0 else np.inf
-        kind[i], distance[i] = 2, 30.0
+        kind[i], distance[i] = 2, FAR_M
         while True:
             if next_x < next_y:
-                gone, side = next_x, (1 if dx > 0.0 else 0)
-                column += step_x
+                gone, side, other = next_x * resolution, side_x, side_y
+                column += 1 if dx > 0.0 else -1
                 next_x += abs(1.0 / dx)
             else:
-                gone, side = next_y, (3 if dy > 0.0 else 2)
-                row += step_y
+                gone, side, other = next_y * resolution, side_y, side_x
+                row += 1 if dy > 0.0 else -1
                 next_y += abs(1.0 / dy)
-            gone *= resolution
-            if gone >= 30.0:
+            if gone >= FAR_M:
                 break
-            if row < 0 or column < 0 or row >= rows or column >= columns or cells[row, column] == -1:
+            if row < 0 or column < 0 or row >= rows or column >= columns or cells[row, column] == UNKNOWN:
                 distance[i] = gone
                 break
-            if cells[row, column] != 1:
+            if cells[row, column] != OCCUPIED:
                 continue
             kind[i], distance[i] = 1, gone + 0.5 * resolution
-            other = (3 if dy > 0.0 else 2) if side < 2 else (1 if dx > 0.0 else 0)
-            best = line_of[side, row, column]
-            if best < 0:
-                best = line_of[other, row, column]
+            best = line_of[side, row, column] if line_of[side, row, column] >= 0 else line_of[other, row, column]
             if best >= 0:
-                nx, ny = lines[best, 2], lines[best, 3]
-                facing = dx * nx + dy * ny
-                if facing < -0.05:
-                    r = ((lines[best, 0] - eye[0]) * nx + (lines[best, 1] - eye[1]) * ny) / facing
-                    if abs(r - gone) < 3.0 * resolution:
-                        distance[i] = r
-                for a in range(max(0, row - 1), min(rows, row + 2)):
-                    for b in range(max(0, column - 1), min(columns, column + 2)):
-                        if line_of[side, a, b] >= 0:
-                            seen[line_of[side, a, b]] = 1
-                        if line_of[other, a, b] >= 0:
-                            seen[line_of[other, a, b]] = 1
+                facing = dx * lines[best, 2] + dy * lines[best, 3]
+                away = (lines[best, 0] - eye[0]) * lines[best, 2] + (lines[best, 1] - eye[1]) * lines[best, 3]
+                if facing < -0.05 and abs(away / facing - gone) < 3.0 * resolution:
+                    distance[i] = away / facing
+                mark(line_of, side, row, column, seen)
+                mark(line_of, other, row, column, seen)
             break
 
 
@@ -236,7 +236,8 @@ def piece_of(
     frames = []
     for number, eye in enumerate(eyes, first):
         distance, kind = np.zeros(len(bearing)), np.zeros(len(bearing), np.uint8)
-        look(plan.cells, plan.resolution, eye, plan.line_of, plan.lines, (bearing, distance, kind), seen)
+        at = np.array((*eye, plan.resolution))
+        look(plan.cells, at, (plan.line_of, plan.lines), (bearing, distance, kind), seen)
         T = se2.compose(T_map_cells, np.array((*eye, 0.0)))
         frames.append(Keyframe(number, submap, T, np.zeros(3), bearing, 0.0, distance.astype(np.float32), kind))
     which = seen != 0
@@ -247,8 +248,8 @@ def piece_of(
     elements[:, WEIGHT] = np.where(plan.count[which] >= 2 * FEW, 1.0, UNPROVED)
     elements[:, SEEN] = 1.0
     widest = max(frames, key=lambda frame: int((frame.beam == Beam.HIT).sum()))
-    at = se2.between(T_map, widest.T_odom_keyframe)
-    witness = Keyframe(widest.key, submap, at, np.zeros(3), bearing, 0.0, widest.range_m, widest.beam)
+    T_submap_witness = se2.between(T_map, widest.T_odom_keyframe)
+    witness = Keyframe(widest.key, submap, T_submap_witness, np.zeros(3), bearing, 0.0, widest.range_m, widest.beam)
     sigma = max(0.01, plan.resolution / math.sqrt(12.0))
     settled = Settled(elements.astype(np.float32), witness, sigma)
     return Piece(key, first, T_map, T_map, 0.0, settled, None), frames
