@@ -208,6 +208,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         views.append((track, seen))
     if len(lights.tracks) > 1:
         rule_out(lights, epoch)
+    if len(lights.tracks) > 1:
         decide(lights)
     return next((seen for track, seen in views if lights.tracks and track is lights.tracks[0]), [])
 

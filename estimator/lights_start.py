@@ -194,26 +194,29 @@ def decide(lights: Lights) -> None:
 
 
 def rule_out(lights: Lights, epoch: LightEpoch) -> None:
-    """Drop hypotheses from which a lamp cannot be seen that has said which one it is, as long as one is left.
+    """Drop hypotheses from which lamps cannot be seen that have said which ones they are.
 
-    Where codes repeat this decides, even at rest.
+    Where codes repeat this decides, even at rest. The last ones go, and the start begins anew with what the lamps have
+    said, only if most of these lamps, and two at least, are out of their sight: one alone may have been moved.
     """
-    rx, out = lights.survey.receiver, []
     named = [
         (lights.catalogue.by_id[frame.lamp_id], float(epoch.amplitude[i]))
         for i, frame in enumerate(epoch.lamps)
         if frame is not None and frame.lamp_id in lights.catalogue.by_id
     ]
     direct = [lamp for lamp, amplitude in named if amplitude > lights.catalogue.rims[lamp.lamp_id]]
-    for track in lights.tracks:
-        spread = 3.0 * math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0)) + APART_M
-        for lamp in direct:
-            reach = (lamp.z - rx.z) * math.tan(min(rx.half_fov_rad, 1.3)) + spread
-            if math.hypot(lamp.x - track.x[0], lamp.y - track.x[1]) > reach:
-                out.append(track)
-                break
-    if out and len(out) < len(lights.tracks):
-        lights.tracks = [track for track in lights.tracks if track not in out]
+    unseen = [sum(out_of_sight(lights, track, lamp) for lamp in direct) for track in lights.tracks]
+    kept = [track for track, count in zip(lights.tracks, unseen, strict=True) if count == 0]
+    if kept or min(unseen) >= max(2.0, 0.5 * len(direct)):
+        lights.tracks = kept
+
+
+def out_of_sight(lights: Lights, track: Track, lamp: Lamp) -> bool:
+    """Whether a lamp is beyond the field of view wherever a hypothesis allows the receiver to be."""
+    rx = lights.survey.receiver
+    spread = 3.0 * math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0)) + APART_M
+    reach = (lamp.z - rx.z) * math.tan(min(rx.half_fov_rad, 1.3)) + spread
+    return math.hypot(lamp.x - float(track.x[0]), lamp.y - float(track.x[1])) > reach
 
 
 def same(a: Track, b: Track) -> bool:

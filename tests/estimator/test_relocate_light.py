@@ -12,6 +12,7 @@ import pytest
 from estimator import adrift
 from estimator.keyframe import Submap
 from estimator.light import LightsSetup
+from estimator.lights_start import rule_out
 from estimator.pipeline import new_state, step
 from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
 from estimator.relocate_light import Window, compatible, disputed, elsewhere, told, windows, witness
@@ -143,5 +144,25 @@ def test_a_lamp_that_says_which_one_it_is_rules_out_the_other_room_at_rest() -> 
     for epoch in told_by_itself[:3]:
         moved = [Odometry(0.6, epoch.t_end, np.zeros(3))] if epoch is told_by_itself[0] else []
         step(state, [*moved, epoch], UNLIMITED)
+    (window,) = windows(state)
+    assert inside(window, at)
+
+
+def test_lamps_that_say_which_they_are_end_a_start_in_the_wrong_room() -> None:
+    """Only the twin had been thought of; two lamps out of its sight are enough, one may have been moved."""
+    at = np.array((2.2, 3.0, 0.4))
+    state = shown(robot(reused=True), at, reused=True)
+    lights = state.light.filter  # type: ignore[union-attr]
+    lights.tracks = [track for track in lights.tracks if track.x[0] > 10.0]
+    assert len(lights.tracks) > 1
+    way = Stroll(at, 0.0, 0.0)
+    epoch = next(one for one in site(True).light(way.at, (0.0, 3.6), 1) if sum(map(bool, one.lamps)) >= 4)
+    first = next(k for k in np.argsort(-epoch.amplitude) if epoch.lamps[k])
+    alone = replace(epoch, lamps=tuple(one if k == first else None for k, one in enumerate(epoch.lamps)))
+    rule_out(lights, alone)
+    assert lights.tracks
+    rule_out(lights, epoch)
+    assert not lights.tracks
+    step(state, [Odometry(0.6, epoch.t_end, np.zeros(3)), epoch], UNLIMITED)
     (window,) = windows(state)
     assert inside(window, at)
