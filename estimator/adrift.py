@@ -25,7 +25,7 @@ from estimator.loop import Found
 from estimator.mapframe import move_map, shift_map
 from estimator.records import Array
 from estimator.relocate import Looked, Piece, Query, look
-from estimator.result import LoopReason
+from estimator.result import Fix, LoopReason
 from estimator.state import State
 
 HINT_M, HINT_RAD = 1.0, 0.5
@@ -34,9 +34,11 @@ HINT_LOOKS: Final = 4
 """Looks after which the map says that it is not there."""
 PATIENCE_S: Final = 1.0
 """Light is waited for so long before the whole map is searched."""
-ELSEWHERE_S, UNFIT = 1.0, 2
+ELSEWHERE_S, UNFIT = 3.0, 2
 """Light that has the robot elsewhere for so long is believed that it was carried off; and at once when so many scans in
 a row did not fit."""
+ALONE_M: Final = 5.0
+"""Way after which light alone, if it is good and agrees, is believed where the map knows nothing of the place."""
 STALE: Final = 5
 """Scans after which a keyframe that was found nowhere is laid anew, where light says that it must be here."""
 SURPRISE: Final = 16.3
@@ -128,7 +130,7 @@ def step_done(state: State) -> None:
     if seek.job in atlas.asked or seek.hint is not None:
         return
     decide(state)
-    if state.atlas.adrift is None:
+    if state.atlas.adrift is None or by_light_alone(state):
         return
     allowed = windows(state, frame)
     if allowed is None and not (seek.looks == 0 and state.fused.t_mono - seek.t_begin > PATIENCE_S):
@@ -140,6 +142,26 @@ def step_done(state: State) -> None:
     elif asked != seek.lit:
         seek.lit, seek.searched = asked, None
         look_for(state, frame, allowed)
+
+
+def by_light_alone(state: State) -> bool:
+    """End being adrift where light has long told the place, in a part of the building that the map does not know.
+
+    Both parts of the graph then hang on what light has said of them.
+    """
+    from estimator.relocate_light import told
+
+    atlas, seek, tie, light = state.atlas, state.atlas.seek, state.absolute, state.light
+    if tie is None or light is None or light.result.fix is not Fix.GOOD or tie.gap is None or tie.gap > SURPRISE:
+        return False
+    if not math.isfinite(seek.way_begin):
+        seek.way_begin = tie.way
+    if seek.alive or not seek.looks or tie.way - seek.way_begin < ALONE_M or not told(state):
+        return False
+    since = atlas.since
+    atlas.adrift, atlas.since, atlas.bridge, atlas.seek = None, 0, None, Seek(terrain=seek.terrain)
+    rehang(state, since)
+    return True
 
 
 def doubt(state: State) -> None:

@@ -87,7 +87,7 @@ class Seek:
             nothing but ``alive`` is left. searched: where that was (odom frame). terrain: of the latest look.
         job: ID of the look under way. looks: so far. hint: T_map_odom by a person who has said where the robot is, and
             how many looks have not found it there. lit: keyframe and number of light's windows of the latest look.
-        t_begin: instant of the first keyframe.
+        t_begin: instant of the first keyframe. way_begin: way driven when light was first good.
     """
 
     alive: tuple[Hypothesis, ...] = ()
@@ -100,6 +100,7 @@ class Seek:
     hint: tuple[Array, int] | None = field(default=None)
     lit: tuple[int, int] = (0, 0)
     t_begin: float = math.inf
+    way_begin: float = math.inf
 
     def due(self, frame: Keyframe) -> bool:
         """Whether a keyframe is to be searched for, and not only looked at where it should be."""
