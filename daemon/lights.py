@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -141,6 +141,7 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     from daemon.store_image import image_from
     from estimator.mapimage import restored
 
+    settings = replace(settings or pipeline.Settings(), localise=start.localise)
     return restored(image_from(start.stored, start.changed), settings, setup)
 
 

@@ -176,7 +176,8 @@ def start_for(source: Source, used: Config, lights: Lights | None, given: Given)
             return started(used.map, lights, mend=False)[1]
         if not source.recorded or MAP not in source.header:
             return None
-        return recorded_start(source.files[0].parent / START, source.header[MAP]["sha256"], lights)
+        path, sha256 = source.files[0].parent / START, source.header[MAP]["sha256"]
+        return recorded_start(path, sha256, lights, used.map.localise)
     except (NoMap, BadMap, OSError) as error:
         remedy = "replay the recording with the files that it was written with, or name a map with --set map.folder=DIR"
         raise DataInvalid(str(source.path), f"the map it began with cannot be used: {error}", remedy) from error

@@ -18,7 +18,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -62,12 +62,13 @@ class Start:
 
     Attributes:
         content: of the file. stored: what it holds. changed: lamps whose gains are not believed, because the survey has
-            changed since.
+            changed since. localise: it is only used, and never changed.
     """
 
     content: bytes
     stored: Stored
     changed: frozenset[int] = frozenset()
+    localise: bool = False
 
 
 class NoMap(Exception):
@@ -104,13 +105,14 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
             "one, or import one: lumiloop map import"
         )
     if start is not None:
+        start = replace(start, localise=config.localise)
         meta = start.stored.meta
         named = f" ({meta.name})" if meta.name else ""
         log.info("map %08x%s of %d submaps loaded", meta.map_id, named, len(start.stored.tables["submap.key"]))
     return store, start
 
 
-def recorded_start(path: Path, sha256: str, lights: Lights | None) -> Start:
+def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
     """The map in a recording's folder.
 
     Raises:
@@ -120,7 +122,7 @@ def recorded_start(path: Path, sha256: str, lights: Lights | None) -> Start:
     if hashlib.sha256(content).hexdigest() != sha256:
         raise Damaged(f"{path.name} is not the map that the recorded run began with")
     stored = read(content)
-    return Start(content, stored, judge_for(lights)(stored)[1])
+    return Start(content, stored, judge_for(lights)(stored)[1], localise)
 
 
 def folder_of(configured: str) -> Path:
