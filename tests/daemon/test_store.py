@@ -12,7 +12,7 @@ import pytest
 
 from daemon import store as module
 from daemon.config import MapConfig
-from daemon.lights import Lights
+from daemon.lights import Lights, new_state
 from daemon.store import NEWEST, NoMap, Store, folder_of, recorded_start, started
 from daemon.store_file import Damaged
 from daemon.store_tables import digest_of
@@ -270,3 +270,13 @@ def test_a_map_that_somebody_has_put_there_is_loaded_where_there_is_no_other_and
     start = Store(tmp_path).load()
     assert start is not None
     assert start.content == content(seed=7)
+
+
+def test_a_map_to_be_used_as_it_is_is_known_as_such_to_the_estimator(tmp_path: Path) -> None:
+    store_with(tmp_path, 1).close()
+    for localise in (True, False):
+        _, start = started(MapConfig(folder=str(tmp_path), localise=localise), None)
+        assert start is not None
+        state = new_state(None, start=start)
+        assert state.settings.localise is localise
+        assert len(state.atlas.submaps) == 4
