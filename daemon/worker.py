@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import queue
+import sys
 import threading
+import time
 from collections.abc import Iterable, Mapping
 from typing import Final, Protocol
 
@@ -18,6 +20,16 @@ log = logging.getLogger(__name__)
 
 ANSWER_CYCLES: Final = 4
 """Under the virtual clock a job answers after this many cycles."""
+
+URGENT: Final = 2
+"""Jobs of this priority or a lower number do not wait for others."""
+
+SWITCH_S: Final = 5e-4
+"""A thread that runs Python gives way after so long (the interpreter's own 5 ms would be waited for after every kernel
+of a cycle while a job prepares its numbers)."""
+
+
+_Waiting = queue.PriorityQueue[tuple[int, int, Job | None]]
 
 
 class Worker(Protocol):
@@ -42,47 +54,58 @@ class Worker(Protocol):
 
 
 class ThreadWorker:
-    """One thread, jobs by priority, first come first served within one. Real time only."""
+    """Two threads, each with jobs by priority, first come first served within one. Real time only.
+
+    One is for what the pose waits for (settling, solving the graph): a search that runs for long never delays it.
+    Where both work in Python, the cycle gets its turn at the next switch of threads: see :data:`SWITCH_S`.
+    """
 
     def __init__(self) -> None:
         self.failed = 0
-        self._waiting: queue.PriorityQueue[tuple[int, int, Job | None]] = queue.PriorityQueue()
-        self._done: queue.SimpleQueue[tuple[int, object]] = queue.SimpleQueue()
+        self._waiting = [_Waiting(), _Waiting()]
+        self._done: queue.SimpleQueue[tuple[int, object] | None] = queue.SimpleQueue()
         self._submitted = 0
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="lumiloop-worker", daemon=True)
-        self._thread.start()
+        sys.setswitchinterval(SWITCH_S)
+        names = "lumiloop-solver", "lumiloop-search"
+        self._threads = [
+            threading.Thread(target=self._work, args=(waiting,), name=name, daemon=True)
+            for name, waiting in zip(names, self._waiting, strict=True)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def submit(self, jobs: Iterable[Job]) -> None:
         """Take jobs; returns at once."""
         for job in jobs:
             self._submitted += 1
-            self._waiting.put((job.priority, self._submitted, job))
+            self._waiting[job.priority > URGENT].put((job.priority, self._submitted, job))
 
     def collect(self, t_mono: float) -> tuple[Answer, ...]:
         """Answers that are ready by now."""
         answers = []
         while not self._done.empty():
-            job_id, payload = self._done.get_nowait()
-            answers.append(Answer(t_mono, job_id, payload))
-        return tuple(answers)
-
-    def close(self) -> None:
-        """Drop what waits and give the running job a second; the thread dies with the process otherwise."""
-        self._closed.set()
-        self._waiting.put((-1, 0, None))
-        self._thread.join(timeout=1.0)
-
-    def _work(self) -> None:
-        while not self._closed.is_set():
-            _, _, job = self._waiting.get()
-            if job is None:
-                continue
-            done = _run(job)
+            done = self._done.get_nowait()
             if done is None:
                 self.failed += 1
             else:
-                self._done.put(done)
+                answers.append(Answer(t_mono, *done))
+        return tuple(answers)
+
+    def close(self) -> None:
+        """Drop what waits and give the running jobs a second; the threads die with the process otherwise."""
+        self._closed.set()
+        for waiting in self._waiting:
+            waiting.put((-1, 0, None))
+        until = time.monotonic() + 1.0
+        for thread in self._threads:
+            thread.join(timeout=max(0.0, until - time.monotonic()))
+
+    def _work(self, waiting: _Waiting) -> None:
+        while not self._closed.is_set():
+            _, _, job = waiting.get()
+            if job is not None:
+                self._done.put(_run(job))
 
 
 class CycleWorker:

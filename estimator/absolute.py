@@ -60,8 +60,8 @@ SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
 ANY_HEADING = math.pi**2 / 3.0
 """Variance of a heading that may be any, rad^2."""
-BLIND_S = 0.5
-"""Without a match for so long, light and odometry are all there is."""
+BLIND_S, BLIND_PERIODS, SLOWEST_S = 0.5, 1.5, 3.0
+"""Without a match for so long, or so many scan periods (of a slow laser), light and odometry are all there is."""
 KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
 """Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey's frame counts as known."""
 MEMORY_S = 1.0
@@ -82,7 +82,8 @@ class Absolute:
         way, way_young: driven so far, and when light last began to find the place.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
         since: ID of the first keyframe laid after the pose was known for the last time.
-        t_match: instant of the latest match. poses: T_odom_base of the last second, each with its instant.
+        t_match: instant of the latest match; scan_s: what had passed since the scan before it.
+        poses: T_odom_base of the last second, each with its instant.
     """
 
     placed: bool = False
@@ -98,6 +99,7 @@ class Absolute:
     fresh: float = 0.0
     since: int = 0
     t_match: float = -math.inf
+    scan_s: float = 0.0
     poses: deque[tuple[float, Array]] = field(default_factory=deque)
 
 
@@ -128,6 +130,7 @@ def on_match(state: State, T_before: Array, P_before: Array, inflated: float) ->
         return
     tie.broken |= blind(state)
     tie.t_match = moving.t_mono
+    tie.scan_s = min(moving.t_mono - state.t_scan, SLOWEST_S)
     if not tie.placed:
         return
     more = (inflated - 1.0) * P_before
@@ -299,9 +302,10 @@ def _spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
 
 
 def blind(state: State) -> bool:
-    """Whether the laser has not told anything lately."""
-    assert state.absolute is not None
-    return state.fused.t_mono - state.absolute.t_match > BLIND_S
+    """Whether the laser has not told anything lately, though a scan was due."""
+    tie = state.absolute
+    assert tie is not None
+    return state.fused.t_mono - tie.t_match > max(BLIND_S, BLIND_PERIODS * tie.scan_s)
 
 
 def pose_at(state: State, t_mono: float) -> Array:

@@ -29,7 +29,7 @@ PHI: Final = 25.0
 """chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real rooms bend more than noise."""
 
 SETTLED: Final = 1e-5
-MOST: Final = 60
+MOST: Final = 100
 TOGETHER: Final = 60
 """Keyframes, at most, between two loops that support each other."""
 

@@ -1,10 +1,15 @@
 """Sparse Gauss-Newton over a graph of planar poses: relative constraints, absolute ones, and loops that may be false.
 
 Minimises ``sum e^T H e`` with ``e = T_z^-1 (T_i^-1 T_j)`` for a constraint ``T_z`` between poses i and j, and
-``e = T_z^-1 T_i`` for an absolute one. A constraint that may be false counts by Geman-McClure's cost, whose scale
-begins wide enough to believe every constraint and narrows step by step to what noise explains (graduated
-non-convexity: Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020): a false one is outvoted without the start having to
-be good. Steps that do not descend are damped (Levenberg-Marquardt).
+``e = T_z^-1 T_i`` for an absolute one. A constraint that may be false counts by Geman-McClure's cost. There are two
+ways down to its least value; where the first leaves a constraint disbelieved both are gone, and the lower end counts:
+
+* From the scale that noise explains: what agrees with the way just driven is believed, makes the graph surer, and so
+  brings in what agrees with that. Many false constraints never get a say; but a true one after much drift neither.
+* From a scale wide enough to believe every constraint, narrowed step by step (graduated non-convexity: Yang, Antonante,
+  Tzoumas, Carlone, RA-L 5(2), 2020): drift does no harm, but a third of false ones may bend the graph for good.
+
+Steps that do not descend are damped (Levenberg-Marquardt).
 """
 
 from __future__ import annotations
@@ -12,14 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.blocks import factor, solve
-from estimator.elimination import Ints, adjacency, columns, minimum_degree
+from estimator.elimination import NONE, Ints, adjacency, columns, minimum_degree
 from estimator.kernel import kernel
 from estimator.records import Array
-
-Bools = npt.NDArray[np.bool_]
+from estimator.spanning import Bools, carry_on, spanning
 
 NARROWER = 0.5
 """By how much the scale of doubt narrows with every step."""
@@ -56,7 +59,7 @@ class Solution:
     """What optimisation has made of a graph.
 
     Attributes:
-        poses: (n, 3). chi2: of all constraints as weighted. iterations: of Gauss-Newton.
+        poses: (n, 3). chi2: of all constraints as weighted. iterations: of Gauss-Newton, both ways.
         converged: not stopped by the cap.
         trust: (m,) weight of each constraint, 1 where it is not doubted, near 0 where it was voted out.
         parts: number of parts of the graph that no constraint joins; each keeps its first pose unless one of its poses
@@ -81,7 +84,7 @@ def optimise(
 
     Args:
         graph: is not changed.
-        most: cap on iterations.
+        most: cap on iterations, of each way down.
         settled: relative decrease of chi2 that ends them.
         phi: chi2 of three degrees of freedom at which a doubtful constraint keeps a quarter of its weight.
         covariance_of: pose whose covariance is wanted, -1 for none.
@@ -106,8 +109,15 @@ def optimise(
     given = (graph.edges, graph.between, graph.information, graph.doubtful)
     absolute = (graph.anchored, graph.at, graph.certainty)
     poses, trust = graph.poses.copy(), np.ones(len(graph.edges))
-    told = np.array((float(most), settled, phi))
+    told = np.array((float(most), settled, phi, phi))
     chi2, iterations, converged = descend(poses, given, absolute, (place, pattern), trust, told)
+    if worst(poses, given, absolute) > phi:
+        others, doubts = graph.poses.copy(), np.ones(len(graph.edges))
+        told[3] = 2.0 * worst(others, given, absolute)
+        wide, more, settles = descend(others, given, absolute, (place, pattern), doubts, told)
+        iterations += more
+        if wide < chi2:
+            poses, trust, chi2, converged = others, doubts, wide, settles
     covariance = np.zeros((3, 3))
     if covariance_of >= 0 and place[covariance_of] >= 0:
         marginal(poses, given, absolute, (place, pattern), (trust, phi, int(place[covariance_of])), covariance)
@@ -343,14 +353,21 @@ def descend(
     trust: Array,
     told: Array,
 ) -> tuple[float, int, bool]:
-    """Gauss-Newton steps, damped where they do not descend; moves ``poses``. ``told``: most, settled, phi."""
+    """Gauss-Newton steps, damped where they do not descend; moves ``poses``.
+
+    Each step is taken as it is and along the spanning tree, whichever descends farther. ``told``: most, settled, phi,
+    and the scale to begin with.
+    """
     place, pattern = structure
     n, nnz = len(pattern[0]) - 1, len(pattern[1])
     phi = told[2]
     slot = slots_of(given[0], place, pattern)
     diagonal, below, b = np.empty((n, 3, 3)), np.empty((nnz, 3, 3)), np.empty((n, 3))
     inverse = np.empty((n, 3, 3))
-    scale = max(phi, 2.0 * worst(poses, given, absolute))
+    tree = spanning(len(poses), given[0], given[3], place >= 0)
+    alone = np.arange(len(poses)), np.full(len(poses), NONE)
+    other = poses.copy()
+    scale = max(phi, told[3])
     best = cost(poses, given, absolute, trust, scale)
     trial, count, damping, done = poses.copy(), 0, 0.0, False
     while count < told[0] and not done:
@@ -362,11 +379,13 @@ def descend(
         now = np.inf
         if factor(pattern, (diagonal, below), inverse) < 0:
             solve(pattern, below, inverse, b)
-            for i in range(len(poses)):
-                if place[i] >= 0:
-                    for r in range(3):
-                        trial[i, r] = poses[i, r] + b[place[i], r]
-            now = cost(trial, given, absolute, trust, scale)
+            now = np.inf
+            for way in (alone, tree):
+                carry_on(poses, b, place, way, other)
+                then = cost(other, given, absolute, trust, scale)
+                if then < now:
+                    now = then
+                    trial, other = other, trial
         small = abs(best - now) <= told[1] * best
         if now <= best:
             poses[:] = trial

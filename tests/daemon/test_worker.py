@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 
 import pytest
 
-from daemon.worker import ANSWER_CYCLES, CycleWorker, ScheduledWorker, ThreadWorker, Worker
+from daemon.worker import ANSWER_CYCLES, URGENT, CycleWorker, ScheduledWorker, ThreadWorker, Worker
 from estimator.records import Job
 
 
@@ -15,11 +16,11 @@ def job(number: int, priority: int = 0) -> Job:
     return Job(number, priority, lambda: number * 10)
 
 
-def broken(number: int) -> Job:
+def broken(number: int, priority: int = 0) -> Job:
     def run() -> object:
         raise ValueError("no such map")
 
-    return Job(number, 0, run)
+    return Job(number, priority, run)
 
 
 def answers(worker: Worker, t_mono: float = 1.0) -> list[tuple[int, object]]:
@@ -71,16 +72,36 @@ def test_the_thread_runs_urgent_jobs_first_and_survives_failures(caplog: pytest.
         gate.wait(10.0)
         return "held"
 
-    worker.submit([Job(1, 0, hold)])
+    worker.submit([Job(1, URGENT + 1, hold)])
     assert started.wait(10.0)
-    worker.submit([job(2, priority=9), job(3, priority=1), broken(4), Job(5, 99, lambda: finished.set() or "last")])
+    last = Job(5, 99, lambda: finished.set() or "last")
+    worker.submit([job(2, priority=9), job(3, priority=URGENT + 2), broken(4, priority=URGENT + 1), last])
     assert answers(worker) == []
     gate.set()
     assert finished.wait(10.0)
     worker.close()
     assert answers(worker) == [(1, "held"), (3, 30), (2, 20), (5, "last")]
     assert worker.failed == 1
-    assert "lumiloop-worker" not in [thread.name for thread in threading.enumerate()]
+    assert not {"lumiloop-solver", "lumiloop-search"} & {thread.name for thread in threading.enumerate()}
+
+
+def test_what_the_pose_waits_for_does_not_wait_for_a_search() -> None:
+    worker = ThreadWorker()
+    gate, started, solved = threading.Event(), threading.Event(), threading.Event()
+    worker.submit([Job(1, URGENT + 1, lambda: started.set() or gate.wait(10.0))])
+    assert started.wait(10.0)
+    worker.submit([Job(2, URGENT, lambda: solved.set() or "solved")])
+    assert solved.wait(10.0)  # the search is still held
+    gate.set()
+    worker.close()
+    assert answers(worker) == [(2, "solved"), (1, True)]
+
+
+def test_a_thread_that_runs_python_soon_gives_way() -> None:
+    """After each of its kernels a cycle waits for the interpreter; what is usual, 5 ms, is a fifth of a period."""
+    worker = ThreadWorker()
+    worker.close()
+    assert sys.getswitchinterval() <= 1e-3
 
 
 def test_closing_drops_what_waits() -> None:
