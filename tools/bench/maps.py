@@ -8,8 +8,8 @@ copies): the map as written, the trajectory in blue, where a loop was closed in 
 with the normal that its neighbours in the scan give it, turned towards the sensor. Around a point drawn at random, the
 points count that lie within ``ALONG_M`` along the wall and ``ACROSS_M`` across it and whose normals are within 30 deg
 of its own, so that the two faces of a wall are two walls. If at least ``ENOUGH`` of them, and two scans more than 30 s
-apart, are there, the thickness is the width across that holds the middle 90 % of them. What has relief (skirtings,
-door frames, shelves) and what was moved counts as thick.
+apart, are there, and single scans show a flat piece of wall (9 of 10 of them less than ``FLAT_M`` across), the
+thickness is the width across that holds the middle 90 % of them. What was moved meanwhile counts as thick.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ ALONG_M, ACROSS_M = 0.15, 0.6
 ALIKE: Final = np.cos(np.radians(30.0))
 ENOUGH: Final = 20
 APART_S: Final = 30.0
+FLAT_M: Final = 0.08
 SAMPLES: Final = 4000
 SAME_STAMP_S: Final = 0.02
 PATH, LOOP = (70, 120, 235), (220, 38, 38)
@@ -188,10 +189,21 @@ def thickness(points: Array, normals: Array, times: Array, samples: int = SAMPLE
         off, n = points[near] - points[k], normals[k]
         across, along = off @ n, off @ np.array((-n[1], n[0]))
         wall = (np.abs(along) < ALONG_M) & (np.abs(across) < ACROSS_M) & (normals[near] @ n > ALIKE)
-        if np.count_nonzero(wall) >= ENOUGH and np.ptp(times[near[wall]]) > APART_S:
+        if np.count_nonzero(wall) < ENOUGH or np.ptp(times[near[wall]]) <= APART_S:
+            continue
+        if relief(across[wall], times[near[wall]]) < FLAT_M:
             low, high = np.percentile(across[wall], (5.0, 95.0))
             widths.append(high - low)
     return np.array(widths)
+
+
+def relief(across: Array, times: Array) -> float:
+    """Width across, m, that single scans show, 90 % of them less; 0 where no scan has two points here."""
+    order = np.argsort(times, kind="stable")
+    first = np.flatnonzero(np.diff(times[order], prepend=-np.inf) > 0.0)
+    widths = np.maximum.reduceat(across[order], first) - np.minimum.reduceat(across[order], first)
+    several = widths[np.diff(np.append(first, len(order))) > 1]
+    return float(np.percentile(several, 90.0)) if len(several) else 0.0
 
 
 def picture(out: Path, path: Path) -> None:
