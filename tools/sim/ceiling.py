@@ -102,6 +102,7 @@ class Ceiling:
     def moved(self, lamp_id: int, by: tuple[float, float]) -> Ceiling:
         """The same ceiling with one lamp hung elsewhere, which the plan does not know."""
         other = replace(self)
+        other.placed, other._lamps, other._off = self.placed.copy(), self._lamps.copy(), dict(self._off)
         k = self._index(lamp_id)
         other.placed[k, :2] += by
         other._lamps[k, :2] += by

@@ -1,0 +1,187 @@
+"""Loops in a corridor round a block, twice round (240 m), under all lamps and under fewer, wrong or ambiguous ones.
+
+Nothing along these corridors tells one metre from the next but their corners; one row of lamps, at most 2.9 m apart,
+hangs above. Reported: loops with precision and recall (definitions: fig6_truth), the error of the published pose, along
+the corridor and in all, and that of the map's keyframes as they lie at the end. `light factors off` takes what light
+said of the submaps out of the pose graph (and out of the judgement of loops).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from estimator.light import LightsSetup
+from estimator.pipeline import Settings, State, keyframe_poses, new_state
+from estimator.result import StepResult
+from tools.experiments.fig6_curves import Point, counted
+from tools.experiments.fig6_trial import FROM_S, Watcher
+from tools.experiments.loop_drives import BODY, half, play, scans
+from tools.experiments.report import COMMAND, Report, Table, Work
+from tools.experiments.trajectory import Errors, Track, errors, started
+from tools.figures import Figure, bounded
+from tools.sim.buildings import building
+from tools.sim.ceiling import Ceiling, Effects
+from tools.sim.ceiling_lamps import Fixture, fixtures, with_codes
+from tools.sim.ceiling_links import Reception
+from tools.sim.ceiling_movers import lean_of
+from tools.sim.ceiling_records import survey
+from tools.sim.lightrun import LightRun
+from tools.sim.odometry import Wheels
+from tools.sim.robot import Drive
+from tools.sim.world import Array
+
+SEEDS: Final = (1, 2, 3)
+LAPS: Final = 2
+ISLANDS: Final = ((20.0, 1.1), (38.9, 16.0), (8.0, 23.9))
+ISLAND_M: Final = 5.0
+CODES: Final = 6
+DEAD: Final = 0.3
+MOVED: Final = ((3, (0.8, 0.0)), (18, (0.0, -0.8)))
+"""Lamps that hang elsewhere than the survey says, and by how much."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is wrong with the lamps. lit: whether there is a photodiode. factors: whether the graph hears of light."""
+
+    name: str
+    lit: bool = True
+    islands: bool = False
+    dead: bool = False
+    moved: bool = False
+    reused: bool = False
+    factors: bool = True
+
+
+CASES: Final = (
+    Case("laser alone", lit=False),
+    Case("all lamps"),
+    Case("all lamps, light factors off", factors=False),
+    Case("three islands of lamps", islands=True),
+    Case("30 % dead", dead=True),
+    Case("two moved by 0.8 m", moved=True),
+    Case("six codes for all lamps", reused=True),
+    Case("islands, 30 % dead, two moved, codes reused", islands=True, dead=True, moved=True, reused=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a drive came to. along: RMSE in the driving direction, m. live: as published; kept: of the keyframes."""
+
+    loops: Point
+    along: float
+    live: Errors
+    kept: Errors
+
+
+def ceiling_for(case: Case, seed: int) -> Ceiling:
+    """The lamps as they are; the survey is made of what was planned."""
+    place = building("corridor_loop")
+    planned: tuple[Fixture, ...] = fixtures(place)
+    if case.islands:
+        planned = tuple(f for f in planned if min(math.hypot(f.x - x, f.y - y) for x, y in ISLANDS) < ISLAND_M)
+    if case.islands or case.reused:
+        planned = with_codes(planned, CODES) if case.reused else with_codes(planned)
+    return Ceiling(planned, place.world, place.height_m, Effects(), seed=seed)
+
+
+def spoiled(case: Case, ceiling: Ceiling, seed: int) -> Ceiling:
+    """Lamps that the survey does not know to be dead or elsewhere."""
+    count = len(ceiling.fixtures)
+    if case.moved:
+        for number, by in MOVED:
+            ceiling = ceiling.moved(1 + (number - 1) % count, by)
+    if case.dead:
+        for k in np.random.default_rng((seed, 5)).permutation(count)[: round(DEAD * count)]:
+            ceiling.switch_off(ceiling.fixtures[int(k)].lamp_id)
+    return ceiling
+
+
+def drive_of(case: Case, seed: int) -> LightRun:
+    """Twice round the block."""
+    place, ceiling = building("corridor_loop"), ceiling_for(case, seed)
+    told = survey(ceiling)
+    drive = Drive(place.route, BODY, 2.0, LAPS)
+    ceiling = spoiled(case, ceiling, seed)
+    ceiling.lean = lean_of(drive)
+    return LightRun(drive, ceiling, told, Wheels(), place.world, seed, LAPS * drive.lap_s, Reception())
+
+
+def without_light(watch: Callable[..., None]) -> Callable[..., None]:
+    """Keep from the graph what light says of submaps."""
+
+    def seen(state: State, result: StepResult, done: list[tuple[Any, Any]]) -> None:
+        for submap in state.atlas.submaps.values():
+            submap.light = None
+        watch(state, result, done)
+
+    return seen
+
+
+def trial(task: tuple[Case, int, float]) -> Outcome:
+    """One case with one seed."""
+    case, seed, seconds = task
+    run = drive_of(case, seed)
+    run = replace(run, seconds=min(run.seconds, seconds))
+    state = new_state(Settings(history=True), LightsSetup(run.survey, clock_ppm=0.0) if case.lit else None)
+    watch = Watcher(run, False)
+    streams = (run.odometry(), scans(run), half(run.light())) if case.lit else (run.odometry(), scans(run))
+    play(state, streams, watch if case.factors else without_light(watch))
+    t = np.array(watch.t)
+    live = Track(t, np.array(watch.pose), run.truth(t))
+    live = live.since(min(FROM_S, 0.3 * seconds)) if case.lit else started(live)
+    laid = sorted(watch.truth.pose)
+    where = keyframe_poses(state)
+    kept = Track(
+        np.array(laid, float), np.array([where[k] for k in laid]), np.array([watch.truth.pose[k] for k in laid])
+    )
+    loops = Point(*counted(watch.loops, watch.asked))
+    return Outcome(loops, along(live), errors(live), errors(kept if case.lit else started(kept)))
+
+
+def along(track: Track) -> float:
+    """RMSE in the direction in which the robot truly looks: along the corridor, but for the corners."""
+    off: Array = track.pose[:, :2] - track.truth[:, :2]
+    ahead = np.column_stack((np.cos(track.truth[:, 2]), np.sin(track.truth[:, 2])))
+    return float(np.sqrt(np.mean(np.sum(off * ahead, axis=1) ** 2)))
+
+
+def run(quick: bool, work: Work) -> Report:
+    """All cases over all seeds; with ``quick`` the first seconds of two."""
+    seeds, cases, seconds = (SEEDS[:1], CASES[:2], 20.0) if quick else (SEEDS, CASES, math.inf)
+    done = work.map(trial, [(case, seed, seconds) for case in cases for seed in seeds], "islands")
+    rows, figures = [], []
+    for n, case in enumerate(cases):
+        mine = done[n * len(seeds) : (n + 1) * len(seeds)]
+        rows.append(row_of(case, mine))
+        if case.name == "all lamps":
+            worst = 100.0 * max(one.along for one in mine)
+            figures.append(
+                bounded("corridors, lamps 2.9 m apart: along, worst", worst, "cm", "<= 5", f"{COMMAND} islands")
+            )
+    figures += [
+        Figure(f"corridors, {row[0]}: RMSE, median", float(row[6]), "cm", command=f"{COMMAND} islands") for row in rows
+    ]
+    return Report(tuple(figures), (Table("Corridors round a block, twice", HEAD, tuple(rows)),), (), tuple(seeds))
+
+
+HEAD: Final = (
+    "", "loops", "precision %", "recall %", "along, median cm", "worst", "RMSE, median cm", "worst", "heading, deg",
+    "map RMSE, median cm", "worst",
+)  # fmt: skip
+
+
+def row_of(case: Case, done: list[Outcome]) -> tuple[str | float | int, ...]:
+    """A line of the table."""
+    p = Point(*np.sum([(o.loops.accepted, o.loops.right, o.loops.queries, o.loops.got) for o in done], axis=0).tolist())
+    ahead, live, kept = [o.along for o in done], [o.live.rmse for o in done], [o.kept.rmse for o in done]
+    cells = [100.0 * v for part in (ahead, live) for v in (float(np.median(part)), max(part))]
+    heading = float(np.median([o.live.heading for o in done]))
+    last = [100.0 * float(np.median(kept)), 100.0 * max(kept)]
+    return (case.name, p.accepted, 100.0 * p.precision, 100.0 * p.recall, *cells, heading, *last)
