@@ -112,6 +112,12 @@ def counted(found: list[Detection], queries: dict[int, bool]) -> tuple[int, int,
     return len(found), len(true), len(asked), len(asked & {one.query for one in true})
 
 
+def clear(drive: Drive) -> Drive:
+    """The same drive, asked only about keyframes of which light could say something."""
+    told = {one.query for one in drive.anywhere if not math.isnan(one.light)}
+    return replace(drive, queries={key: positive for key, positive in drive.queries.items() if key in told})
+
+
 def best(points: Iterable[Point], precision: float) -> float:
     """Largest recall of a curve at that precision or better, NaN where it never gets there."""
     return max((one.recall for one in points if one.accepted and one.precision >= precision), default=math.nan)
