@@ -30,7 +30,7 @@ def draw_maps(panels: list[Panel], where: str, canvas: Any) -> None:
     across = 1 if lying else (len(panels) + 1) // 2
     places = canvas.subplots(-(-len(panels) // across), across, squeeze=False).ravel()
     for axes, panel in zip(places, panels, strict=False):
-        _walls(axes, lying)
+        walls(axes, lying)
         for points, how in (
             (panel.points, {"ls": "", "marker": ",", "color": "black", "alpha": 0.5}),
             (panel.track.truth, {"ls": "--", "lw": 0.6, "color": "tab:gray"}),
@@ -46,7 +46,7 @@ def draw_maps(panels: list[Panel], where: str, canvas: Any) -> None:
         axes.set_axis_off()
 
 
-def _walls(axes: Any, lying: bool) -> None:
+def walls(axes: Any, lying: bool) -> None:
     """The true building, in light blue."""
     turn = np.linspace(0.0, 2.0 * np.pi, 25)
     for kind, a, b, c, d, _ in building("paper_room").world.shapes:

@@ -116,7 +116,7 @@ class Watcher:
         self._frames[frame.key] = frame
         self.truth.laid(frame, result.t_mono)
         for job, payload in done:
-            if job.priority == LOOK:
+            if job.priority == LOOK and isinstance(payload, tuple):  # not where the whole map is looked through
                 self.asked[frame.key] = self.truth.has_positive(frame.key)
                 self._waiting += [(frame.key, found) for found in payload]
         if self.anywhere and state.atlas.laid % EVERY == 0:

@@ -48,10 +48,10 @@ def room_route(seed: int, length_m: float = 160.0) -> Route:
     return Route(tuple(corners[:-1] if corners[-1] == HOME else corners), 1.2)
 
 
-def room_drive(seed: int, length_m: float = 160.0) -> LightRun:
+def room_drive(seed: int, length_m: float = 160.0, body: Body = BODY) -> LightRun:
     """A random drive in the paper's room under its 16 lamps; wheels as those whose dead reckoning ends 1.5 m off."""
     run = room_run(seed=seed)
-    drive = Drive(room_route(seed, length_m), BODY, 2.0, 1)
+    drive = Drive(room_route(seed, length_m), body, 2.0, 1)
     run.ceiling.lean = lean_of(drive)
     return replace(run, drive=drive, seconds=drive.lap_s)
 
