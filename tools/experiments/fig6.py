@@ -1,7 +1,7 @@
 """The paper's third experiment (its Fig. 6): precision and recall of loop closures over drives that return.
 
 Fifty-one drives of 80 m on random ways through the paper's symmetric room, from one start and back to it; people, slip
-and lamps by chance. Two questions are asked. *As driven*: which loops does the daemon close, that has an idea of its pose?
+and lamps by chance. Two questions: *As driven*, which loops does the daemon close, that has an idea of its pose?
 *Without an idea*: each of some keyframes is looked for in every earlier submap by branch and bound over the whole room
 and every heading; there the laser alone takes the room's mirror images for the same place. Its curve is the baseline:
 our own laser-only branch and bound (Cartographer's way of searching, not Cartographer itself).
