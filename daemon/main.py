@@ -155,7 +155,7 @@ class Daemon:
         fitted = settings.lidar.fitted
         self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
         self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
-        self._estimator = _Estimator(lights, world.start)
+        self._estimator = _Estimator(lights, world.start, settings.map.localise)
         self.cycle = Cycle(
             Parts(
                 clock=world.clock,
@@ -280,8 +280,9 @@ class _Estimator:
         state: None until then.
     """
 
-    def __init__(self, lights: Lights | None, start: Start | None) -> None:
+    def __init__(self, lights: Lights | None, start: Start | None, localise: bool = False) -> None:
         self.state: Estimate | None = None
+        self._localise = localise
         self._lights = lights
         self._start = start
         self._step: Step | None = None
@@ -290,7 +291,7 @@ class _Estimator:
         """Load the estimator, and the map into it."""
         from estimator import pipeline
 
-        self.state = new_state(self._lights, start=self._start)
+        self.state = new_state(self._lights, pipeline.Settings(localise=self._localise), self._start)
         self._step = partial(pipeline.step, self.state)
         return self._step
 

@@ -109,7 +109,7 @@ class Rerun:
         self.t_first = math.inf
         self._source = source
         self._clock = ReplayClock()
-        self._state = new_state(lights, pipeline.Settings(history=True), start)
+        self._state = new_state(lights, pipeline.Settings(history=True, localise=config.map.localise), start)
         self._journal = journal
         if journal is not None:
             journal.attach(self._state)
