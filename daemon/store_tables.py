@@ -203,9 +203,13 @@ def _adds_up(counts: AnyArray, total: int) -> bool:
 
 
 def parts(tables: Tables) -> Keys:
-    """Number of the part of the graph that each submap belongs to; parts are joined by nothing."""
+    """Number of the part of the graph that each submap belongs to; parts are joined by nothing.
+
+    Submaps whose place light has told lie in one frame, the survey's: that joins them, too.
+    """
     keys = tables["submap.key"]
-    ends = np.searchsorted(keys, tables["joined.keys"])
+    lit = np.flatnonzero(tables["submap.lit"])
+    ends = np.vstack((np.searchsorted(keys, tables["joined.keys"]), np.column_stack((lit[:-1], lit[1:]))))
     part = np.arange(len(keys))
     while True:
         least = part.copy()

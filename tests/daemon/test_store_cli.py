@@ -17,14 +17,14 @@ ROOT = Path(__file__).parents[2]
 
 def test_info_says_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.lumimap"
-    path.write_bytes(content(Shape(lit=True, submaps=8, loose=1)))
+    path.write_bytes(content(Shape(lit=True, submaps=7, loose=1)))
     assert cli.main(["map", "info", str(path)]) == cli.OK
     said = capsys.readouterr().out
     for words in ("map id            00001234", "second floor, Süd", "the light survey's", "2017-07-14 02:40:00 UTC"):
         assert words in said
     assert cli.main(["map", "info", str(path), "--json"]) == cli.OK
     found = json.loads(capsys.readouterr().out)
-    assert (found["submaps"], found["isolated_submaps"], found["lamps"]) == (7, 1, 6)
+    assert (found["submaps"], found["isolated_submaps"], found["lamps"]) == (6, 1, 6)
     assert found["bytes"] == path.stat().st_size
 
 

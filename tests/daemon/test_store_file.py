@@ -248,3 +248,11 @@ def test_a_receiver_that_was_calibrated_anew_changes_no_lamp() -> None:
     words, changed = against_survey(stored, replace(SURVEY, floor=0.02))
     assert "receiver or the floor" in words
     assert changed == frozenset()
+
+
+def test_parts_that_only_light_joins_are_one_map() -> None:
+    made = image(Shape(submaps=8, lit=True))
+    made.constraints.keep(np.arange(7) != 4)
+    stored = read(packed(made, meta_of(made, 0.0, "", "")))
+    assert stored.isolated == 0
+    assert len(stored.tables["submap.key"]) == 8
