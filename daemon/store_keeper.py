@@ -165,11 +165,11 @@ class Keeper:
         image = self._image(state)
         log.debug("the map was gathered in %.2f ms", 1e3 * (time.perf_counter() - begun))
         end = partial(self._end, revision, waiting)
-        self._over.clear()
         self._thread = threading.Thread(
             target=self._work, args=(store, image, asyncio.get_running_loop(), end), name="lumiloop-map", daemon=True
         )
         self._thread.start()
+        self._over.clear()  # after what may fail: else nothing would ever be saved again
 
     def _revision(self, state: State) -> Revision:
         """Changes when there is something new to save."""
