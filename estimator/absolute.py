@@ -185,6 +185,7 @@ def on_order(state: State, command: Command) -> None:
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.since = False, False, None, None, 0
     if T_map_base is not None and np.isfinite(T_map_base).all():
         state.light.place(T_map_base, SAID)
+        state.frozen.forget()
         R = se2.rotation(state.T_map_odom[2])
         tie.P, tie.X = R.T @ SAID @ R, np.zeros((3, 3))
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0

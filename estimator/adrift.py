@@ -75,6 +75,13 @@ def forget_adrift(state: State) -> None:
         del state.keyframes[frame.key]
         if state.settings.history:
             state.retired[frame.key] = frame.submap, se2.between(frame.submap.T_odom_submap, frame.T_odom_keyframe)
+    unlist(state, state.atlas.since)
+
+
+def unlist(state: State, since: int) -> None:
+    """Take the keyframes from ``since`` on off the lists by place, and lists that are empty then."""
+    kept = {place: [key for key in keys if key < since] for place, keys in state.places.items()}
+    state.places = {place: keys for place, keys in kept.items() if keys}
 
 
 def places(state: State) -> int | None:
@@ -313,8 +320,7 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
 
 def rehang(state: State, since: int) -> None:
     """List the keyframes that were adrift by the places that they have come to."""
-    for here in state.places.values():
-        here[:] = [key for key in here if key < since]
+    unlist(state, since)
     for key, frame in state.keyframes.items():
         if key >= since:
             state.places.setdefault(square_of(frame.T_map_keyframe), []).append(key)

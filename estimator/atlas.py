@@ -224,7 +224,8 @@ class Atlas:
             kept = [key for key in self.submaps if key < self.adrift]
             self.constraints.keep(np.asarray(np.isin(self.constraints.between, kept).all(axis=1)))
             self.submaps = {key: self.submaps[key] for key in kept}
-            self.frames, self.waiting = [], []
+            self.frames = []
+        self.waiting = []  # no loop of another part can support them
         newest = self.newest
         assert newest is not None
         self.adrift, self.since, self.bridge = newest.key + 1, since, None

@@ -117,8 +117,8 @@ def turned(state: State, P_odom: Array) -> Array:
 
 def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found) -> None:
     """Accept a loop, or let it wait for a second one that agrees where it would move the pose far."""
-    if found.key not in atlas.submaps or frame.submap.key not in atlas.submaps:
-        return
+    if found.key not in atlas.submaps or atlas.submaps.get(frame.submap.key) is not frame.submap:
+        return  # forgotten meanwhile, and its key may have been given to another
     x, y, yaw = found.moved.tolist()
     far = math.hypot(x, y) > told.supported_m or abs(yaw) > told.supported_rad
     if far and found.reason is not LoopReason.LIT:  # there light is the second witness
@@ -225,12 +225,14 @@ def certainty_of(T: Array, P_map: Array) -> list[float]:
 def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:
     """Move the submaps to where the graph has them, and the robot with the newest one.
 
-    Returns whether it did: a solution of what has been moved meanwhile is thrown away, the graph is solved once more.
+    Returns whether it did: a solution of what has been moved or forgotten meanwhile is thrown away, and the graph
+    solved once more.
     """
     newest = atlas.newest
     held, last = lit(state) and not atlas.held, submaps[-1]
     counts = np.array([submap.into is None and not (held and submap is last) for submap in submaps])
-    same = np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
+    there = all(submap.into is not None or atlas.submaps.get(submap.key) is submap for submap in submaps)
+    same = there and np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
     if newest is None or not same or not np.isfinite(solution.poses).all():
         atlas.stale |= not same
         return False

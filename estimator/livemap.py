@@ -132,7 +132,7 @@ class LiveMap:
         """Take in what a job has done."""
         self.drawn.update(done.drawn)
         for key, frames in done.task.fresh.items():
-            if self.fresh[key] is frames:  # nothing has been added to it meanwhile
+            if self.fresh.get(key) is frames:  # nothing has been added to it meanwhile
                 del self.fresh[key]
         for key in done.gone:
             if key not in self.fresh:

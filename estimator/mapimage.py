@@ -205,7 +205,8 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
         state.keyframes[frame.key] = frame
         state.places.setdefault(square_of(frame.T_map_keyframe), []).append(frame.key)
     livemap.begin(state)
-    state.next_key = 1 + max((*state.keyframes, *(piece.first for piece in image.submaps)))
+    witnesses = (piece.settled.witness.key for piece in image.submaps if piece.settled is not None)
+    state.next_key = 1 + max((*state.keyframes, *(piece.first for piece in image.submaps), *witnesses))
     atlas.since = atlas.kept = state.next_key
     atlas.held = state.settings.localise
     if state.absolute is not None:

@@ -10,11 +10,12 @@ import pytest
 
 from estimator import se2
 from estimator.absolute import Absolute
+from estimator.adrift import begin
 from estimator.atlas import KEPT, LOOK, LOST, MANY, SOLVE, Constraints, cell_of
-from estimator.closing import candidates, keyframe_laid, take_answer
+from estimator.closing import candidates, found_again, keyframe_laid, take_answer
 from estimator.commands import forget
 from estimator.keyframe import Virtual, keep
-from estimator.loop import Candidate, LoopSettings, look, look_in
+from estimator.loop import Candidate, Found, LoopSettings, look, look_in
 from estimator.mapframe import shift_map
 from estimator.posegraph import UPPER, Graph, optimise
 from estimator.records import Answer, Array, Job
@@ -152,6 +153,41 @@ def test_a_map_moved_while_its_graph_was_solved_is_solved_again() -> None:
     take_answer(state, Answer(0.0, again.job_id, again.run()))
     places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
     assert np.hypot(*(places - truth)[:, :2].T - np.array(((5.0,), (0.0,)))).max() < 0.15
+
+
+def test_a_graph_of_which_a_part_was_forgotten_meanwhile_moves_nothing() -> None:
+    """As after RELOCALISE: the newest submap then may be of an earlier run, with another odom frame."""
+    state, truth = driven(laps=0.6)
+    for submap in state.atlas.submaps.values():
+        submap.T_odom_submap = submap.T_odom_submap + np.array((50.0, 20.0, 1.0))
+    state.next_key = 1000
+    begin(state)
+    lay(state, truth[0], truth[0], np.random.default_rng(3), 1000)
+    state.atlas.stale = True
+    take_answer(state, Answer(0.0, -1, None))
+    job = next(job for job in state.atlas.take_jobs() if job.priority == SOLVE)
+    T_map_odom, places = state.T_map_odom, {k: one.T_map_submap for k, one in state.atlas.submaps.items() if k != 1000}
+    state.next_key = 1001
+    begin(state)
+    take_answer(state, Answer(0.0, job.job_id, job.run()))
+    assert state.T_map_odom is T_map_odom
+    assert all(places[key] is submap.T_map_submap for key, submap in state.atlas.submaps.items())
+    assert 1000 not in {key for keys in state.places.values() for key in keys}
+
+
+def test_a_loop_of_a_forgotten_submap_whose_key_was_given_again_is_none() -> None:
+    state, truth = driven(laps=0.6)
+    rng, before = np.random.default_rng(3), len(state.atlas.constraints.T)
+    begin(state)
+    lay(state, truth[0], truth[0], rng, 1000)
+    frame = state.keyframes[1000]
+    state.atlas.since = 1000
+    begin(state)
+    lay(state, truth[0], truth[0], rng, 1001)
+    assert state.atlas.submaps[frame.submap.key] is not frame.submap
+    found = Found(1, np.zeros(3), SMALL, 1.0, 0.0, 0.01, np.zeros(3))
+    found_again(state.atlas, TOLD, frame, found)
+    assert len(state.atlas.constraints.T) == before
 
 
 @pytest.mark.jit

@@ -62,6 +62,13 @@ def test_a_restored_state_has_the_same_map_and_is_adrift(mapped: State) -> None:
     assert [piece.key for piece in again.submaps] == list(mapped.atlas.submaps)
 
 
+def test_a_scan_that_only_a_submap_holds_keeps_its_number(mapped: State) -> None:
+    image = image_of(mapped)
+    last = max(one.settled.witness.key for one in image.submaps if one.settled is not None)
+    frames = tuple(frame for frame in image.frames if frame.key < last)
+    assert restored(replace(image, frames=frames)).next_key > last
+
+
 def test_nothing_that_happens_later_changes_an_image(mapped: State) -> None:
     state = restored(image_of(mapped))
     image = image_of(state)
