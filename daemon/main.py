@@ -35,7 +35,7 @@ from daemon.photodiode import AdcMaker, BlockWatch, make_adc
 from daemon.publish.snapshot import Snapshot, State
 from daemon.realtime import claim
 from daemon.sampleclock import SampleClock, runtime_folder
-from daemon.store import NoMap, Start, Store, started
+from daemon.store import NoMap, Start, Store, folder_of, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
 from daemon.supervise import Supervisor
@@ -373,6 +373,8 @@ def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> 
     said = [modbus if settings.modbus.port else "no Modbus"]
     said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
     said += [f"stream {stream}"] if stream is not None else []
+    used = "map from" if settings.map.localise else "maps in"
+    said += [f"{used} {folder_of(settings.map.folder)}"] if settings.map.kept else ["no map is kept"]
     said += [f"recording into {record}"] if record is not None else []
     return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 

@@ -15,13 +15,12 @@ from daemon import cli
 from daemon.carmenfile import carmen
 from daemon.mapimage import draw
 from daemon.mapserver import BadMapServer, load
-from daemon.mapstore import keep, opened
+from daemon.mapstore import LONGEST_NAME, Refused, called, keep, opened, put
 from daemon.png import encode_png
 from daemon.results import Folder, OutputRefused, Trajectory, finest, map_yaml, pgm, tum
 from daemon.store_file import BadMap
 from daemon.store_image import image_from, meta_of, packed
 from daemon.versions import versions
-from daemon.wholefile import write_whole
 from estimator import se2
 from estimator.floorplan import image_of_cells
 from estimator.grid import Grid
@@ -68,21 +67,16 @@ def take_in(args: argparse.Namespace) -> int:
     """Make a map file of one of map_server's; returns the exit code."""
     try:
         described, cells = load(args.yaml)
-        identity = Identity(1 + secrets.randbelow(2**32 - 1), (args.name or args.yaml.stem)[:64])
+        named = called(args.name) if args.name else args.yaml.stem[:LONGEST_NAME]
+        identity = Identity(1 + secrets.randbelow(2**32 - 1), named)
         origin = np.array(described.origin)
         image = image_of_cells(cells, described.resolution, origin, identity)
         content = packed(image, meta_of(image, time.time(), "", versions()["lumiloop"]))
-        if args.out is None:
-            path = keep(args.settings, content, identity.map_id)
-        else:
-            path = args.out
-            write_whole(path, content)
-    except (BadMapServer, BadMap) as error:
+        path = keep(args.settings, content, identity.map_id) if args.out is None else put(args.out, content)
+    except (BadMapServer, BadMap, Refused, OSError) as error:
         return cli.fail(str(error))
     except ValueError as error:
         return cli.fail(f"{args.yaml}: {error}")
-    except OSError as error:
-        return cli.fail(f"the map cannot be written: {error}; name another place with --out FILE")
     wide, tall = cells.shape[1] * described.resolution, cells.shape[0] * described.resolution
     sys.stdout.write(f"{path}: map {identity.map_id:08x} of {wide:.1f} x {tall:.1f} m, {len(image.submaps)} submaps\n")
     return cli.OK

@@ -63,16 +63,27 @@ def opened(path: Path) -> Stored:
     except OSError as error:
         raise OSError(f"{path}: cannot be read: {said(error)}; name a map file, *.lumimap") from error
     except BadMap as error:
-        raise type(error)(f"{path}: {error}; {error.remedy}") from error
+        raise type(error)(f"{path}: {error}; {error.advice}") from error
+
+
+def put(path: Path, content: bytes) -> Path:
+    """Write a map to a place that a person has named; `OSError` names it and the remedy."""
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {said(error)}; name another place with --out FILE") from error
+    return path
 
 
 def keep(settings: Config, content: bytes, map_id: int) -> Path:
-    """Put a map into the configured folder; `OSError` where another process uses it."""
+    """Put a map into the configured folder; `OSError`, with the remedy, where another process uses it."""
     if not settings.map.kept:
-        raise OSError("`map.folder` is none")
+        raise OSError("`map.folder` is none; name a place with --out FILE")
     store = Store(folder_of(settings.map.folder))
     try:
         return store.save(content, map_id)
+    except OSError as error:
+        raise OSError(f"{store.folder}: {said(error)}; stop the daemon, or name --out FILE") from error
     finally:
         store.close()
 
@@ -102,15 +113,24 @@ def name(args: argparse.Namespace) -> int:
     """Say which floor or building a map is of; returns the exit code."""
     try:
         stored = opened(args.map)
-        text = args.text.strip()
-        if len(text) > LONGEST_NAME or not text.isprintable():
-            raise Refused(f"a name is one line of at most {LONGEST_NAME} characters")
-        meta = msgspec.structs.replace(stored.meta, name=text)
+        meta = msgspec.structs.replace(stored.meta, name=called(args.text))
         path = written(args, stored.tables, meta)
     except (BadMap, Refused, OSError) as error:
         return cli.fail(str(error))
-    sys.stdout.write(f"{path}: map {meta.map_id:08x} is called {text!r}\n")
+    sys.stdout.write(f"{path}: map {meta.map_id:08x} is called {meta.name!r}\n")
     return cli.OK
+
+
+def called(text: str) -> str:
+    """The name of a map.
+
+    Raises:
+        Refused: it cannot be one.
+    """
+    text = text.strip()
+    if len(text) > LONGEST_NAME or not text.isprintable():
+        raise Refused(f"a name is one line of at most {LONGEST_NAME} characters")
+    return text
 
 
 def written(args: argparse.Namespace, tables: Tables, meta: Meta) -> Path:
@@ -118,8 +138,7 @@ def written(args: argparse.Namespace, tables: Tables, meta: Meta) -> Path:
     content = pack({**tables, "meta": msgspec.structs.replace(meta, saved=time.time()).packed()})
     read(content)  # what cannot be read again is not written
     if args.out is not None:
-        write_whole(args.out, content)
-        return Path(args.out)
+        return put(args.out, content)
     store = Store(args.map.parent)
     try:
         return store.save(content, meta.map_id)

@@ -108,7 +108,8 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
         start = replace(start, localise=config.localise)
         meta = start.stored.meta
         named = f" ({meta.name})" if meta.name else ""
-        log.info("map %08x%s of %d submaps loaded", meta.map_id, named, len(start.stored.tables["submap.key"]))
+        count = len(start.stored.tables["submap.key"])
+        log.info("map %08x%s of %d submaps loaded from %s", meta.map_id, named, count, store.folder)
     return store, start
 
 

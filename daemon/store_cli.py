@@ -49,7 +49,7 @@ def _read(path: Path) -> Stored | str:
     except OSError as error:
         return f"{path}: cannot be read: {said(error)}; name a map file, *.lumimap"
     except BadMap as error:
-        return f"{path}: {error}; {error.remedy}"
+        return f"{path}: {error}; {error.advice}"
 
 
 def _table(found: dict[str, Any]) -> str:

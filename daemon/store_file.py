@@ -46,10 +46,11 @@ class BadMap(Exception):
     """A map that cannot be used. The text says what is wrong with it, without the file's name.
 
     Attributes:
-        remedy: what a person can do.
+        remedy: what a person can do, or what the daemon does. advice: the same for who has named the file himself.
     """
 
     remedy = "it is kept; the generation before it is used"
+    advice = "name another, for instance the generation before it"
 
 
 class Foreign(BadMap):
@@ -60,6 +61,7 @@ class Newer(BadMap):
     """A newer version of this software has written it."""
 
     remedy = "install that version again, or move the file away"
+    advice = "read it with that version"
 
 
 class Damaged(BadMap):

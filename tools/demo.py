@@ -292,7 +292,8 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
         off, turned = figures["error_m"], figures["error_deg"]
         print(
             f"{figures['driven_m']:.1f} m driven; error median {100 * off['median']:.1f} cm, "
-            f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg"
+            f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg; "
+            f"largest while TRACKING {100 * score.tracking_m:.1f} cm"
         )
     for act in score.acts:
         seen, back, right = (("never" if t is None else f"after {t:.1f} s") for t in (act.seen, act.back, act.right))

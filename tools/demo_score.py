@@ -59,6 +59,7 @@ class Score:
     acts: list[Act] = field(default_factory=list)
     error_m: list[float] = field(default_factory=list)
     error_rad: list[float] = field(default_factory=list)
+    tracking_m: float = 0.0  # the largest error while the state was TRACKING
     states: dict[str, int] = field(default_factory=dict)
     reads: int = 0
     unanswered: int = 0
@@ -90,6 +91,8 @@ class Score:
         want = in_map(truth, self.origin)
         self.error_m.append(math.hypot(pose[0] - want[0], pose[1] - want[1]))
         self.error_rad.append(math.remainder(pose[2] - want[2], math.tau))
+        if state == State.TRACKING.name:
+            self.tracking_m = max(self.tracking_m, self.error_m[-1])
         if self._was is not None:
             self.driven_m += math.hypot(truth[0] - self._was[0], truth[1] - self._was[1])
         self._was = truth
@@ -127,6 +130,7 @@ def summary(score: Score) -> dict[str, Any]:
         "driven_m": round(score.driven_m, 2),
         "poses_compared": len(errors),
         "error_m": {"median": statistics.median(errors), "max": max(errors), "last": errors[-1]} if known else None,
+        "error_while_tracking_m": score.tracking_m if known else None,
         "error_deg": {"median": statistics.median(angles), "max": max(angles), "last": angles[-1]} if known else None,
         "states": score.states,
         "acts": [act.figures for act in score.acts],

@@ -47,6 +47,9 @@ def test_errors_are_measured_from_the_first_pose() -> None:
     assert score.error_m == pytest.approx([0.0, 0.3])
     assert score.error_rad == pytest.approx([0.0, 0.02])
     assert score.driven_m == pytest.approx(1.0)
+    score.take(reading(State.LOST, pose=(9.1, 0.0, 0.0)), (6.0, 5.0, 0.0))  # in the air, and says so
+    assert max(score.error_m) == pytest.approx(8.0)
+    assert summary(score)["error_while_tracking_m"] == pytest.approx(0.3)
 
 
 def test_a_reading_without_pose_or_truth_is_not_compared() -> None:
