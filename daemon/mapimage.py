@@ -32,6 +32,11 @@ _RING_PX: Final = 2.0
 _LINE_PX: Final = 1.2
 _DOT_PX: Final = 7.0
 _BAR_PX: Final = 3.0
+_BAND: Final = 64
+"""Rows of cells that are drawn at a time."""
+
+Discs = tuple[Array, Pixels, float]
+"""Places (n, 2) in pixels, colours (n, 3) and radius."""
 
 
 def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.uint8]:
@@ -42,20 +47,21 @@ def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.
         path: (n, 2 or more) positions in the map frame in order of time, metres; n may be 0.
         lamps: (k, 2) positions of lamps in the map frame; those beyond the map's edge are not drawn.
     """
-    probability = grid.probability
+    probability = grid.probability[::-1]
     if probability.size == 0:
         return np.broadcast_to(UNKNOWN, (16, 16, 3)).astype(np.uint8)
-    scale = max(1, round(SMALLEST_SIDE / max(probability.shape)))
-    pixels = _shade(probability[::-1].repeat(scale, axis=0).repeat(scale, axis=1))
-    places = _to_pixels(grid, path, scale, len(pixels))
-    if lamps is not None and len(lamps) > 0:
-        at = _to_pixels(grid, lamps, scale, len(pixels))
-        _stamp(pixels, at, np.tile(WALL, (len(at), 1)), _LAMP_PX + _RING_PX)
-        _stamp(pixels, at, np.tile(LAMP, (len(at), 1)), _LAMP_PX)
-    if len(places) > 0:
-        _draw_path(pixels, places)
+    rows, columns = probability.shape
+    scale = max(1, round(SMALLEST_SIDE / max(rows, columns)))
+    discs = _discs(grid, path, lamps, scale)
+    pixels = np.empty((scale * rows, scale * columns, 3), np.uint8)
+    for first in range(0, rows, _BAND):  # what is computed with takes twenty times the memory of the picture
+        band = _shade(probability[first : first + _BAND].repeat(scale, axis=0).repeat(scale, axis=1))
+        top = scale * first
+        for places, colours, radius in discs:
+            _stamp(band, places - (top, 0.0), colours, radius)
+        pixels[top : top + len(band)] = np.rint(band)
     _draw_bar(pixels, scale / grid.resolution)
-    return np.rint(pixels).astype(np.uint8)
+    return pixels
 
 
 def _shade(probability: npt.NDArray[np.float32]) -> Pixels:
@@ -71,8 +77,20 @@ def _to_pixels(grid: Grid, path: Array, scale: int, rows: int) -> Array:
     return np.stack([rows - cells[:, 1], cells[:, 0]], axis=1)
 
 
-def _draw_path(pixels: Pixels, places: Array) -> None:
-    """The line, densely stamped with soft dots, and a larger dot at either end."""
+def _discs(grid: Grid, path: Array, lamps: Array | None, scale: int) -> list[Discs]:
+    """What is drawn over the map, the lowest first."""
+    rows = scale * len(grid.log_odds)
+    discs: list[Discs] = []
+    if lamps is not None and len(lamps) > 0:
+        at = _to_pixels(grid, lamps, scale, rows)
+        discs.append((at, np.tile(WALL, (len(at), 1)), _LAMP_PX + _RING_PX))
+        discs.append((at, np.tile(LAMP, (len(at), 1)), _LAMP_PX))
+    places = _to_pixels(grid, path, scale, rows)
+    return discs + _line(places) if len(places) > 0 else discs
+
+
+def _line(places: Array) -> list[Discs]:
+    """The path, densely stamped with soft dots, and a larger dot at either end."""
     steps = np.hypot(*np.diff(places, axis=0).T) if len(places) > 1 else np.zeros(0)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     count = max(2, int(along[-1] * 1.5))
@@ -80,16 +98,22 @@ def _draw_path(pixels: Pixels, places: Array) -> None:
     dense = np.stack([np.interp(wanted, along, places[:, axis]) for axis in (0, 1)], axis=1)
     shades = np.linspace(0.0, len(PATH) - 1.0, count)
     colours = np.stack([np.interp(shades, np.arange(len(PATH)), PATH[:, c]) for c in range(3)], axis=1)
-    _stamp(pixels, dense, colours, _LINE_PX)
-    _stamp(pixels, places[:1], START[None], _DOT_PX)
-    _stamp(pixels, places[-1:], END[None], _DOT_PX)
+    return [
+        (dense, colours, _LINE_PX),
+        (places[:1], START[None], _DOT_PX),
+        (places[-1:], END[None], _DOT_PX),
+    ]
 
 
 def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> None:
     """Blend a soft-edged disc of ``radius`` pixels at each place; a pixel takes the colour of its last disc."""
     reach = int(np.ceil(radius)) + 1
-    centre = np.floor(places).astype(np.int64)
     rows, columns = pixels.shape[:2]
+    near = (places[:, 0] > -reach - 1) & (places[:, 0] < rows + reach + 1)
+    if not near.any():
+        return
+    places, colours = places[near], colours[near]
+    centre = np.floor(places).astype(np.int64)
     cover = np.zeros((rows, columns))
     paint = np.zeros((rows, columns, 3))
     for down in range(-reach, reach + 1):
@@ -103,7 +127,7 @@ def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> Non
     pixels += cover[..., None] * (paint - pixels)
 
 
-def _draw_bar(pixels: Pixels, pixels_per_metre: float) -> None:
+def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
     """A scale bar in the lower left corner, the longest of 1, 5, 10, 50, 100 m that takes at most a third."""
     rows, columns = pixels.shape[:2]
     length = next((m for m in (100, 50, 10, 5, 1) if m * pixels_per_metre <= columns / 3), 0)

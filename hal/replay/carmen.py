@@ -82,17 +82,18 @@ class CarmenLog:
 
     def _scan(self, seq: int, t_scan: float) -> RawScan:
         scan = self._scans[seq]
+        ranges, code = scan.beams()
         return RawScan(
             geometry=scan.geometry,
             seq=seq,
-            t_rx=t_scan + scan.geometry.beam_dt_s * (len(scan.ranges) - 1),
+            t_rx=t_scan + scan.geometry.beam_dt_s * (len(ranges) - 1),
             t_mono=t_scan,
             t_sigma=0.0,
             t_tick=-1,
             first_step=0,
             stride=1,
-            ranges=scan.ranges,
-            code=scan.code,
+            ranges=ranges,
+            code=code,
             intensity=scan.intensity,
         )
 

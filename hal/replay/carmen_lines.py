@@ -15,6 +15,7 @@ where ``TAIL`` is ``ipc_time host logger_time``.
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -57,12 +58,12 @@ class LaserLine:
 
     Attributes:
         laser, robot: first and second pose triple; None where the line has none or it is not finite.
-        remission: one value per beam, empty where there is none.
+        remission: one value per beam, empty where there is none. Arrays, because a whole log of them is held at once.
     """
 
     setup: LaserSetup
-    ranges: list[float]
-    remission: list[float]
+    ranges: array[float]
+    remission: array[float]
     laser: Pose | None
     robot: Pose | None
     stamp: float
@@ -133,17 +134,20 @@ def _pose(values: list[float]) -> Pose | None:
     return (values[0], values[1], values[2]) if all(map(math.isfinite, values)) else None
 
 
+def _numbers(words: list[bytes]) -> array[float]:
+    return array("d", map(float, words))
+
+
 def _flaser(words: list[bytes]) -> LaserLine:
     count = _count(words[1])
     end = 2 + count + 6
     stamp = _stamp(words, end)
-    values = list(map(float, words[2:end]))
-    return LaserLine(
-        LaserSetup(count), values[:count], [], _pose(values[count : count + 3]), _pose(values[count + 3 :]), stamp
-    )
+    ranges = _numbers(words[2 : 2 + count])
+    poses = list(map(float, words[2 + count : end]))
+    return LaserLine(LaserSetup(count), ranges, array("d"), _pose(poses[:3]), _pose(poses[3:]), stamp)
 
 
-def _configured(words: list[bytes]) -> tuple[LaserSetup, list[float], int]:
+def _configured(words: list[bytes]) -> tuple[LaserSetup, array[float], int]:
     """Setup and ranges of the newer laser lines, and the index of the first word after the ranges."""
     config = list(map(float, words[1 : 1 + _CONFIG]))
     count = _count(words[1 + _CONFIG])
@@ -151,10 +155,10 @@ def _configured(words: list[bytes]) -> tuple[LaserSetup, list[float], int]:
     if len(words) < end + _TAIL:
         raise IndexError
     setup = LaserSetup(count, start=config[1], fov=config[2], resolution=config[3], maximum=config[4])
-    return setup, list(map(float, words[2 + _CONFIG : end])), end
+    return setup, _numbers(words[2 + _CONFIG : end]), end
 
 
-def _remissions(words: list[bytes], at: int, rest: tuple[int, ...]) -> tuple[list[float], int]:
+def _remissions(words: list[bytes], at: int, rest: tuple[int, ...]) -> tuple[array[float], int]:
     """Remission values and the next index.
 
     Old logs leave out even the count of remissions; a count has no decimal point, a pose has.
@@ -168,9 +172,9 @@ def _remissions(words: list[bytes], at: int, rest: tuple[int, ...]) -> tuple[lis
     if words[at].isdigit():
         count = int(words[at])
         if after - 1 - count in rest:
-            return list(map(float, words[at + 1 : at + 1 + count])), at + 1 + count
+            return _numbers(words[at + 1 : at + 1 + count]), at + 1 + count
     if after in rest:
-        return [], at
+        return array("d"), at
     raise ValueError(f"{after} fields between the ranges and the time stamp")
 
 
@@ -188,9 +192,9 @@ def _rawlaser(words: list[bytes]) -> LaserLine:
     return LaserLine(setup, ranges, _whole(remission, setup), None, None, _stamp(words, at))
 
 
-def _whole(remission: list[float], setup: LaserSetup) -> list[float]:
+def _whole(remission: array[float], setup: LaserSetup) -> array[float]:
     """Remissions are of use only where every beam has one."""
-    return remission if len(remission) == setup.count else []
+    return remission if len(remission) == setup.count else array("d")
 
 
 def _odometry(words: list[bytes]) -> OdometryLine:

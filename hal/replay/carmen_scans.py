@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,18 +26,24 @@ PARAM_BEAM_DT: Final = "lumiloop_laser_beam_dt"
 """Parameters of our own that a converted log may carry: text, metres, seconds, seconds between beams."""
 
 PARAM_MAXIMUM: Final = "robot_front_laser_max"
+_PART: Final = 256
+"""Scans that are turned into whole numbers at a time."""
 _FARTHEST: Final = 1_000_000
 """One kilometre in range units; what is beyond is no distance of any indoor lidar, whatever the log says."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarmenScan:
-    """One scan in device units; `hal.lidar.RawScan` describes the fields."""
+    """One scan in device units; `hal.lidar.RawScan` describes its fields. ``raw`` has a beam's range or its code."""
 
     geometry: LidarGeometry
-    ranges: Whole
-    code: Whole
+    raw: Whole
     intensity: Whole | None
+
+    def beams(self) -> tuple[Whole, Whole]:
+        """Ranges and codes; made anew by each call, so that a log in memory holds one number a beam."""
+        valid = (self.raw >= self.geometry.dmin) & (self.raw <= self.geometry.dmax)
+        return np.where(valid, self.raw, np.int32(0)), np.where(valid, np.int32(VALID), self.raw)
 
 
 def convert(lasers: list[LaserLine], parameters: dict[str, str], time: Array, report: LogReport) -> list[CarmenScan]:
@@ -54,19 +61,26 @@ def convert(lasers: list[LaserLine], parameters: dict[str, str], time: Array, re
     period = float(np.median(np.diff(time))) if len(lasers) > 1 else 0.0
     scans: dict[int, CarmenScan] = {}
     for setup, indices in by_setup.items():
-        raw = _millimetres(np.array([lasers[index].ranges for index in indices]))
+        raw = _raw([lasers[index].ranges for index in indices], setup.count)
         geometry = _geometry(setup, raw, parameters, period)
-        valid = (raw >= geometry.dmin) & (raw <= geometry.dmax)
-        ranges, code = np.where(valid, raw, np.int32(0)), np.where(valid, np.int32(VALID), raw)
+        valid = np.count_nonzero((raw >= geometry.dmin) & (raw <= geometry.dmax))
         report.use("beams", raw.size)
-        report.use("beams without a return", int(raw.size - np.count_nonzero(valid)))
+        report.use("beams without a return", int(raw.size - valid))
         for row, index in enumerate(indices):
-            scans[index] = CarmenScan(geometry, ranges[row], code[row], _intensity(lasers[index].remission))
+            scans[index] = CarmenScan(geometry, raw[row], _intensity(lasers[index].remission))
     return [scans[index] for index in range(len(lasers))]
 
 
-def _intensity(remission: list[float]) -> Whole | None:
-    return np.rint(np.nan_to_num(remission)).astype(np.int32) if remission else None
+def _intensity(remission: array[float]) -> Whole | None:
+    return np.rint(np.nan_to_num(np.asarray(remission))).astype(np.int32) if remission else None
+
+
+def _raw(ranges: list[array[float]], count: int) -> Whole:
+    """Ranges of one laser, a row a scan, (n, count); a part at a time, so that nothing else as large comes to be."""
+    raw = np.empty((len(ranges), count), np.int32)
+    for first in range(0, len(ranges), _PART):
+        raw[first : first + _PART] = _millimetres(np.array(ranges[first : first + _PART]))
+    return raw
 
 
 def _millimetres(metres: Array) -> Whole:

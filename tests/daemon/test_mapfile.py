@@ -122,7 +122,7 @@ def test_carmen_keeps_beams_mount_and_bearings(made: MapImage) -> None:
     assert line.setup.start == pytest.approx(-1.0)
     assert line.setup.resolution == pytest.approx(0.44)
     assert line.stamp == 17.0
-    assert line.ranges == [9.0, 9.0, 9.0, 7.25, 2.5, 1.0]
+    assert line.ranges.tolist() == [9.0, 9.0, 9.0, 7.25, 2.5, 1.0]
     assert line.setup.maximum == 9.0
     assert line.robot == pytest.approx(tuple(T), abs=1e-6)
     assert line.laser == pytest.approx(tuple(se2.compose(T, mount)), abs=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -72,4 +73,14 @@ def test_walls_of_real_logs_are_thin(monkeypatch: pytest.MonkeyPatch, log_root: 
     named = {figure.name: figure for figure in maps.run()}
     for log in ("intel", "aces"):
         assert named[f"{log}: thickness of walls, median"].value <= 100.0
+        assert named[f"{log}: memory at most"].value <= 300.0
         assert (tmp_path / "out" / "bench" / f"map-{log}.png").stat().st_size < 300_000
+
+
+def test_a_process_is_charged_with_its_own_memory_only() -> None:
+    held = np.ones(25_000_000)  # 200 MB of this process
+    assert maps.waited([sys.executable, "-S", "-c", "pass"]).peak_mb < 60.0
+    assert maps.waited([sys.executable, "-S", "-c", "len(bytearray(b'x') * 100_000_000)"]).peak_mb > 95.0
+    assert held.all()
+    with pytest.raises(RuntimeError, match="status 3"):
+        maps.waited([sys.executable, "-S", "-c", "raise SystemExit(3)"])

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import csv
 import os
+import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -48,6 +49,12 @@ APART_S: Final = 30.0
 FLAT_M: Final = 0.08
 SAMPLES: Final = 4000
 SAME_STAMP_S: Final = 0.02
+_BETWEEN: Final = """
+import os, sys
+_, status, used = os.wait4(os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ), 0)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss)
+sys.exit(os.waitstatus_to_exitcode(status) & 0xFF)
+"""
 PATH, LOOP = (70, 120, 235), (220, 38, 38)
 
 
@@ -81,16 +88,24 @@ def run() -> list[Figure]:
 def replayed(log: Path, out: Path) -> Used:
     """Replay in a process of its own; kernels are loaded once before, so that none is compiled in it."""
     warm = "from daemon import warmup; warmup.load()"
-    _waited([sys.executable, "-c", warm])
-    return _waited([sys.executable, "-m", "daemon", "replay", str(log), "--out", str(out)])
+    waited([sys.executable, "-c", warm])
+    return waited([sys.executable, "-m", "daemon", "replay", str(log), "--out", str(out)])
 
 
-def _waited(command: list[str]) -> Used:
-    pid = os.posix_spawn(command[0], command, dict(os.environ))
-    _, status, used = os.wait4(pid, 0)
-    if status != 0:
-        raise RuntimeError(f"{' '.join(command[1:])} ended with status {os.waitstatus_to_exitcode(status)}")
-    return Used(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0)
+def waited(command: list[str]) -> Used:
+    """Run a command and see what it takes.
+
+    A small process in between starts it: a process counts the memory of the one that started it as its own (exec keeps
+    the highest resident set so far), and this one is large.
+
+    Raises:
+        RuntimeError: the command failed.
+    """
+    ran = subprocess.run([sys.executable, "-S", "-c", _BETWEEN, *command], stdout=subprocess.PIPE, text=True)
+    if ran.returncode != 0:
+        raise RuntimeError(f"{' '.join(command[1:])} ended with status {ran.returncode}")
+    cpu_s, peak_kb = ran.stdout.splitlines()[-1].split()
+    return Used(float(cpu_s), float(peak_kb) / 1024.0)
 
 
 def _figures(name: str, log: Path, out: Path, used: Used) -> list[Figure]:

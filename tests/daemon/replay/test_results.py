@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from daemon.mapimage import draw
 from daemon.png import encode_png
 from daemon.results import FREE, OCCUPIED, Folder, OutputRefused, Trajectory, greys, map_files, map_yaml, pgm, tum
 from estimator.grid import Grid
@@ -93,6 +95,26 @@ def test_the_picture_shows_walls_free_space_and_the_path(tmp_path: Path) -> None
     assert at(2.5, 1.0) == [37, 99, 235]  # the start, blue
     assert at(5.5, 3.5) == [220, 38, 38]  # the end, red
     assert max(at(4.0, 1.0)) - min(at(4.0, 1.0)) > 60  # a coloured path between
+
+
+def test_a_picture_is_drawn_in_a_few_times_its_size() -> None:
+    cells = np.random.default_rng(1).normal(0.0, 3.0, (1500, 1500)).astype(np.float32)
+    t = np.linspace(0.0, 6.0, 500)
+    tracemalloc.start()
+    pixels = draw(Grid(np.zeros(2), 0.05, cells), np.column_stack([37.0 + 20.0 * np.cos(t), 37.0 + 20.0 * np.sin(t)]))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert pixels.shape == (1500, 1500, 3)
+    assert peak < 10 * pixels.nbytes
+
+
+def test_no_seam_where_a_picture_was_drawn_in_bands() -> None:
+    grid = Grid(np.zeros(2), 0.05, np.full((300, 200), -4.0, np.float32))
+    up = np.column_stack([np.full(400, 5.025), np.linspace(1.0, 14.0, 400)])
+    along = draw(grid, up)[30 * 4 : 270 * 4]  # a cell has 4 pixels; between the dots at the ends
+    painted = (along != along[:, :1]).any(axis=2)
+    assert painted.any(axis=1).all()
+    assert np.unique(painted, axis=0).shape[0] == 1
 
 
 def test_tum_is_what_evo_and_the_benchmarks_read() -> None:

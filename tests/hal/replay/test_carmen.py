@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import math
+import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,6 +25,19 @@ from tests.hal.replay.logs import drive, flaser, robotlaser, write
 
 def scans_of(log: CarmenLog, start: float = 0.0) -> list[RawScan]:
     return [event for event in log.events(start) if isinstance(event, RawScan)]
+
+
+def test_a_log_is_read_in_sixteen_bytes_a_beam(tmp_path: Path) -> None:
+    read_carmen(write(tmp_path / "b.log", drive(3)))  # what numpy loads at its first use does not count
+    path = write(tmp_path / "a.log", drive(600, count=361))
+    tracemalloc.start()
+    log = read_carmen(path)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    beams = 600 * 361
+    assert sum(scan.ranges.size for scan in scans_of(log)) == beams
+    assert held < 8 * beams
+    assert peak - 4_000_000 < 16 * beams  # a part of the file is split into lines at a time
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def laser(line: bytes) -> LaserLine:
 
 def test_flaser_has_the_laser_first_and_the_robot_second() -> None:
     line = laser(FLASER)
-    assert line.ranges == [1.0, 2.5, 81.83]
+    assert line.ranges.tolist() == [1.0, 2.5, 81.83]
     assert line.laser == (1.1, 2.0, 0.5)
     assert line.robot == (1.0, 2.0, 0.5)
     assert line.stamp == 976052857.337530
@@ -47,7 +47,7 @@ def test_robotlaser_with_and_without_remissions(remissions: bytes, safety: bytes
     assert line.setup.maximum == 81.92
     assert line.setup.resolution == 0.017453
     assert (line.laser, line.robot) == ((1.1, 2.0, 0.5), (1.0, 2.0, 0.5))
-    assert line.remission == expected
+    assert line.remission.tolist() == expected
     assert line.stamp == 12.5
 
 
@@ -55,7 +55,7 @@ def test_rawlaser_has_no_poses() -> None:
     line = laser(b"RAWLASER1 " + CONFIG + b" 0 12.5 host 12.6")
     assert line.laser is None
     assert line.robot is None
-    assert line.ranges == [1.0, 2.5, 81.83]
+    assert line.ranges.tolist() == [1.0, 2.5, 81.83]
     assert laser(b"RAWLASER1 " + CONFIG + b" 12.5 host 12.6") == line
 
 
