@@ -140,7 +140,9 @@ def _map(parser: argparse.ArgumentParser) -> None:
     taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
     taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
     taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
-    taken.add_argument("--out", type=Path, metavar="FILE", help="default: the configured folder of maps")
+    taken.add_argument(
+        "--out", type=Path, metavar="FILE", help="default: the configured folder of maps; the next start takes it"
+    )
     _config_arguments(taken)
     taken.set_defaults(body=_estimating("daemon.mapfile", "take_in", "warm-plan"))
     render = verbs.add_parser("render", help="draw a map file as a picture")
@@ -166,7 +168,12 @@ def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     name.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     name.add_argument("text", metavar="NAME", help="at most 64 characters")
     for parser, verb in ((align, "align"), (name, "name")):
-        parser.add_argument("--out", type=Path, metavar="FILE", help="default: the next generation beside FILE")
+        parser.add_argument(
+            "--out",
+            type=Path,
+            metavar="FILE",
+            help="default: beside FILE, as the newest; the daemon there has to be stopped",
+        )
         parser.set_defaults(body=_loaded("daemon.mapstore", verb))
 
 

@@ -36,6 +36,8 @@ _ANSWER: Final = struct.Struct(">HHHBBB")
 _READ_INPUT: Final = 4
 _ANY_HOST: Final = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
 _TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
+_SEEKING: Final = (State.AMBIGUOUS, State.RELOCATING, State.LOST)
+_GUESS: Final = "  (a guess: the place is not known)"
 _CLEAR: Final = "\x1b[H\x1b[2J"
 
 Reading = dict[str, Value]
@@ -226,13 +228,13 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("state", _state(reading["state"]) + ("  (STANDS STILL: no new snapshot)" if stalled else "")),
         ("reason", _meaning("reason", reading["reason"])),
         ("fault", _meaning("fault", reading["fault"])),
-        ("map pose", _pose(reading, "map") + _unknown_axes(flags)),
+        ("map pose", _pose(reading, "map") + _reserve(reading["state"], flags)),
         ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
         *_trust(reading),
         ("odom pose", _pose(reading, "odom")),
         ("speed", _triple(reading, ("v_x", "v_y", "yaw_rate"), "m/s", "/s")),
         ("age", _bounded(reading["age"], "s")),
-        ("map", f"id {reading['map_id']}, {reading['jumps']} jumps"),
+        ("map", f"id {reading['map_id']:08x}, {reading['jumps']} jumps"),
         ("loops", _loops(reading)),
         *_lights(reading),
         ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
@@ -340,6 +342,11 @@ def _pose(reading: Reading, frame: str) -> str:
 def _unknown_axes(flags: dict[str, bool]) -> str:
     missing = [axis for axis in ("x", "y", "yaw") if not flags[f"{axis}_known"]]
     return f"  (not observed: {', '.join(missing)})" if flags["pose_valid"] and missing else ""
+
+
+def _reserve(state: Value, flags: dict[str, bool]) -> str:
+    """What has to be known of a pose before it is used."""
+    return _GUESS if state in _SEEKING and flags["pose_valid"] else _unknown_axes(flags)
 
 
 def _loops(reading: Reading) -> str:

@@ -96,7 +96,11 @@ def _heartbeat(snapshot: Snapshot) -> Value:
 Bit = tuple[str, str, Callable[[Snapshot], bool]]
 
 FLAGS: Final[tuple[Bit, ...]] = (
-    ("pose_valid", "there is a pose in the map frame", lambda s: s.pose is not None),
+    (
+        "pose_valid",
+        "there is a pose in the map frame; a guess in AMBIGUOUS, RELOCATING, LOST",
+        lambda s: s.pose is not None,
+    ),
     ("odom_valid", "there is a pose in the odom frame", lambda s: s.odom is not None),
     ("x_known", "x of the map pose is observed, not only carried on", lambda s: s.known[0]),
     ("y_known", "y of the map pose is observed", lambda s: s.known[1]),

@@ -268,3 +268,12 @@ def test_while_a_daemon_keeps_its_maps_there_nothing_is_written(
 def test_align_and_name_load_no_compiler() -> None:
     code = "import sys, daemon.mapstore; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_place_that_cannot_be_written_is_named(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "none" / "b.lumimap"
+    assert cli.main(["map", "name", str(file), "hall", "--out", str(out)]) == cli.FAILED
+    said = capsys.readouterr().err
+    assert f"{out}: cannot be written: No such file or directory; name another place with --out FILE" in said

@@ -77,6 +77,14 @@ def test_a_person_sees_the_links_beside_the_pose(capsys: pytest.CaptureFixture[s
         assert line in shown, shown
 
 
+@pytest.mark.parametrize("state", [State.AMBIGUOUS, State.RELOCATING, State.LOST])
+def test_a_pose_whose_place_is_not_known_is_marked_as_a_guess(state: State, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(state=state, map_id=0xC0FFEE), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "yaw 171.89 deg  (a guess: the place is not known)\n" in shown
+    assert "map        id 00c0ffee, " in shown
+
+
 def test_a_daemon_of_a_version_without_the_block_of_lights_is_read_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
