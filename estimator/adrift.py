@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator import absolute, se2
+from estimator import absolute, livemap, se2
 from estimator.atlas import LOOK, Atlas
 from estimator.closing import join
 from estimator.globalsearch import Around
@@ -76,6 +76,15 @@ def forget_adrift(state: State) -> None:
         if state.settings.history:
             state.retired[frame.key] = frame.submap, se2.between(frame.submap.T_odom_submap, frame.T_odom_keyframe)
     unlist(state, state.atlas.since)
+
+
+def disown(state: State, watch: Watch) -> None:
+    """The place was the wrong one: what was mapped since lies in it, and is what the next `begin` lets go of.
+
+    Else the robot would find itself again in what it has laid there.
+    """
+    state.atlas.adrift, state.atlas.since, state.atlas.stale = watch.first, watch.since, True
+    livemap.forget(state, watch.first)
 
 
 def unlist(state: State, since: int) -> None:
@@ -242,8 +251,11 @@ def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis
 def decide(state: State) -> None:
     """Take the robot to the place that is sure, if one is."""
     one = state.atlas.seek.favourite()
-    if one is not None and state.atlas.seek.sure(one, said(state, one) is True):
-        land(state, one)
+    if one is None:
+        return
+    witnessed = said(state, one) is True
+    if state.atlas.seek.sure(one, witnessed):
+        land(state, one, not witnessed)
 
 
 def said(state: State, one: Hypothesis) -> bool | None:
@@ -260,8 +272,11 @@ def said(state: State, one: Hypothesis) -> bool | None:
     return False if relocate_light.compatible(state, T_map_base) is False else None
 
 
-def land(state: State, one: Hypothesis) -> None:
-    """The place is known: join what was mapped adrift to the older map, and take the robot there."""
+def land(state: State, one: Hypothesis, alone: bool) -> None:
+    """The place is known: join what was mapped adrift to the older map, and take the robot there.
+
+    ``alone``: by the laser alone.
+    """
     atlas, (frame, fit) = state.atlas, one.held[-1]
     found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in atlas.submaps]
     if fit.key not in atlas.submaps or not found:
@@ -272,7 +287,7 @@ def land(state: State, one: Hypothesis) -> None:
     move_map(state, T_map_odom)
     since, first = atlas.since, atlas.adrift
     if first is not None:
-        atlas.watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain)
+        atlas.watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain, since=since, alone=alone)
     atlas.adrift, atlas.since, atlas.seek = None, 0, Seek(terrain=atlas.seek.terrain)
     for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
         if it.key in atlas.submaps:

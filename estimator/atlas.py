@@ -348,9 +348,9 @@ class Atlas:
 
     def thin_out(self, latest: Submap) -> None:
         """Bound what is kept per area: of the submaps of one place and heading the newest few stay."""
-        here = [
-            other for other in self.of_part(latest) if cell_of(other) == cell_of(latest) and not self.is_held(other)
-        ]
+        first = 0 if self.watch is None else self.watch.first  # what is watched takes the place of nothing older
+        part = [other for other in self.of_part(latest) if (other.key < first) == (latest.key < first)]
+        here = [other for other in part if cell_of(other) == cell_of(latest) and not self.is_held(other)]
         for submap in here[:-KEPT]:
             self.let_go(submap)
         if self.held:

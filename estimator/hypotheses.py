@@ -166,7 +166,7 @@ class Watch:
     Attributes:
         first: key of the first submap that is no part of the map it was found in. until_m: way until then.
         strikes: looks that have spoken against it since one held it. job: ID of the look under way. terrain: of the
-            latest.
+            latest. since: first keyframe of that part. alone: the laser alone has decided.
     """
 
     first: int
@@ -174,6 +174,8 @@ class Watch:
     terrain: Terrain | None
     strikes: int = 0
     job: int = 0
+    since: int = 0
+    alone: bool = False
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

@@ -210,6 +210,19 @@ def begin(state: State) -> None:
             state.live.laid(submap, frames)
 
 
+def forget(state: State, first: int) -> None:
+    """The submaps from key ``first`` on are taken out of the map; an answer that still shows them is not waited for."""
+    live = state.live
+    if live is None:
+        return
+    state.atlas.asked.pop(live.job, None)
+    live.job = 0
+    for key in [key for key in live.drawn if key >= first]:
+        live.stale |= live.drawn.pop(key).tiles
+    live.submaps = {key: submap for key, submap in live.submaps.items() if key < first}
+    live.fresh = {key: seen for key, seen in live.fresh.items() if key < first}
+
+
 def go_on(state: State) -> None:
     """Hand out the next piece of work, if there is any and none is under way."""
     live, atlas = state.live, state.atlas

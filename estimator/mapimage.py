@@ -113,9 +113,13 @@ class MapImage:
 
 
 def image_of(state: State, identity: Identity | None = None) -> MapImage:
-    """The map of this moment, without what is adrift: that lies nobody knows where in it. At most a millisecond."""
-    atlas, joined = state.atlas, state.atlas.constraints
+    """The map of this moment, without what is adrift, or lies where only the laser has said and is still watched.
+
+    At most a millisecond.
+    """
+    atlas, joined, watch = state.atlas, state.atlas.constraints, state.atlas.watch
     adrift = math.inf if atlas.adrift is None else atlas.adrift
+    adrift = min(adrift, watch.first) if watch is not None and watch.alone else adrift
     pieces: list[Piece] = []
     hung: dict[int, tuple[int, Array]] = {}
     for submap in atlas.submaps.values():

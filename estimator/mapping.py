@@ -132,8 +132,8 @@ def retire(state: State, newest: Keyframe) -> None:
     place = square_of(newest.T_map_keyframe)
     here = [key for key in state.places.get(place, ()) if key in state.keyframes]
     here.append(newest.key)
-    atlas = state.atlas  # what is adrift may be anywhere: it takes the place of nothing older
-    since = max(atlas.since, atlas.kept if atlas.held else 0)
+    atlas = state.atlas  # what is adrift, or watched, may lie elsewhere: it takes the place of nothing older
+    since = max(atlas.since, atlas.kept if atlas.held else 0, 0 if atlas.watch is None else atlas.watch.since)
     older, here = [key for key in here if key < since], [key for key in here if key >= since]
     while len(here) > state.settings.keep:
         drop(state, here.pop(0))

@@ -1,7 +1,8 @@
 """After a place was found in the whole map: whether what is seen from there on goes on being true of it.
 
 A room that is not in the map may look like one that is. While the robot stays in it nothing tells; what it sees when
-it leaves does, and then it is adrift again instead of going on in the wrong place.
+it leaves does, and then it is adrift again instead of going on in the wrong place. What it has mapped there meanwhile
+goes if the laser alone had decided; until the watch is over that is not saved, and takes the place of nothing older.
 """
 
 from __future__ import annotations
@@ -42,4 +43,6 @@ def take(state: State, watch: Watch, payload: object) -> None:
     watch.strikes = 0 if fit.verdict is Verdict.HOLDS else watch.strikes + (fit.verdict is Verdict.NO)
     if watch.strikes >= STRIKES and state.atlas.watch is watch and state.atlas.adrift is None:
         state.atlas.watch = None
+        if watch.alone:
+            adrift.disown(state, watch)
         adrift.begin(state)

@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 
 from estimator import watch
+from estimator.atlas import Atlas
+from estimator.closing import take_answer
 from estimator.hypotheses import Watch
-from estimator.keyframe import Keyframe
+from estimator.keyframe import Keyframe, Submap
+from estimator.livemap import LiveMap, go_on
 from estimator.loop import LoopSettings
+from estimator.mapimage import image_of
+from estimator.records import Answer
 from estimator.relocate import Fit, Looked, Verdict
 from estimator.state import State
-from tests.estimator.test_closing import driven
+from tests.estimator.test_closing import driven, run_jobs
 
 
 def watched(until_m: float = 1e6) -> tuple[State, Watch, Keyframe]:
@@ -78,3 +83,51 @@ def test_after_its_way_the_watch_is_over() -> None:
     watch.keyframe_laid(state, frame)
     assert state.atlas.watch is None
     assert state.atlas.take_jobs() == ()
+
+
+def test_what_was_mapped_in_a_place_that_was_the_wrong_one_goes_if_the_laser_alone_had_decided() -> None:
+    for alone in (True, False):
+        state, seen, frame = watched()
+        newest = frame.submap
+        seen.since, seen.alone = newest.first, alone
+        older = {key: one for key, one in state.keyframes.items() if key < newest.first}
+        assert (newest.key in {piece.key for piece in image_of(state).unsettled}) == (not alone)
+        for _ in range(watch.STRIKES):
+            watch.take(state, seen, looked(Verdict.NO))
+        assert (newest.key in state.atlas.submaps) == (not alone)
+        assert (newest.key in state.atlas.constraints.between) == (not alone)
+        assert (state.keyframes == older) == alone
+        assert state.atlas.adrift == newest.key + (not alone)
+
+
+def test_the_live_map_no_longer_shows_it() -> None:
+    state, seen, frame = watched()
+    seen.since, seen.alone = frame.submap.first, True
+    live = state.live = LiveMap(0.1)
+    live.laid(frame.submap, state.atlas.frames)
+    go_on(state)
+    run_jobs(state)
+    assert any(cells.any() for _, cells in live.tiles.values())
+    live.laid(frame.submap, state.atlas.frames)
+    go_on(state)  # one more drawing of it is under way
+    late = state.atlas.take_jobs()
+    assert late
+    for _ in range(watch.STRIKES):
+        watch.take(state, seen, looked(Verdict.NO))
+    for job in late:
+        take_answer(state, Answer(0.0, job.job_id, job.run()))
+    go_on(state)
+    run_jobs(state)
+    assert not any(cells.any() for _, cells in live.tiles.values())
+
+
+def test_what_is_watched_takes_the_place_of_nothing_older() -> None:
+    for key in (3, 0):
+        atlas = Atlas()
+        for k in range(1, 5):
+            atlas.submaps[k] = Submap(k, k, np.zeros(3), np.zeros(3))
+            if k > 1:
+                atlas.constraints.add(k - 1, k, np.zeros(3), np.eye(3), False)
+        atlas.watch = Watch(key, 1e6, None) if key else None
+        atlas.thin_out(atlas.submaps[4])
+        assert list(atlas.submaps) == ([1, 2, 3, 4] if key else [3, 4])
