@@ -181,9 +181,11 @@ def by_light_alone(state: State) -> bool:
 
 
 def doubt(state: State) -> None:
-    """Say that the robot was carried off where light says so: at once if scans fit no more, else after a second.
+    """Say that the robot was carried off where light says so: at once if scans fit no more, else after a while.
 
-    The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here.
+    The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here. Where
+    light once proved the place, it must also receive a lamp that cannot be received here: the filter itself can be
+    led astray by wheels, and a robot that the laser holds is not set adrift for that.
     """
     from estimator import relocate_light
 
@@ -195,6 +197,8 @@ def doubt(state: State) -> None:
     now = state.fused.t_mono
     tie.elsewhere_since = now if tie.elsewhere_since is None else tie.elsewhere_since
     here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    if tie.proved and not relocate_light.out_of_place(state, here):
+        return
     sure = now - tie.elsewhere_since >= ELSEWHERE_S and relocate_light.elsewhere(state, here)
     if (sure or state.failures >= UNFIT) and afresh(state):
         tie.elsewhere_since, tie.broken = None, True

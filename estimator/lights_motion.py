@@ -25,6 +25,8 @@ UNSEEN: Final = 0.5
 REVERSE_M_S: Final = 0.1
 STILL: Final = 0.08
 """m/s; without odometry a slower robot is taken to stand."""
+AT_MOST: Final = (5.0, 5.0, 10.0)
+"""m/s, m/s and rad/s of any indoor robot. What is faster has moved so far, but not in the time that its stamps say."""
 FASTEST: Final = 20.0
 """m or rad within one record. More is not a motion but a counter that has jumped."""
 
@@ -52,7 +54,8 @@ def on_odometry(lights: Lights, record: Odometry) -> None:
     )
     blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else made[2], 0.0 if by_gyro else made[0], 0.0, 1.0)
     if 1e-3 < dt < CARRY_S:
-        course.velocity = se2.log(delta) / dt
+        velocity = se2.log(delta) / dt
+        course.velocity = velocity if (np.abs(velocity) <= AT_MOST).all() else course.velocity
     course.gyro_turned = course.gyro_span = 0.0
     course.t_odometry = record.t_end
     move_all(lights, made, np.array(blame), np.array(q), max(course.t_mono, record.t_end))

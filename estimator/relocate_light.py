@@ -18,7 +18,9 @@ import numpy as np
 from estimator import se2
 from estimator.absolute import ACROSS_M, ROW_M
 from estimator.cdma_epoch import UNUSABLE
+from estimator.lamps import Lamp
 from estimator.light import Light
+from estimator.lights_links import remembered, sights
 from estimator.lights_start import Place, places, probabilities
 from estimator.lights_state import Lights, Track
 from estimator.linear3 import invert3
@@ -45,6 +47,10 @@ LEAST: Final = 3
 """Links used without which light is no witness."""
 AGAINST: Final = 0.34
 """Share of links against the place from which on it is none."""
+
+NEARER_M: Final = 1.0
+STRONGER: Final = 2.0
+"""A lamp that is received so many times stronger than it can be within the former of a place is not received there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +116,37 @@ def disputed(state: State) -> bool:
 def elsewhere(state: State, T_map_base: Array) -> bool:
     """Whether light has the robot in one place, and that is not here."""
     return len(windows(state)) == 1 and compatible(state, T_map_base) is False
+
+
+def out_of_place(state: State, T_map_base: Array) -> bool:
+    """Whether a lamp is received now that cannot be received about a pose, as strong as it is.
+
+    It asks the latest epoch alone, not the `lights` filter, which wheels that turn more than they say can lead astray;
+    and not the heading, of which strengths know nothing. Of lamps of one code the nearest counts.
+    """
+    if state.light is None or state.light.epoch is None:
+        return False
+    lights, epoch = state.light.filter, state.light.epoch
+    if lights.course.t_mono - epoch.t_end > SILENT_S or epoch.block & UNUSABLE:
+        return False
+    rx = lights.survey.receiver
+    (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
+    return any(
+        sight.state is LinkState.ACCEPTED
+        and sight.lamp is not None
+        and too_strong(lights, sight.lamp, sight.amplitude, x, y)
+        for sight in sights(lights, epoch, x, y)
+    )
+
+
+def too_strong(lights: Lights, lamp: Lamp, amplitude: float, x: float, y: float) -> bool:
+    """Whether a lamp is received straight, and stronger than it can be near a place of the receiver."""
+    rx = lights.survey.receiver
+    h = max(lamp.z - rx.z, 0.1)
+    away = max(math.hypot(lamp.x - x, lamp.y - y) - NEARER_M, 0.0)
+    fall = h / math.hypot(h, away) / math.cos(min(rx.half_fov_rad, 1.5))
+    rim = lights.catalogue.rims[lamp.lamp_id] * math.exp(float(remembered(lights, lamp)[0][0]))
+    return amplitude > rim * max(1.0, STRONGER * math.pow(fall, lamp.order + rx.order + 2.0))
 
 
 def about(lights: Lights, place: Place) -> Window:

@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from estimator import adrift
+from estimator import adrift, se2
 from estimator.keyframe import Submap
 from estimator.light import LightsSetup
 from estimator.lights_start import rule_out
 from estimator.pipeline import new_state, step
 from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
-from estimator.relocate_light import Window, compatible, disputed, elsewhere, told, windows, witness
+from estimator.relocate_light import Window, compatible, disputed, elsewhere, out_of_place, told, windows, witness
 from estimator.result import Fix
 from estimator.state import State
 from estimator.submap import Settled
@@ -180,3 +180,28 @@ def test_light_that_has_long_told_the_place_is_enough_where_the_map_knows_nothin
         assert adrift.by_light_alone(state) == known
     assert state.atlas.adrift is None
     assert adrift.places(state) is None
+
+
+@pytest.mark.parametrize("bearing", np.linspace(0.0, 2.0 * math.pi, 6, endpoint=False).tolist())
+def test_lamps_that_cannot_be_received_here_say_that_the_robot_is_elsewhere(bearing: float) -> None:
+    state, way = shown(robot()), np.array((math.cos(bearing), math.sin(bearing), 0.0))
+    for yaw in (0.0, 1.6, 3.1):  # of which strengths say nothing
+        assert not out_of_place(state, np.array((*HERE[:2], yaw)))
+    assert not out_of_place(state, HERE + 0.8 * way)
+    assert out_of_place(state, HERE + 5.0 * way)
+    state.light.filter.course.t_mono += 5.0  # type: ignore[union-attr]  # what was received then
+    assert not out_of_place(state, HERE + 5.0 * way)
+
+
+@pytest.mark.parametrize("proved", [True, False])
+def test_a_filter_led_astray_sets_no_robot_adrift_that_receives_the_lamps_of_its_place(proved: bool) -> None:
+    for at, carried in ((HERE, False), (HERE + np.array((5.0, 0.0, 0.0)), True)):
+        state = shown(robot())
+        state.atlas.adrift, state.atlas.since, state.failures = None, 0, adrift.UNFIT
+        state.T_map_odom = se2.compose(at, se2.inverse(state.fused.T_odom_base))
+        tie, light = state.absolute, state.light
+        tie.placed, tie.proved = True, proved  # type: ignore[union-attr]
+        light.filter.lost = True  # type: ignore[union-attr]
+        assert disputed(state)
+        adrift.doubt(state)
+        assert (state.atlas.adrift is not None) == (carried or not proved)
