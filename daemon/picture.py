@@ -65,6 +65,7 @@ class Painter:
             self._loop = result.loop
         loop = self._loop
         estimate = None if result is None or not math.isfinite(result.t_mono) else result
+        guessed = estimate is not None and estimate.places is not None  # how sure a guess is, nobody knows
         received = _received(result, facts)
         return Snapshot(
             seq=self._seq,
@@ -76,9 +77,9 @@ class Painter:
             pose=None if estimate is None else _pose(estimate),
             odom=None if estimate is None else _triple(estimate.T_odom_base),
             predicted=None if estimate is None else _predicted(estimate, facts),
-            covariance=None if estimate is None else _upper(estimate.covariance),
+            covariance=None if estimate is None or guessed else _upper(estimate.covariance),
             velocity=None if estimate is None else _triple(estimate.velocity),
-            known=verdict.known,
+            known=(False, False, False) if guessed else verdict.known,
             jumps=0 if estimate is None else estimate.jumps,
             map_id=self.map_id,
             loop_counter=0 if loop is None else loop.counter,

@@ -131,7 +131,7 @@ class Snapshot:
         seq: counts snapshots. t_mono: instant the pose is true for. t_sent: when this was built. t_utc: `t_sent` as
             seconds since the Unix epoch.
         pose: T_map_base (x, y, yaw). odom: T_odom_base. predicted: T_map_base carried to `t_sent` by `velocity`.
-        covariance: (xx, xy, yy, x-yaw, y-yaw, yaw-yaw), m and rad.
+        covariance: (xx, xy, yy, x-yaw, y-yaw, yaw-yaw), m and rad; None while the place in the map is looked for.
         velocity: (v_x, v_y, yaw rate) in the base frame.
         known: (x, y, yaw) whether the axis is observed.
         reason: index into the table of reasons (daemon/state.py), 0: none.

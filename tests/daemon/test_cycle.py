@@ -14,8 +14,9 @@ from daemon.bridge import ScanBridge
 from daemon.budget import Budget, FixedBudget, MeasuredBudget, RecordedBudget
 from daemon.config import LidarConfig
 from daemon.cycle import Cycle, CycleRecord, Pacemaker, Parts
+from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot, State
-from daemon.state import Reason
+from daemon.state import Memory, Reason
 from daemon.worker import CycleWorker, ScheduledWorker, Worker
 from estimator import pipeline
 from estimator.records import Command, Job, Limits, Order, Record
@@ -370,3 +371,17 @@ def test_a_run_repeats_exactly_from_its_raw_streams_and_cycle_records() -> None:
     assert [(s.pose, s.odom, s.covariance, s.velocity, s.state) for s in second] == [
         (s.pose, s.odom, s.covariance, s.velocity, s.state) for s in first.snapshots
     ]
+
+
+def test_how_sure_a_guess_is_is_not_said() -> None:
+    """While the place in the map is looked for the pose goes on, and neither axes nor deviations are known."""
+    told = StepResult(
+        1.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.ones(3), None, -1, None, 0, np.zeros(3), 0
+    )
+    verdict = Memory(State.RELOCATING, known=(True, True, True))
+    sure, guess = (Painter().paint(replace(told, places=places), verdict, Facts()) for places in (None, 2))
+    assert sure.covariance is not None
+    assert sure.known == (True, True, True)
+    assert guess.pose is not None
+    assert guess.covariance is None
+    assert guess.known == (False, False, False)
