@@ -33,6 +33,9 @@ MOST: Final = 100
 TOGETHER: Final = 60
 """Keyframes, at most, between two loops that support each other."""
 
+TURNED: Final = 1.05
+"""Turned by so much (rad), a lidar that sees half the horizon sees another part of the surroundings."""
+
 APART: Final = 4.0
 """By how much the variance of what light said is raised: its errors hang together over several submaps."""
 
@@ -116,36 +119,72 @@ def turned(state: State, P_odom: Array) -> Array:
 
 
 def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found) -> None:
-    """Accept a loop, or let it wait for a second one that agrees where it would move the pose far."""
+    """Accept a loop, or let it wait for others that agree where it would move the pose far."""
     if found.key not in atlas.submaps or atlas.submaps.get(frame.submap.key) is not frame.submap:
         return  # forgotten meanwhile, and its key may have been given to another
-    x, y, yaw = found.moved.tolist()
-    far = math.hypot(x, y) > told.supported_m or abs(yaw) > told.supported_rad
-    if far and found.reason is not LoopReason.LIT:  # there light is the second witness
-        T_found_odom = se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe))
-        one = Waiting(found, frame, T_found_odom)
-        friends = [other for other in atlas.waiting if agree(atlas, told, one, other)]
-        if not friends:
-            atlas.waiting = [*atlas.waiting[-20:], one]
+    one = Waiting(found, frame, se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe)))
+    if not within(found.moved, told, 1.0) and found.reason is not LoopReason.LIT:  # there light is the second witness
+        friends = supporters(atlas, told, one)
+        far = min(math.hypot(*found.moved[:2]), told.most_m)
+        if not friends or max(apart(one, other) for other in friends) < far:
+            atlas.waiting = [*atlas.waiting[-TOGETHER:], one]
             return
         atlas.waiting = [other for other in atlas.waiting if other not in friends]
         for other in friends:
             join(atlas, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
         found = replace(found, reason=LoopReason.SUPPORTED)
+    else:
+        atlas.waiting = [  # the others are refuted, or were left long ago
+            other
+            for other in atlas.waiting
+            if comparable(atlas, one, other) and within(off(atlas, one, other), told, 1.0)
+        ]
     join(atlas, frame, found)
 
 
-def agree(atlas: Atlas, told: LoopSettings, one: Waiting, other: Waiting) -> bool:
-    """Whether two loops from different places put the odom frame into the same place of the map."""
-    a, b = atlas.submaps.get(one.found.key), atlas.submaps.get(other.found.key)
-    if a is None or b is None or other.frame.submap.into is not None or one.frame.key - other.frame.key > TOGETHER:
-        return False
+def supporters(atlas: Atlas, told: LoopSettings, one: Waiting) -> list[Waiting]:
+    """The loops that agree with this one, newest first, as far back as none contradicts it."""
+    friends: list[Waiting] = []
+    for other in reversed(atlas.waiting):
+        if not comparable(atlas, one, other):
+            continue
+        if not within(off(atlas, one, other), told, 1.0):
+            break
+        if within(off(atlas, one, other), told, 0.5):
+            friends.append(other)
+    return friends
+
+
+def apart(one: Waiting, other: Waiting) -> float:
+    """How far apart (m) two keyframes lie; without end where the robot has turned to see what was behind it.
+
+    Where the surroundings repeat, a place that is off by a period fits as well as the true one while the latter is
+    beyond the end of the map. It no longer can once as much has been driven as the loop would move the pose: the place
+    that was found has then been reached by who had not been there yet, and is found as such.
+    """
+    x, y, yaw = se2.between(other.frame.T_odom_keyframe, one.frame.T_odom_keyframe).tolist()
+    return math.inf if abs(yaw) > TURNED else math.hypot(x, y)
+
+
+def comparable(atlas: Atlas, one: Waiting, other: Waiting) -> bool:
+    """Whether two loops tell of the same stretch of the way, in submaps that are still there."""
+    laid = other.frame.submap
+    there = one.found.key in atlas.submaps and other.found.key in atlas.submaps and atlas.submaps.get(laid.key) is laid
+    return there and one.frame.key - other.frame.key <= TOGETHER
+
+
+def off(atlas: Atlas, one: Waiting, other: Waiting) -> Array:
+    """How far (x, y, yaw) the place where one loop puts its keyframe is from where another one would put it."""
+    a, b = atlas.submaps[one.found.key], atlas.submaps[other.found.key]
     T_b_a = se2.between(b.T_map_submap, a.T_map_submap)
-    x, y, yaw = se2.between(
-        se2.compose(other.T_found_odom, one.frame.T_odom_keyframe),
-        se2.compose(T_b_a, one.found.T_submap_keyframe),
-    ).tolist()
-    return math.hypot(x, y) < 0.5 * told.supported_m and abs(yaw) < 0.5 * told.supported_rad
+    there = se2.compose(other.T_found_odom, one.frame.T_odom_keyframe)
+    return se2.between(there, se2.compose(T_b_a, one.found.T_submap_keyframe))
+
+
+def within(moved: Array, told: LoopSettings, share: float) -> bool:
+    """Whether a pose is moved by less than this share of what asks for support."""
+    x, y, yaw = moved.tolist()
+    return math.hypot(x, y) <= share * told.supported_m and abs(yaw) <= share * told.supported_rad
 
 
 def join(atlas: Atlas, frame: Keyframe, found: Found) -> None:

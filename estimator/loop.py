@@ -67,8 +67,8 @@ class LoopSettings:
             than one that looks the other way. every: a look for every so many keyframes.
         sure_m, sure_rad: deviations of the expected place up to which the matcher finds it by itself.
         points: of a scan, at most. places: that a wide search may offer; two of them that fit close nothing.
-        supported_m, supported_rad: a loop that moves the pose by more than this waits for a second one that agrees as
-            well as this.
+        supported_m, supported_rad: a loop that moves the pose by more than this waits for others that agree within half
+            of this, over as much way as it moves the pose (or a turn); one in between that is off by more refutes them.
     """
 
     conditions: frozenset[Condition] = frozenset(Condition) - {Condition.IDS}

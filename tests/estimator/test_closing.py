@@ -11,10 +11,10 @@ import pytest
 from estimator import se2
 from estimator.absolute import Absolute
 from estimator.adrift import begin
-from estimator.atlas import KEPT, LOOK, LOST, MANY, SOLVE, Constraints, cell_of
+from estimator.atlas import KEPT, LOOK, LOST, MANY, SOLVE, Atlas, Constraints, cell_of
 from estimator.closing import candidates, found_again, keyframe_laid, take_answer
 from estimator.commands import forget
-from estimator.keyframe import Virtual, keep
+from estimator.keyframe import Submap, Virtual, keep
 from estimator.loop import Candidate, Found, LoopSettings, look, look_in
 from estimator.mapframe import shift_map
 from estimator.posegraph import UPPER, Graph, optimise
@@ -28,6 +28,7 @@ from tools.bench._scenes import Scene, bearings, box, office, paper_room, round_
 HALF = bearings(181, 180.0)
 SMALL = np.diag((0.004**2, 0.004**2, 0.002**2))
 TOLD = LoopSettings()
+BARE = scan_in(paper_room(), se2.identity(), HALF, np.random.default_rng(0))
 
 
 def circuit(step: float = 0.25, laps: float = 1.3) -> Array:
@@ -125,6 +126,39 @@ def test_a_large_loop_waits_for_a_second_that_agrees() -> None:
     reasons = [loop.reason for loop in news if loop is not None]
     assert reasons[0] is LoopReason.SUPPORTED
     assert reasons[-1] is LoopReason.NEAR
+
+
+def corridor(shifts: list[float], turn: float = 0.0) -> Atlas:
+    """Keyframes straight on, 0.25 m and a turn apart, each found so much further on than it is expected."""
+    atlas, origin = Atlas(), se2.identity()
+    atlas.submaps = {key: Submap(key, key, origin, origin) for key in (1, 2)}
+    for k, shift in enumerate(shifts):
+        T = np.array((0.25 * k, 0.0, turn * k))
+        moved = np.array((shift * np.cos(T[2]), -shift * np.sin(T[2]), 0.0))
+        frame = replace(keep(k + 10, T, T, BARE, 0.0), submap=atlas.submaps[2])
+        found_again(atlas, TOLD, frame, Found(1, se2.compose(T, moved), SMALL, 0.8, 0.0, 0.01, moved))
+    return atlas
+
+
+def test_a_loop_is_supported_over_as_long_a_way_as_it_moves_the_pose() -> None:
+    """Where doors repeat, one door off fits as well until the robot has come to where it was said to be."""
+    assert corridor([2.0] * 8).closures == 0  # 1.75 m
+    assert corridor([2.0] * 9).closures == 9
+    assert corridor([0.4] * 3).closures == 3
+    assert corridor([6.0] * 24).closures == 0
+    assert corridor([6.0] * 25).closures == 25
+    assert corridor([6.0] * 3, turn=0.5).closures == 0
+    assert corridor([6.0] * 4, turn=0.5).closures == 4  # what was behind has been seen
+
+
+def test_whatever_is_found_elsewhere_refutes_the_loops_that_wait() -> None:
+    refuted = corridor([2.0] * 6 + [0.0])
+    assert (refuted.closures, len(refuted.waiting)) == (1, 0)
+    assert corridor([2.0] * 6 + [0.0] + [2.0] * 8).closures == 1  # they begin again
+    assert corridor([2.0] * 6 + [5.0] + [2.0] * 8).closures == 0
+    assert corridor([2.0] * 6 + [5.0] + [2.0] * 9).closures == 9
+    assert corridor([2.0] * 4 + [2.1] + [2.0] * 4).closures == 9  # within what agrees
+    assert corridor([2.0] * 4 + [2.2] + [2.0] * 4).closures == 8  # neither agrees nor refutes
 
 
 def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
