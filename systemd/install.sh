@@ -14,6 +14,7 @@ PYTHON=${PYTHON:-/usr/bin/python3}
 SOURCE=$(cd "$(dirname "$0")/.." && pwd)
 ROOT=${DESTDIR}${PREFIX}
 UNITS=/usr/lib/systemd/system
+MARK=.lumiloop
 
 say() { echo "lumiloop: $*"; }
 
@@ -26,10 +27,17 @@ put() { # mode, file below the source, place
     install -D -m "$1" "$SOURCE/$2" "$DESTDIR$3"
 }
 
+ours() { # whether the environment's place may be removed: only what an installation has made, whatever PREFIX says
+    if [ ! -e "$ROOT" ] || [ -e "$ROOT/$MARK" ] || [ -z "$(ls -A "$ROOT")" ]; then return; fi
+    fail "$ROOT is not an installation of lumiloop; PREFIX must name a directory of its own, as /opt/lumiloop"
+}
+
 environment() {
     "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || fail "$PYTHON is older than 3.11; name another one: PYTHON=..."
     "$PYTHON" -c 'import venv, ensurepip' 2> /dev/null || fail "the venv module is missing: apt-get install python3-venv"
     rm -rf "$ROOT"
+    mkdir -p "$ROOT"
+    touch "$ROOT/$MARK"
     "$PYTHON" -m venv "$ROOT"
     "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --require-hashes -r "$SOURCE/requirements/core.lock"
     wheel=$(mktemp -d)
@@ -87,12 +95,14 @@ tell_system() {
 
 case "${1:-}" in
     install)
+        ours
         environment
         files
         tell_system install
         say "installed into ${DESTDIR:-/}; edit /etc/lumiloop/lumiloop.toml, then: systemctl enable --now lumiloop"
         ;;
     uninstall)
+        ours
         if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
             systemctl disable --now lumiloop.service lumiloop-warmup.service 2> /dev/null || true
         fi

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,25 @@ def test_devices_are_named_by_what_they_are() -> None:
     groups = set(re.findall(r'GROUP="(\w+)"', rules))
     assert groups == set(dict(settings(UNIT))["SupplementaryGroups"].split())
     assert groups == set(re.findall(r"^g (\w+)", (SYSTEMD / "lumiloop.sysusers").read_text(), re.MULTILINE))
+
+
+@pytest.mark.parametrize("order", ["install", "uninstall"])
+def test_a_prefix_that_holds_other_things_is_left_alone(order: str, tmp_path: Path) -> None:
+    """PREFIX=/usr/local is what other programs take; here it would be a directory that is removed as a whole."""
+    other = tmp_path / "usr/local/bin/other"
+    other.parent.mkdir(parents=True)
+    other.touch()
+    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/usr/local", "PYTHON": sys.executable}
+    done = subprocess.run([SYSTEMD / "install.sh", order], env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "must name a directory of its own" in done.stderr
+    assert other.exists()
+
+
+def test_what_an_interrupted_installation_has_left_is_removed(tmp_path: Path) -> None:
+    made = tmp_path / "opt/lumiloop"
+    made.mkdir(parents=True)
+    (made / ".lumiloop").touch()
+    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
+    subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
+    assert not made.exists()
