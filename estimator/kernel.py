@@ -51,7 +51,9 @@ FASTMATH: Final = {"contract", "reassoc", "arcp", "nsz"}
 KEPT: Final = 4
 """Directories of other sources that are kept beside our own, the latest used ones."""
 KEPT_S: Final = 7 * 86400.0
-"""And all that were used more recently than this: their programs may be running."""
+"""And all that were used more recently than this: their programs may be running..."""
+MOST: Final = 40
+"""...but no more than these in all, some 10 MB each. A running program has its kernels in memory and misses nothing."""
 
 SHAPING: Final = (
     "BOUNDSCHECK",
@@ -111,8 +113,8 @@ def _prune(root: Path, ours: Path) -> None:
     """Remove what earlier versions left behind; whatever cannot be removed stays."""
     now = _last_used(ours)
     others = sorted((path for path in root.glob("kernels-*") if path != ours), key=_last_used, reverse=True)
-    for path in others[KEPT:]:
-        if now - _last_used(path) > KEPT_S:
+    for rank, path in enumerate(others):
+        if rank >= MOST or (rank >= KEPT and now - _last_used(path) > KEPT_S):
             shutil.rmtree(path, ignore_errors=True)
 
 

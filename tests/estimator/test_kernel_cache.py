@@ -42,6 +42,12 @@ def test_what_was_used_this_week_is_kept(root: Path) -> None:
     assert all(folder.exists() for folder in fresh)
 
 
+def test_not_even_a_busy_week_fills_the_disk(root: Path) -> None:
+    fresh = [left_behind(root, f"{k:02}", 0.01 * k) for k in range(kernel.MOST + 5)]
+    ours = kernel._choose_cache()
+    assert sorted(root.iterdir()) == sorted([ours, *fresh[: kernel.MOST]])
+
+
 def test_nothing_is_looked_at_when_ours_is_there_already(root: Path) -> None:
     ours = kernel._choose_cache()
     os.utime(ours, (0.0, 0.0))
