@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from daemon.alarm import Alarm, bounded
@@ -28,7 +28,7 @@ from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot, Trust
 from daemon.state import REASONS, SILENT_PERIODS, Evidence, Memory, judge
 from daemon.worker import Worker
-from estimator.records import Command, LightEpoch, Limits, Order, Record, SampleBlock
+from estimator.records import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
 from estimator.result import StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
@@ -120,6 +120,7 @@ class Cycle:
         verdict: what is said about the pose. result: of the latest step.
         blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
         alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
+        paused: by a command: map and laser are left alone, light and odometry carry the pose.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -140,6 +141,8 @@ class Cycle:
         self.lamps = LampWatch()
         self.alarm = Alarm(parts.alert_m)
         self.trust = Trust(limit_m=parts.alert_m or None, alert=self.alarm.on)
+        self.paused = False
+        self._held: list[Answer] = []
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
@@ -147,8 +150,10 @@ class Cycle:
         self.cycles += 1
         t_mono = self.parts.clock.now()
         taken = self.inbox.take()
-        answers = self.parts.worker.collect(t_mono)
-        records = (*answers, *taken.commands, *self._bridge(taken))
+        self._obey(taken.commands)
+        answers = self._answers(t_mono)
+        orders = [command for command in taken.commands if command.order not in (Order.PAUSE, Order.RESUME)]
+        records = (*answers, *orders, *self._bridge(taken))
         stages.lap("bridge")
         limits = self._step(records, stages)
         self._watch_lamps(t_mono, records, limits)
@@ -176,6 +181,19 @@ class Cycle:
             )
             self.parts.tap(record)
         return snapshot
+
+    def _obey(self, commands: tuple[Command, ...]) -> None:
+        for command in commands:
+            if command.order in (Order.PAUSE, Order.RESUME):
+                self.paused = command.order is Order.PAUSE
+
+    def _answers(self, t_mono: float) -> tuple[Answer, ...]:
+        """What the worker has found; during a pause it is kept for later, because the map is not to be touched."""
+        self._held += self.parts.worker.collect(t_mono)
+        if self.paused:
+            return ()
+        answers, self._held = tuple(replace(answer, t_begin=t_mono) for answer in self._held), []
+        return answers
 
     def announce(self) -> None:
         """Publish where we stand without running a cycle: while the estimator is still being loaded."""
@@ -246,6 +264,8 @@ class Cycle:
         parts = self.parts
         light = any(isinstance(record, SampleBlock) for record in records)
         limits = parts.budget.limits(self.budget_us, light)
+        if self.paused:
+            limits = replace(limits, update_map=False, rung=Rung.CARRIED)
         self.result = parts.step(records, limits)
         step_us = stages.lap("step")
         if parts.stopwatch is not None:

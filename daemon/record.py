@@ -23,7 +23,7 @@ from daemon.lights import RESIDUALS, Lights
 from daemon.store import Start
 from daemon.versions import versions
 from daemon.wholefile import write_whole
-from estimator.records import Array, Command, Limits, Order
+from estimator.records import UNLIMITED, Array, Command, Limits, Order
 from estimator.result import StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
@@ -61,6 +61,7 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
         odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
         codes: `Limits.codes`, None where nothing was stepped or before there were lights.
         samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
+        rung: `Limits.rung`.
     """
 
     cycle: int
@@ -77,12 +78,13 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
     codes: int | None = None
     samples: int = 0
     light: Pose | None = None
+    rung: int = 0
 
     def caps(self) -> Limits | None:
         """The step's caps as the estimator takes them."""
         if self.limits is None:
             return None
-        return Limits(*self.limits) if self.codes is None else Limits(*self.limits, self.codes)
+        return Limits(*self.limits, UNLIMITED.codes if self.codes is None else self.codes, self.rung)
 
     def orders(self) -> list[Command]:
         """The commands as the estimator takes them."""
@@ -122,6 +124,7 @@ def _entry(record: CycleRecord) -> CycleEntry:
         codes=None if limits is None else limits.codes,
         samples=record.samples,
         light=light_of(result),
+        rung=0 if limits is None else limits.rung,
     )
 
 

@@ -17,7 +17,7 @@ LEAST_NOISE_M = 0.004
 LEARNING = 0.02
 HELD, HELD_YAW = 100.0, 830.0
 """Information with which a match holds a direction, or the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
-BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE)
+BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE, Reason.PASSED_OVER)
 """Outcomes of a scan that has shown nothing: they do not speak against the map."""
 CAUCHY = 0.807
 """What the robust weights of the matcher leave of a Gaussian's variance."""

@@ -16,7 +16,20 @@ from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
 from estimator.matchers import First, Matcher, first_of
 from estimator.matching import Asked, Prior, View
-from estimator.records import Answer, Array, Command, Imu, LightEpoch, Limits, Odometry, Record, SampleBlock, Scan
+from estimator.records import (
+    UNLIMITED,
+    Answer,
+    Array,
+    Command,
+    Imu,
+    LightEpoch,
+    Limits,
+    Odometry,
+    Record,
+    Rung,
+    SampleBlock,
+    Scan,
+)
 from estimator.refusal import in_time, nothing_of, refused
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scanpoints import ScanPoints, oriented, points_of
@@ -46,18 +59,24 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
         if isinstance(record, Answer):
             close_loops(state, record)
         if isinstance(record, Scan):
+            why = why or passed_over(limits)
             points = nothing_of(record) if why else virtual_frame(state, record)
             walk(state)
             match = match_scan(state, record, points, limits, why)
             fuse(state, match)
-            if limits.update_map and keyframe_due(state, points, match):
+            if limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match):
                 if match.ok:
                     learn_alike(state, oriented(points, limits.points))
                 keyframe = lay_keyframe(state, record, points)
                 update_map(state, record, points)
     look_for_lamps(state, limits)
     adrift.step_done(state)
-    return report(state, match, keyframe)
+    return report(state, match, keyframe, limits)
+
+
+def passed_over(limits: Limits) -> Reason | None:
+    """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose."""
+    return Reason.PASSED_OVER if limits.rung >= Rung.CARRIED else None
 
 
 def order(record: Record) -> tuple[float, bool]:
@@ -148,8 +167,8 @@ def light_first(state: State, prior: Prior) -> First:
     return first_of(prior, state.local.newest, absolute.virtual(state), lights)
 
 
-def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult:
-    """The estimate after this step."""
+def report(state: State, match: MatchResult | None, keyframe: int, limits: Limits = UNLIMITED) -> StepResult:
+    """The estimate after this step; jobs wait for one that has the time."""
     moving = state.fused
     return StepResult(
         t_mono=moving.t_mono,
@@ -168,7 +187,7 @@ def report(state: State, match: MatchResult | None, keyframe: int) -> StepResult
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
         places=adrift.places(state),
-        jobs=state.atlas.take_jobs(),
+        jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
         anew=state.anew,
         protection=protection.bound(state),
     )

@@ -78,6 +78,8 @@ class Order(Enum):
     SET_POSE = "set_pose"
     RESET = "reset"
     RELOCALISE = "relocalise"
+    PAUSE = "pause"  # obeyed by the cycle: it asks for no more than :attr:`Rung.CARRIED`, and applies no answer
+    RESUME = "resume"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +117,15 @@ Record = Scan | SampleBlock | LightEpoch | Odometry | Imu | Command | Answer
 """What `step` takes. Light comes as a photodiode's samples, or decoded already (a foreign log, a link-level run)."""
 
 
+class Rung(IntEnum):
+    """How far a step does without: each leaves out what the ones before it leave out, and more."""
+
+    FULL = 0  # everything
+    THINNED = 1  # fewer iterations and points: the caps say how many
+    NO_MAP = 2  # and no keyframe is laid, no map updated, no job handed out
+    CARRIED = 3  # and scans are passed over: lights and odometry carry the pose
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """The time budget of one cycle, already turned into caps; nothing in this room reads a clock.
@@ -124,12 +135,14 @@ class Limits:
         points: cap on query points per match (the scan is thinned evenly above it).
         update_map: whether keyframe and map work may run in this cycle.
         codes: effort for lamps not seen yet, in light codes that could be searched (6 us each with profile A).
+        rung: what the step leaves out, :class:`Rung`.
     """
 
     icp_iterations: int
     points: int
     update_map: bool
     codes: int = 150
+    rung: int = 0
 
 
 UNLIMITED: Final = Limits(icp_iterations=50, points=100_000, update_map=True)

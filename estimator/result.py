@@ -35,6 +35,7 @@ class Reason(Enum):
     REJECTED = "residual or correction implausible"
     MALFORMED = "not a scan: lengths, bearings, times, mount or noise cannot be those of a sweep"
     LATE = "older than the scan before it"
+    PASSED_OVER = "not matched: no time for it, or a person has said pause"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

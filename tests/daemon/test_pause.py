@@ -1,0 +1,51 @@
+"""PAUSE and RESUME: the laser moves nothing, the map is not touched, and it all goes on afterwards, repeatably."""
+
+from __future__ import annotations
+
+import pytest
+
+from daemon.budget import RecordedBudget
+from daemon.worker import ScheduledWorker
+from estimator.records import Command, Order, Rung
+from estimator.result import Reason
+from tests.daemon.test_cycle import Bench, on_bench
+
+pytestmark = pytest.mark.jit
+
+
+async def paused_in_the_middle(bench: Bench) -> None:
+    await bench.drive(0, 30, odometry=True)
+    bench.cycle.inbox.put_command(Command(3.0, Order.PAUSE))
+    await bench.drive(30, 30, odometry=True)
+    bench.cycle.inbox.put_command(Command(6.0, Order.RESUME))
+    await bench.drive(60, 40, odometry=True)
+
+
+def test_the_map_is_left_alone_and_the_laser_moves_nothing() -> None:
+    bench = on_bench(paused_in_the_middle, odometry=True)
+    begun = next(k for k, record in enumerate(bench.records) if record.commands)
+    ended = next(k for k, record in enumerate(bench.records) if k > begun and record.commands)
+    during = bench.records[begun:ended]
+    assert len(during) >= 25
+    assert all(r.limits is not None and r.limits.rung == Rung.CARRIED and not r.limits.update_map for r in during)
+    assert all(r.result is not None and r.result.keyframe < 0 and not r.answers for r in during)
+    seen = {r.result.match.reason for r in during if r.result is not None and r.result.match is not None}
+    assert seen == {Reason.PASSED_OVER}
+    after = bench.records[-1].result
+    assert after is not None
+    assert after.match is not None
+    assert after.match.ok
+    asked = [order for records, _ in bench.estimate.calls for order in records if isinstance(order, Command)]
+    assert asked == [], "the estimator is not concerned"
+    assert any(r.result is not None and r.result.keyframe >= 0 for r in bench.records[ended:])
+
+
+def test_answers_that_came_during_a_pause_are_applied_after_it_and_a_replay_repeats_that() -> None:
+    bench = on_bench(paused_in_the_middle, odometry=True)
+    applied = {r.cycle: r.answers for r in bench.records if r.answers}
+    asked = [job.job_id for r in bench.records if r.result is not None for job in r.result.jobs]
+    assert len(sum(applied.values(), ())) >= len(asked) - 2
+
+    budget = RecordedBudget([r.limits for r in bench.records if r.limits is not None])
+    replay = on_bench(paused_in_the_middle, odometry=True, budget=budget, worker=ScheduledWorker(applied))
+    assert [(s.pose, s.state) for s in replay.snapshots] == [(s.pose, s.state) for s in bench.snapshots]
