@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-from daemon.state import HELD, Evidence, Memory
+from daemon.state import HELD
+from daemon.state_evidence import Evidence
+from daemon.state_memory import Memory
 
 CLEAR_S: Final = 1.0
 """The bound has to be within the limit for this long before the alert is over: it must not chatter."""

@@ -26,7 +26,10 @@ from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot, Trust
-from daemon.state import REASONS, SILENT_PERIODS, Evidence, Memory, judge
+from daemon.reasons import REASONS
+from daemon.state import judge
+from daemon.state_evidence import SILENT_PERIODS, Evidence
+from daemon.state_memory import Memory
 from daemon.worker import Worker
 from estimator.records import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
 from estimator.result import StepResult

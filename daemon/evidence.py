@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from daemon.state import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
+from daemon.reasons import Reason as Cause
+from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
 from daemon.witness import Witnesses
 from estimator import result as light
 from estimator.records import Array, Command, LightEpoch, Odometry, Record, SampleBlock
@@ -31,11 +32,16 @@ EARLY: Final = 0.01
 
 
 class Observer:
-    """Watches the cycles go by. Its memory: witnesses, when devices last spoke, what was known when all was known."""
+    """Watches the cycles go by. Its memory: witnesses, when devices last spoke, what was known when all was known.
+
+    Attributes:
+        unused: why the laser is left out though it is there, set by the cycle; None: it is used.
+    """
 
     def __init__(self, t_mono: float, odometry: bool, lidar: bool = True, lights: bool = False) -> None:
         """Start watching; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
         self.witnesses = Witnesses()
+        self.unused: Cause | None = None
         self._lidar, self._lights = lidar, lights
         self._t_samples = t_mono
         self._jumps = 0
@@ -106,6 +112,7 @@ class Observer:
             ordered=ordered,
             lidar=self._lidar,
             light=self._light(t_mono, result) if self._lights else None,
+            unused=self.unused,
         )
 
     def _light(self, t_mono: float, result: StepResult | None) -> Light:

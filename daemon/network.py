@@ -17,7 +17,7 @@ import numpy as np
 from daemon.config import Config
 from daemon.cycle import Sink
 from daemon.publish.snapshot import Snapshot
-from daemon.state import REASONS, Reason
+from daemon.reasons import REASONS, Reason
 from estimator.records import Command, Order
 from hal.clock import Clock
 from hal.imu import RawImu

@@ -8,7 +8,7 @@ from typing import Final
 
 from daemon.publish.lights import ROWS
 from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
-from daemon.state import Memory
+from daemon.state_memory import Memory
 from estimator import se2
 from estimator.records import Array
 from estimator.result import Fix, Link, LinkState, Loop, StepResult

@@ -9,7 +9,7 @@ from typing import Any
 
 from daemon.cycle import Cycle
 from daemon.health import Vitals
-from daemon.state import Reason
+from daemon.reasons import Reason
 
 
 def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:

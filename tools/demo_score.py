@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from daemon.publish.client import Reading
 from daemon.publish.snapshot import State
-from daemon.state import REASONS, Reason
+from daemon.reasons import REASONS, Reason
 from tools.demo_acts import Act
 
 ABSURD_M: Final = 0.5

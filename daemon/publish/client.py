@@ -261,7 +261,7 @@ def _meaning(subject: str, number: Value) -> str:
     if not number:
         return "none"
     from daemon.health import FAULTS
-    from daemon.state import REASONS
+    from daemon.reasons import REASONS
 
     meanings: Mapping[Any, tuple[str, str]] = REASONS if subject == "reason" else FAULTS
     text, remedy = meanings.get(int(number), ("unknown to this reader", "use the daemon's own version of this command"))

@@ -11,7 +11,7 @@ from daemon.health import FAULTS
 from daemon.publish import holding, integrity, lights, modbus, registers, requests
 from daemon.publish.points import Layout, Point, Rule
 from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
-from daemon.state import REASONS
+from daemon.reasons import REASONS
 from hal import input_codec, inputs
 
 _NOTICE: Final = (

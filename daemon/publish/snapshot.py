@@ -134,7 +134,7 @@ class Snapshot:
         covariance: (xx, xy, yy, x-yaw, y-yaw, yaw-yaw), m and rad; None while the place in the map is looked for.
         velocity: (v_x, v_y, yaw rate) in the base frame.
         known: (x, y, yaw) whether the axis is observed.
-        reason: index into the table of reasons (daemon/state.py), 0: none.
+        reason: index into the table of reasons (daemon/reasons.py), 0: none.
         jumps: how often T_map_odom jumped. map_id: identity of the map frame, 0: not known.
         loop_counter: accepted loop closures; loop_new, loop_old: keyframe IDs of the latest, None before the first;
             loop_reason (:class:`LoopReason`), loop_residual (m): likewise.

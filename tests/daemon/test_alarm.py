@@ -9,7 +9,9 @@ import pytest
 
 from daemon.alarm import CLEAR_S, Alarm, bounded
 from daemon.publish.snapshot import State
-from daemon.state import Evidence, Memory, Reason
+from daemon.reasons import Reason
+from daemon.state_evidence import Evidence
+from daemon.state_memory import Memory
 
 
 def run(alarm: Alarm, bounds: list[float | None], begin: float = 0.0) -> list[bool]:

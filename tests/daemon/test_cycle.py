@@ -16,7 +16,8 @@ from daemon.config import LidarConfig
 from daemon.cycle import Cycle, CycleRecord, Pacemaker, Parts
 from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot, State
-from daemon.state import Memory, Reason
+from daemon.reasons import Reason
+from daemon.state_memory import Memory
 from daemon.worker import CycleWorker, ScheduledWorker, Worker
 from estimator import pipeline
 from estimator.records import Command, Job, Limits, Order, Record

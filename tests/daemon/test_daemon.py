@@ -18,7 +18,8 @@ from daemon.config import Config, LidarConfig, ModbusConfig, Mount
 from daemon.health import Fault
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot, State
-from daemon.state import SILENT_PERIODS, Reason
+from daemon.reasons import Reason
+from daemon.state_evidence import SILENT_PERIODS
 from daemon.worker import CycleWorker
 from estimator import se2
 from hal.clock import LoopClock, run_virtual

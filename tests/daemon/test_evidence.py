@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from daemon.evidence import ENOUGH_INLIERS, ODOMETRY_SILENT_S, OPENING_S, Observer, good
-from daemon.state import VAGUE_M, Evidence
+from daemon.state_evidence import VAGUE_M, Evidence
 from estimator.records import Array, Command, Odometry, Order, Record
 from estimator.result import Loop, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from daemon.evidence import LIGHT_SILENT_S, Observer
-from daemon.state import Evidence, Light
+from daemon.state_evidence import Evidence, Light
 from estimator.cdma_epoch import BlockFlag, LightEpoch
 from estimator.records import Record
 from estimator.result import SURPRISE, Fix, LightsResult, Link, LinkState, StepResult

@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 
 from daemon import state as rules
 from daemon.publish.snapshot import State
-from daemon.state import REASONS, Evidence, Light, Match, Memory, Reason, judge
+from daemon.reasons import REASONS, Reason
+from daemon.state import judge
+from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, Evidence, Light, Match
+from daemon.state_memory import DARK_S, FAILED_SCANS, Memory
 
 PERIOD = 0.1
 ALL = (True, True, True)
@@ -171,7 +174,7 @@ def test_configured_odometry_that_does_not_arrive_is_a_missing_witness() -> None
 
 
 def test_uncertainty_degrades_then_loses() -> None:
-    vague = judge(tracking(), seen(3.0, sigma_m=1.1 * rules.VAGUE_M))
+    vague = judge(tracking(), seen(3.0, sigma_m=1.1 * VAGUE_M))
     assert said(vague) == (State.DEGRADED, Reason.UNCERTAIN)
     assert said(judge(vague, seen(3.1, sigma_rad=1.1 * rules.LOST_RAD))) == (State.LOST, Reason.UNCERTAIN)
 
@@ -256,9 +259,9 @@ def test_a_photodiode_that_falls_silent_degrades_at_once_and_darkness_after_a_wh
     silent = replace(LIT, alive=False, used=False, agrees=None)
     assert said(run(lit(), scans(4.0, 1, light=silent))) == (State.DEGRADED, Reason.LIGHT_SILENT)
     dark = replace(LIT, used=False, agrees=None)
-    soon = run(lit(), scans(4.0, round((rules.DARK_S - 0.3) / PERIOD), light=dark))
+    soon = run(lit(), scans(4.0, round((DARK_S - 0.3) / PERIOD), light=dark))
     assert soon.state is State.TRACKING
-    late = run(soon, scans(4.0 + rules.DARK_S, 3, light=dark))
+    late = run(soon, scans(4.0 + DARK_S, 3, light=dark))
     assert said(late) == (State.DEGRADED, Reason.LIGHT_DARK)
     assert run(late, scans(10.0, 3, light=LIT)).state is State.TRACKING
 
@@ -300,6 +303,25 @@ def test_light_alone_tracks_when_there_is_no_laser_to_wait_for() -> None:
     assert said(run(memory, alone(3.0, 3, lost, odometry=True))) == (State.RELOCATING, Reason.LIGHT_LOST)
 
 
+@pytest.mark.parametrize("why", [Reason.PAUSED, Reason.OVERLOADED])
+def test_a_laser_that_is_left_out_degrades_and_says_why(why: Reason) -> None:
+    paused = run(tracking(odometry=True), scans(3.0, 30, None, odometry=True, unused=why))
+    assert said(paused) == (State.DEGRADED, why)
+    assert paused.known == (False, False, False)
+    assert not paused.doubt  # odometry has carried the pose
+    assert said(judge(paused, seen(6.0, None, sigma_m=1.1 * rules.LOST_M, unused=why)))[0] is State.LOST
+    contradicted = scans(6.0, 5, None, light=replace(LIT, agrees=False), odometry=True, unused=why)
+    assert said(run(paused, contradicted)) == (State.DEGRADED, Reason.LIGHT_DISAGREES)
+    assert run(paused, scans(6.0, 40, odometry=True)).state is State.TRACKING
+
+
+def test_a_pause_without_odometry_leaves_a_place_in_doubt() -> None:
+    paused = run(tracking(), scans(3.0, 30, None, unused=Reason.PAUSED))
+    assert paused.doubt
+    lost = replace(tracking(), lost=True, doubt=True)
+    assert said(judge(lost, seen(3.0, None, unused=Reason.PAUSED))) == (State.LOST, Reason.NO_WITNESS)
+
+
 def test_every_reason_has_a_meaning_and_every_trouble_a_remedy() -> None:
     assert set(REASONS) == set(Reason)
     assert all(meaning for meaning, _ in REASONS.values())
@@ -333,6 +355,7 @@ evidences = st.lists(
         places=st.sampled_from([None, None, None, 0, 1, 2]),
         ordered=st.sampled_from([False, False, True]),
         light=lights,
+        unused=st.sampled_from([None, None, None, Reason.PAUSED, Reason.OVERLOADED]),
     ),
     max_size=60,
 )
@@ -348,11 +371,12 @@ def test_what_must_hold_whatever_happens(steps: list[Evidence]) -> None:
         if memory.state is State.TRACKING:
             assert all(memory.known)
             assert evidence.places is None
+            assert evidence.unused is None
             assert evidence.silence is not None
-            assert evidence.silence < rules.SILENT_PERIODS
-            assert memory.failed < rules.FAILED_SCANS
+            assert evidence.silence < SILENT_PERIODS
+            assert memory.failed < FAILED_SCANS
             assert evidence.odometry is not False
-            assert evidence.sigma_m <= rules.VAGUE_M
+            assert evidence.sigma_m <= VAGUE_M
             assert not memory.lost
             assert not memory.doubt
             if evidence.light is not None:
@@ -361,7 +385,7 @@ def test_what_must_hold_whatever_happens(steps: list[Evidence]) -> None:
                 assert not evidence.light.lost
                 assert memory.odd_since is None or t - memory.odd_since < rules.CONTRADICTED_S
         assert (memory.reason is Reason.NONE) == (memory.state is State.TRACKING)
-        if evidence.silence is not None and evidence.silence >= rules.SILENT_PERIODS:
+        if evidence.silence is not None and evidence.silence >= SILENT_PERIODS:
             held = evidence.light is not None and evidence.light.placed
             assert memory.state is not State.TRACKING
             assert held or memory.state is State.NO_LIDAR

@@ -18,7 +18,8 @@ import numpy as np
 
 from daemon.evidence import Observer
 from daemon.publish.snapshot import State as Said
-from daemon.state import Memory, judge
+from daemon.state import judge
+from daemon.state_memory import Memory
 from estimator import se2
 from estimator.light import LightsSetup
 from estimator.mapimage import MapImage, restored

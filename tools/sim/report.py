@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from daemon.publish.snapshot import State
-from daemon.state import REASONS, Reason
+from daemon.reasons import REASONS, Reason
 from hal.fake.models import MODELS
 from tools.sim.buildings import BUILDINGS
 from tools.sim.ceiling import Effects

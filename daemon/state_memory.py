@@ -1,0 +1,133 @@
+"""What the state machine remembers from cycle to cycle. Bad news counts fast, good news slowly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+from daemon.publish.snapshot import State
+from daemon.reasons import Reason
+from daemon.state_evidence import SILENT_PERIODS, Evidence, Light, Match
+
+FAILED_SCANS: Final = 3
+"""Matches in a row that may fail before it is said; one bad scan among people is no news."""
+AXIS_LOST_SCANS: Final = 3
+AXIS_LOST_S: Final = 0.3
+AXIS_FOUND_SCANS: Final = 5
+"""Scans in a row, over at least this time, after which an axis changes between known and unknown: what moved in a
+tenth of a second is millimetres, and says nothing about the pose."""
+HELD_S: Final = 1.0
+"""Without odometry a pose is held by its last velocity for this long after the last good match, then it is lost."""
+DARK_S: Final = 5.0
+"""Light that tells nothing for this long is a witness that is missing: the way between two lamps is shorter."""
+
+
+Streak = tuple[int, float]
+"""How many in a row, and when it began."""
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """What the machine remembers between cycles; start with ``Memory()``.
+
+    Attributes:
+        good, good_since: good scans in a row and when the first of them was. failed: failed scans in a row.
+        good_last: when a match was last good.
+        axes: per axis, scans in a row that say otherwise than what is shown, and when the first of them did.
+        known: the axes as shown. known_since: when the last of them became known.
+        disagree_since: None while the witnesses do not disagree.
+        doubt: the place itself has to be proved again, because nothing told the motion for a while.
+        lost: the pose was given up and is not confirmed yet; implies ``doubt``.
+        lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
+        odd_since: since when light has contradicted the place; both None while it does not.
+    """
+
+    state: State = State.STARTING
+    reason: Reason = Reason.WARMING_UP
+    good: int = 0
+    good_since: float = 0.0
+    good_last: float | None = None
+    failed: int = 0
+    axes: tuple[Streak, Streak, Streak] = ((0, 0.0), (0, 0.0), (0, 0.0))
+    known: tuple[bool, bool, bool] = (False, False, False)
+    known_since: float = 0.0
+    disagree_since: float | None = None
+    doubt: bool = False
+    lost: bool = False
+    lit_since: float | None = None
+    lit_last: float | None = None
+    odd_since: float | None = None
+
+
+def remember(memory: Memory, evidence: Evidence) -> Memory:
+    """Take in one cycle's evidence."""
+    now = evidence.t_mono
+    memory = replace(memory, odd_since=None) if evidence.light is None else _take_light(memory, evidence.light, now)
+    silent = evidence.silence is not None and evidence.silence >= SILENT_PERIODS
+    if not evidence.lidar or silent or evidence.unused is not None:
+        return _forget_laser(memory, evidence)
+    since = memory.disagree_since if memory.disagree_since is not None else now
+    memory = replace(memory, disagree_since=since if evidence.agree is False else None)
+    if evidence.places is not None:
+        memory = replace(memory, good=0)  # what fits the surroundings proves nothing of the place in the map
+    if evidence.match is None:
+        return memory
+    return _take_good(memory, evidence.match, now) if evidence.match.good else _take_failed(memory)
+
+
+def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
+    """What is left of the memory while the laser is silent or not used; a pose that nothing carried on is in doubt."""
+    now, light = evidence.t_mono, evidence.light
+    carried = evidence.odometry or (light is not None and light.used)
+    blind = not carried and memory.good_last is not None and now - memory.good_last > HELD_S
+    known = light.known if light is not None and light.placed else (False, False, False)
+    return replace(
+        Memory(memory.state, memory.reason, lost=memory.lost, doubt=memory.doubt or blind),
+        good_last=memory.good_last,
+        known=known,
+        lit_since=memory.lit_since,
+        lit_last=memory.lit_last,
+        odd_since=memory.odd_since,
+    )
+
+
+def _take_light(memory: Memory, light: Light, now: float) -> Memory:
+    """Remember since when light has told the place, and since when it has contradicted the pose."""
+    odd = light.agrees is False
+    memory = replace(memory, odd_since=(now if memory.odd_since is None else memory.odd_since) if odd else None)
+    if light.moved or light.lost:
+        memory = replace(memory, doubt=True, lit_since=None, good=0)
+    if light.used and light.placed and not odd:
+        begun = memory.lit_since is None or now - (memory.lit_last or now) > DARK_S
+        return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now)
+    return memory
+
+
+def _take_failed(memory: Memory) -> Memory:
+    failed = memory.failed + 1
+    known = memory.known if failed < FAILED_SCANS else (False, False, False)
+    return replace(memory, good=0, failed=failed, known=known)
+
+
+def _take_good(memory: Memory, match: Match, now: float) -> Memory:
+    x, y, yaw = (_axis(*axis, now) for axis in zip(memory.known, memory.axes, match.known, strict=True))
+    known = (x[0], y[0], yaw[0])
+    return replace(
+        memory,
+        good=memory.good + 1,
+        good_since=memory.good_since if memory.good else now,
+        good_last=now,
+        failed=0,
+        known=known,
+        axes=(x[1], y[1], yaw[1]),
+        known_since=memory.known_since if all(memory.known) or not all(known) else now,
+    )
+
+
+def _axis(shown: bool, streak: Streak, seen: bool, now: float) -> tuple[bool, Streak]:
+    """One axis' hysteresis: what is shown, and the streak of scans that say otherwise."""
+    if seen == shown:
+        return shown, (0, 0.0)
+    count, since = streak[0] + 1, streak[1] if streak[0] else now
+    changed = count >= AXIS_FOUND_SCANS if seen else count >= AXIS_LOST_SCANS and now - since >= AXIS_LOST_S
+    return (seen, (0, 0.0)) if changed else (shown, (count, since))
