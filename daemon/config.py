@@ -7,51 +7,31 @@ the tree alone; ``daemon/configfile.py`` reads, explains and prints it.
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Callable
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
-BAUDS = (0, 19200, 38400, 57600, 115200, 250000, 500000, 750000)
-"""Line rates that SCIP knows (command SS, C-42-03320B), and 0."""
+from daemon.endpoints import (
+    AUTO,
+    NO_DEVICE,
+    LidarPlace,
+    RtuLine,
+    is_address,
+    parse_endpoint,
+    parse_lidar,
+    parse_line,
+    parse_network,
+    subscription_port,
+)
 
-NO_DEVICE = "none"
-"""A lidar that is not there: lights alone."""
 PROFILES = ("A", "B", "D")
 """Air interfaces (docs/air-interface.md)."""
 
 Port = Annotated[int, Meta(ge=0, le=65535)]
 Metres = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
-
-
-def parse_endpoint(text: str) -> tuple[str, int]:
-    """Split ``host:port`` or ``[ipv6]:port`` into its parts.
-
-    Raises:
-        ValueError: naming what is wrong and what was expected.
-    """
-    match = re.fullmatch(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[A-Za-z0-9_.-]+)):(?P<port>\d{1,5})", text)
-    if match is None:
-        raise ValueError(f"Expected `host:port` or `[ipv6]:port`, got `{text}`")
-    port = int(match["port"])
-    if not 1 <= port <= 65535:
-        raise ValueError(f"Expected a port from 1 to 65535, got `{text}`")
-    if match["v6"] is not None and not _is_address(match["v6"]):
-        raise ValueError(f"Expected an IPv6 address in the brackets, got `{text}`")
-    return match["v6"] or match["host"], port
-
-
-def _is_address(text: str) -> bool:
-    for family in (socket.AF_INET, socket.AF_INET6):
-        try:
-            socket.inet_pton(family, text)
-        except OSError:
-            continue
-        return True
-    return False
 
 
 def _check_network(key: str, name: str, parse: Callable[[str], object]) -> None:
@@ -62,6 +42,14 @@ def _check_network(key: str, name: str, parse: Callable[[str], object]) -> None:
         parse(name)
     except DeviceRefused:
         raise ValueError(f"Expected tcp://host or tcp://host:port in `{key}`, got `{name}`") from None
+
+
+def _named(key: str, parse: Callable[[str], object], text: str) -> None:
+    """Raise what ``parse`` raises, with the key in it."""
+    try:
+        parse(text)
+    except ValueError as error:
+        raise ValueError(f"{error} in `{key}`") from None
 
 
 class Mount(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -95,26 +83,30 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         str,
         Meta(
             min_length=1,
-            description="auto (look for one), a path such as /dev/ttyACM0, tcp://host:port, or none (lights alone)",
+            description="auto (look for one), auto:SERIAL (that one), a path such as /dev/ttyACM0 or "
+            "/dev/ttyUSB0@115200 (fixed line rate), tcp://host:port, or none (lights alone)",
         ),
     ] = "auto"
-    serial: Annotated[str, Meta(description="serial number to insist on where several are connected; empty: any")] = ""
-    baud: Annotated[int, Meta(description="line rate of a real serial line; 0: find it; USB and TCP ignore it")] = 0
     intensity: Annotated[bool, Meta(description="true to read intensities too, where the model can")] = False
     mount: Mount = Mount()
     mask: Mask = Mask()
 
     def __post_init__(self) -> None:
-        if self.device not in ("auto", NO_DEVICE) and not re.match(r"/.|[\w-]+:.", self.device):
+        if self.device not in (AUTO, NO_DEVICE) and not re.match(r"/.|[\w-]+:.", self.device):
             raise ValueError(
-                f"Expected `auto`, `none`, a path such as /dev/ttyACM0 or tcp://host:port, got `{self.device}`"
+                "Expected `auto`, `auto:SERIAL`, `none`, a path such as /dev/ttyACM0 or tcp://host:port, "
+                f"got `{self.device}` in `device`"
             )
         if self.device.startswith("tcp://"):
             from hal.tcp_port import parse_tcp_name
 
             _check_network("device", self.device, parse_tcp_name)
-        if self.baud not in BAUDS:
-            raise ValueError(f"Expected one of {', '.join(map(str, BAUDS))} in `baud`, got {self.baud}")
+        _named("device", parse_lidar, self.device)
+
+    @property
+    def place(self) -> LidarPlace:
+        """The device string's parts."""
+        return parse_lidar(self.device)
 
     @property
     def fitted(self) -> bool:
@@ -243,10 +235,26 @@ class CycleConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 class ModbusConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """Modbus server, on UDP and on TCP."""
+    """Modbus server: on UDP and TCP, and on a serial line."""
 
     port: Annotated[Port, Meta(description="UDP and TCP port; 0: no Modbus")] = 1502
+    serial: Annotated[
+        str,
+        Meta(
+            description="serial line for RTU, /dev/ttyUSB1@115200#1: path, line rate (19200; a format may follow, "
+            "@9600,8N1; else 8E1), our unit (1); empty: none"
+        ),
+    ] = ""
     write: Annotated[bool, Meta(description="true to accept writes (commands, odometry)")] = False
+
+    def __post_init__(self) -> None:
+        if self.serial:
+            _named("serial", parse_line, self.serial)
+
+    @property
+    def line(self) -> RtuLine | None:
+        """The serial line; None: none."""
+        return parse_line(self.serial) if self.serial else None
 
 
 class IntegrityConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -261,14 +269,19 @@ class IntegrityConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class PoseConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """UDP pose datagrams, one per cycle."""
 
-    receivers: Annotated[tuple[str, ...], Meta(description="where to send them, each `host:port`")] = ()
+    receivers: Annotated[
+        tuple[str, ...],
+        Meta(
+            description="where to send them, each `host:port`, a multicast group too; `*:port`: to whoever subscribes "
+            "by a datagram to that port"
+        ),
+    ] = ()
 
     def __post_init__(self) -> None:
         for index, receiver in enumerate(self.receivers):
-            try:
-                parse_endpoint(receiver)
-            except ValueError as error:
-                raise ValueError(f"{error} in `receivers[{index}]`") from None
+            _named(f"receivers[{index}]", parse_endpoint, receiver)
+        if len([receiver for receiver in self.receivers if receiver.startswith("*")]) > 1:
+            raise ValueError("Expected one port to subscribe on, `*:port`, in `receivers`")
 
 
 class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -281,6 +294,12 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         str,
         Meta(description="address of this machine the servers listen on; 0.0.0.0: reachable from every network"),
     ] = "127.0.0.1"
+    allow: Annotated[
+        tuple[str, ...],
+        Meta(
+            description="addresses and networks (192.168.0.0/24) that the servers answer; empty: all that reach `bind`"
+        ),
+    ] = ()
     lidar: LidarConfig = LidarConfig()
     photodiode: PhotodiodeConfig = PhotodiodeConfig()
     lights: LightsConfig = LightsConfig()
@@ -292,9 +311,19 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     integrity: IntegrityConfig = IntegrityConfig()
 
     def __post_init__(self) -> None:
-        if not _is_address(self.bind):
+        if not is_address(self.bind):
             raise ValueError(f"Expected an IP address of this machine in `bind`, got `{self.bind}`")
+        for index, network in enumerate(self.allow):
+            _named(f"allow[{index}]", parse_network, network)
         if not self.lidar.fitted and not self.photodiode.fitted:
             raise ValueError("Expected a lidar or a photodiode: `lidar.device` is none and `photodiode.bus` is empty")
+        if self.modbus.serial and self.lidar.place.device == parse_line(self.modbus.serial).path:
+            raise ValueError(f"Expected another line than the lidar's in `modbus.serial`, got `{self.modbus.serial}`")
+        self._check_ports()
+
+    def _check_ports(self) -> None:
         if self.odometry.port and self.odometry.port == self.modbus.port:
             raise ValueError(f"Expected a port other than Modbus's in `odometry.port`, got {self.odometry.port}")
+        port = subscription_port(self.pose.receivers)
+        if port and port in (self.odometry.port, self.modbus.port):
+            raise ValueError(f"Expected a port of its own in `pose.receivers`, got `*:{port}`")

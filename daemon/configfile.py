@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from daemon.config import Config
+from daemon.endpoints import AUTO
 from daemon.wholefile import write_whole
 
 if TYPE_CHECKING:
@@ -35,6 +36,14 @@ JSON schema for editors. `--set KEY=VALUE` on the command line overrules the fil
 All keys with their defaults, ready to paste:
 
 """
+
+
+MOVED: Final = {
+    "lidar.serial": 'write lidar.device = "auto:SERIAL", as in "auto:H0906091"',
+    "lidar.baud": 'write the rate behind the path, as in lidar.device = "/dev/ttyUSB0@115200", or leave it out: it is '
+    "found by itself",
+}
+"""Keys of earlier versions, and what to write instead."""
 
 
 class ConfigError(Exception):
@@ -83,6 +92,18 @@ def _anchored(config: Config, file: Path | None) -> Config:
             config, map=msgspec.structs.replace(config.map, folder=str(here / config.map.folder))
         )
     return config
+
+
+def brought_up(tree: dict[str, Any]) -> dict[str, Any]:
+    """The resolved tree of an earlier version, as recordings hold it, in the keys of this one."""
+    lidar = dict(tree.get("lidar", {}))
+    serial, baud = lidar.pop("serial", ""), lidar.pop("baud", 0)
+    device = lidar.get("device", AUTO)
+    if serial and device == AUTO:
+        lidar["device"] = f"{AUTO}:{serial}"
+    elif baud and str(device).startswith("/"):
+        lidar["device"] = f"{device}@{baud}"
+    return tree | {"lidar": lidar} if lidar else tree
 
 
 def options() -> list[Option]:
@@ -185,6 +206,8 @@ def _explain(message: str, name: str, text: str) -> str:
     if unknown := re.search(r"contains unknown field `([^`]*)`", message):
         path = f"{path}.{unknown[1]}".lstrip(".")
         message = f"unknown key `{path}`{_nearest(path)}"
+        if path in MOVED:
+            message = f"`{path}` is now part of `lidar.device`: {MOVED[path]}"
     else:
         if inner := re.search(r"`([a-z_.]+)(\[\d+\])?`(, got|$| -)", message):
             candidate = f"{path}.{inner[1]}".lstrip(".")

@@ -25,6 +25,7 @@ from daemon.budget import Budget, MeasuredBudget
 from daemon.cli import FAILED, OK, USAGE
 from daemon.config import Config, LidarConfig
 from daemon.cycle import Cycle, Pacemaker, Parts, Sink, Step
+from daemon.endpoints import parse_lidar
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.lights import Lights, SurveyError, load_lights, new_state
@@ -82,8 +83,9 @@ def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
     from hal.registry import lidar_factory, split
 
     name, device = split(config.device)
+    place = parse_lidar(device)
     return lidar_factory(name)(
-        device, clock=clock, opener=opener, serial=config.serial, baud=config.baud, intensity=config.intensity
+        place.device, clock=clock, opener=opener, serial=place.serial, baud=place.baud, intensity=config.intensity
     )
 
 

@@ -12,19 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
+from daemon.access import Access
 from daemon.config import Config
 from daemon.cycle import Sink
-from daemon.publish.snapshot import Snapshot
 from daemon.reasons import REASONS, Reason
-from estimator.records import Command, Order
+from estimator.records import Command
 from hal.clock import Clock
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:
-    from daemon.publish.holding import Request
+    from daemon.orders import Told
     from daemon.publish.modbus import ModbusPublisher
     from daemon.publish.stream import StreamServer
 
@@ -32,8 +30,6 @@ log = logging.getLogger(__name__)
 
 SILENT_S: Final = 1.0
 """Another sender of odometry is listened to once the present one has been silent for this long."""
-
-SAVE_MAP: Final = "SAVE_MAP"
 
 Run = Callable[[], Awaitable[None]]
 OnOdometry = Callable[[RawOdometry], None]
@@ -43,13 +39,18 @@ OnOdometry = Callable[[RawOdometry], None]
 class Feeds:
     """Who takes what comes in.
 
-    ``on_save`` is asked to save the map, and tells the end of it: empty, or why it came to nothing.
+    ``on_save`` is asked to save the map, ``on_dump`` to write the flight recorder, ``on_switch`` to go on in another
+    map; each tells the end of it: empty, or why it came to nothing. ``on_pause``: whether the map is to be left alone.
+    What is None is refused.
     """
 
     on_odometry: OnOdometry
     on_imu: Callable[[RawImu], None]
     on_command: Callable[[Command], None]
-    on_save: Callable[[Callable[[str], None]], None]
+    on_save: Callable[[Told], None]
+    on_pause: Callable[[bool], None] | None = None
+    on_dump: Callable[[Told], None] | None = None
+    on_switch: Callable[[int, Told], None] | None = None
 
 
 class OneSender:
@@ -85,8 +86,8 @@ class Network:
         self._settings = settings
         self._clock = clock
         self._feeds = feeds
+        self._access = Access(settings.allow, settings.bind)
         self._odometry = OneSender(feeds.on_odometry)
-        self._asked: list[int] = []
         self.modbus: ModbusPublisher | None = None
         if settings.modbus.port:
             self._add_modbus()
@@ -99,16 +100,19 @@ class Network:
             self._add_stream(stream)
 
     def _add_modbus(self) -> None:
+        from daemon.orders import Orders
         from daemon.publish.modbus import ModbusPublisher
 
         modbus = ModbusPublisher(
             self._clock,
             write=self._settings.modbus.write,
-            on_command=self._command,
+            allowed=self._access,
+            on_command=lambda request: orders.take(request),
             on_odometry=self._from("Modbus"),
         )
+        orders = Orders(self._clock, self._feeds, modbus.acknowledge)
         self.modbus = modbus
-        self.sinks += [modbus.publish, self._acknowledge]
+        self.sinks += [modbus.publish, orders.published]
         self.parts["modbus"] = lambda: _open(
             lambda: modbus.start(self._settings.bind, self._settings.modbus.port), modbus.close
         )
@@ -131,7 +135,7 @@ class Network:
     def _add_inputs(self) -> None:
         from hal.inputs import InputPort
 
-        port = InputPort(self._clock, self._settings.bind, self._settings.odometry.port)
+        port = InputPort(self._clock, self._settings.bind, self._settings.odometry.port, allowed=self._access)
         on_odometry, on_imu = self._from("UDP"), self._feeds.on_imu
         self.parts["odometry"] = lambda: port.odometry.run(on_odometry)
         self.parts["imu"] = lambda: port.imu.run(on_imu)
@@ -139,37 +143,6 @@ class Network:
     def _from(self, sender: str) -> OnOdometry:
         """A callback for one sender's readings."""
         return lambda reading: self._odometry.take(sender, reading)
-
-    def _command(self, request: Request) -> None:
-        """An order written over Modbus; carried out by the next cycle, but for one that is none of the estimator's."""
-        if request.code.name == SAVE_MAP:
-            log.info("Modbus: %s", SAVE_MAP)
-            self._feeds.on_save(lambda reason: self._saved(request.number, reason))
-            return
-        order = Order[request.code.name]
-        pose = np.array(request.pose) if order is Order.SET_POSE else None
-        log.info("Modbus: %s %s", order.name, request.pose if pose is not None else "")
-        self._feeds.on_command(Command(self._clock.now(), order, pose))
-        self._asked.append(request.number)
-
-    def _saved(self, number: int, reason: str) -> None:
-        """The map is on the disk, or not: ``reason``."""
-        from daemon.publish.holding import Outcome
-
-        if reason:
-            log.warning("Modbus: %s refused: %s", SAVE_MAP, reason)
-        if self.modbus is not None:
-            self.modbus.acknowledge(number, Outcome.REFUSED if reason else Outcome.DONE)
-
-    def _acknowledge(self, snapshot: Snapshot) -> None:
-        """The cycle that took the orders has published: they are done."""
-        if not self._asked or self.modbus is None or snapshot.pose is None:
-            return
-        from daemon.publish.holding import Outcome
-
-        asked, self._asked = self._asked, []
-        for number in asked:
-            self.modbus.acknowledge(number, Outcome.DONE)
 
 
 async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:

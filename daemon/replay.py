@@ -22,6 +22,7 @@ import msgspec
 
 from daemon import cli, warmup
 from daemon.config import Config, Mount
+from daemon.configfile import brought_up
 from daemon.ledger import Ledger
 from daemon.lights import Lights, SurveyError, from_header, load_lights, lost_residuals
 from daemon.record import MAP, START
@@ -134,7 +135,7 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: Ma
 def config_for(source: Source, config: Config, given: Given) -> Config:
     """The configuration that counts: a person's, else the recording's, with the log's mount where none was given."""
     if source.recorded and not given.file:
-        tree = dict(source.header.get("config", {}))
+        tree = brought_up(dict(source.header.get("config", {})))
         try:
             return msgspec.convert(_laid_over(tree, msgspec.to_builtins(config), given.keys), Config)
         except msgspec.ValidationError as error:

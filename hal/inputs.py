@@ -110,6 +110,7 @@ class Sequence:
 
 OnOdometry = Callable[[RawOdometry], None]
 OnImu = Callable[[RawImu], None]
+Allowed = Callable[[str], bool]
 
 
 class InputPort:
@@ -121,13 +122,17 @@ class InputPort:
         bind: name or address of this computer; empty: all of them.
         port: 0: any free one, told by :attr:`port` once open.
         option: configuration key of the port, for the remedy.
+        allowed: whether a host's datagrams are taken.
     """
 
-    def __init__(self, clock: Clock, bind: str, port: int, option: str = "odometry.port") -> None:
+    def __init__(
+        self, clock: Clock, bind: str, port: int, option: str = "odometry.port", allowed: Allowed | None = None
+    ) -> None:
         self._clock = clock
         self._bind = bind
         self._wanted = port
         self._option = option
+        self._allowed = allowed
         self._sockets: list[socket.socket] = []
         self._users = 0
         self._opening = asyncio.Lock()
@@ -190,10 +195,11 @@ class InputPort:
     def _read(self, sock: socket.socket) -> None:
         for _ in range(_PER_TURN):
             try:
-                data, ancillary, _, _ = sock.recvmsg(_BUFFER, socket.CMSG_SPACE(_TIMESPEC.size))
+                data, ancillary, _, peer = sock.recvmsg(_BUFFER, socket.CMSG_SPACE(_TIMESPEC.size))
             except OSError:  # nothing more
                 return
-            self.take(data, self._clock.now() - _kernel_age(ancillary))
+            if self._allowed is None or self._allowed(peer[0]):
+                self.take(data, self._clock.now() - _kernel_age(ancillary))
 
     def take(self, data: bytes, t_rx: float) -> None:
         """One datagram and its time of arrival (also for replay)."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from daemon.publish.points import I32, U16, Layout, Point, from_client
+from daemon.publish.points import I32, U16, U32, Layout, Point, from_client
 
 COMMAND_ADDRESS: Final = 1000
 ODOMETRY_ADDRESS: Final = 1100
@@ -26,6 +26,10 @@ class CommandCode(IntEnum):
     RESET = 2  # forget map and pose, start anew
     SAVE_MAP = 3  # write the map to the disk; done when it is there and has been read back
     RELOCALISE = 4  # the robot was carried off: look for it everywhere in the map
+    PAUSE = 5  # the map is not touched and the laser does not move the pose, until RESUME
+    RESUME = 6  # the end of a pause
+    DUMP_RECORDER = 7  # write what the flight recorder holds; done when it is on the disk
+    SWITCH_MAP = 8  # go on in the stored map `map_id`; the one in use is saved first
 
 
 class Outcome(IntEnum):
@@ -40,11 +44,12 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command as a client asked for it: its number, what, and the pose (m, m, rad) in its parameters."""
+    """A command as a client asked for it: its number, what, and its parameters: a pose (m, m, rad), a stored map."""
 
     number: int
     code: CommandCode
     pose: tuple[float, float, float]
+    map_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +87,12 @@ COMMAND: Final = Layout(
         *_parameters("map frame, for SET_POSE"),
         _point("acknowledge", "acknowledge number", "The number of the last request that was finished.", "R"),
         _point("result", "result", f"Of the last request: {_OUTCOMES}.", "R"),
+        Point("map_id", "map", U32, from_client, "For SWITCH_MAP: the stored map's identity; written before the "
+              "request.", can_be_unknown=False, access="RW"),
     )
 )  # fmt: skip
-COMMAND_WRITABLE: Final = COMMAND.words - 2
+_ANSWER_AT: Final = 8  # acknowledge, result: told by us
+_WRITABLE: Final = ((0, _ANSWER_AT), (_ANSWER_AT + 2, COMMAND.words))
 
 ODOMETRY: Final = Layout(
     (
@@ -126,7 +134,7 @@ class Holding:
     def write(self, address: int, data: bytes) -> None:
         """Write registers (big-endian bytes) and act on a new number. Raises Refused where it is not allowed."""
         at = address - COMMAND_ADDRESS
-        if at >= 0 and at + len(data) // 2 <= COMMAND_WRITABLE:
+        if any(begin <= at and at + len(data) // 2 <= end for begin, end in _WRITABLE):
             self._command[2 * at : 2 * at + len(data)] = data
             self._look_for_command()
         elif address == ODOMETRY_ADDRESS and len(data) == len(self._odometry):
@@ -157,10 +165,10 @@ class Holding:
             return
         self._put_result(int(values["acknowledge"] or 0), Outcome.RUNNING)
         x, y, yaw = (value or 0.0 for value in pose)
-        self._on_command(Request(number, code, (x, y, yaw)))
+        self._on_command(Request(number, code, (x, y, yaw), int(values["map_id"] or 0)))
 
     def _put_result(self, acknowledge: int, outcome: Outcome) -> None:
-        self._command[-4:] = acknowledge.to_bytes(2, "big") + outcome.to_bytes(2, "big")
+        self._command[2 * _ANSWER_AT : 2 * _ANSWER_AT + 4] = acknowledge.to_bytes(2, "big") + outcome.to_bytes(2, "big")
 
     def _take_reading(self) -> None:
         values = ODOMETRY.values(ODOMETRY.big.unpack(self._odometry))

@@ -43,6 +43,14 @@ _READ_HIGH: Final = 16 * 1024
 _RECEIVE_BUFFER: Final = 256 * 1024
 
 
+Allowed = Callable[[str], bool]
+
+
+def everyone(_: str) -> bool:
+    """No host is turned away."""
+    return True
+
+
 @dataclass(slots=True)
 class Counts:
     """What the server has seen, for the health report."""
@@ -58,8 +66,9 @@ class Counts:
 class UdpEndpoint:
     """Serves one bound datagram socket."""
 
-    def __init__(self, sock: socket.socket, responder: Responder, counts: Counts) -> None:
+    def __init__(self, sock: socket.socket, responder: Responder, counts: Counts, allowed: Allowed = everyone) -> None:
         self._sock = sock
+        self._allowed = allowed
         self._responder = responder
         self._counts = counts
         self._loop = asyncio.get_running_loop()
@@ -76,6 +85,8 @@ class UdpEndpoint:
                 frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
             except OSError:  # nothing more, or the network's complaint about an earlier answer
                 return
+            if not self._allowed(peer[0]):
+                continue
             if not frame or frame_size(frame) != len(frame):
                 self._counts.malformed += 1
                 continue
@@ -105,6 +116,10 @@ class Connection(asyncio.Protocol):
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         transport.set_write_buffer_limits(high=_WRITE_HIGH)
+        peer = transport.get_extra_info("peername")
+        if peer is not None and not self._server.allowed(peer[0]):
+            transport.abort()
+            return
         self._server.admit(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -176,7 +191,8 @@ class Connection(asyncio.Protocol):
 class TcpEndpoint:
     """Serves listening sockets and shares each turn fairly among their connections."""
 
-    def __init__(self, responder: Responder, counts: Counts) -> None:
+    def __init__(self, responder: Responder, counts: Counts, allowed: Allowed = everyone) -> None:
+        self.allowed = allowed
         self.responder = responder
         self.counts = counts
         self._loop = asyncio.get_running_loop()
@@ -254,7 +270,7 @@ class ModbusPublisher:
 
     Args:
         clock: time of arrival of written odometry.
-        write: whether commands and odometry may be written.
+        write: whether commands and odometry may be written. allowed: whether a host may be answered.
         on_command: takes each command; tell its end by :meth:`acknowledge`.
         on_odometry: takes each written odometry reading.
     """
@@ -264,11 +280,13 @@ class ModbusPublisher:
         clock: Clock,
         *,
         write: bool = False,
+        allowed: Allowed = everyone,
         on_command: Callable[[Request], None] = _ignore,
         on_odometry: Callable[[RawOdometry], None] = _ignore,
     ) -> None:
         self._clock = clock
         self._on_odometry = on_odometry
+        self._allowed = allowed
         self._continuity = Continuity()
         self._holding = Holding(on_command, self._take_odometry) if write else None
         self._responder = Responder(self._holding)
@@ -290,7 +308,7 @@ class ModbusPublisher:
         """
         self.port = 0
         addresses = await inet.resolve(bind, port, passive=True)
-        self._tcp = TcpEndpoint(self._responder, self.counts)
+        self._tcp = TcpEndpoint(self._responder, self.counts, self._allowed)
         try:
             for address in addresses:
                 await self._listen(self._tcp, address)
@@ -308,7 +326,7 @@ class ModbusPublisher:
             undo.callback(datagrams.close)
             datagrams.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
             await tcp.listen(stream)
-            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts))
+            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts, self._allowed))
             undo.pop_all()
 
     def publish(self, snapshot: Snapshot) -> None:

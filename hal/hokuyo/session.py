@@ -200,7 +200,8 @@ class Session:
             if await self._try(scip.VV, _TEXT_S) is not None:
                 self.baud = baud
                 return
-        raise DeviceFault(self.device, f"lost after changing to {baud} bit/s", "set lidar.baud to a lower rate")
+        remedy = f"name a lower rate: lidar.device = {self.device}@19200"
+        raise DeviceFault(self.device, f"lost after changing to {baud} bit/s", remedy)
 
     async def prove(self, request: ScanRequest) -> str:
         """Ask for a single scan of a mode that not every firmware can do; "" if it came whole, else what was wrong."""

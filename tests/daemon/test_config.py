@@ -21,9 +21,9 @@ from daemon.config import (
     Mount,
     PoseConfig,
     parse_chip,
-    parse_endpoint,
 )
 from daemon.configfile import ConfigError, load
+from daemon.endpoints import LidarPlace, RtuLine, parse_endpoint, parse_lidar, parse_line
 from estimator import cdma_profile
 
 ROOT = Path(__file__).parents[2]
@@ -68,9 +68,31 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ("lidar = 3", "robot.toml:1: Expected `object`, got `int` - at `$.lidar`"),
         ("[lidar.mask]\nsectors = [[1, 2], [3]]", "Expected `array` of length 2, got 1 - at `$.lidar.mask.sectors[1]`"),
         ("[lidar.mask]\nsectors = [[1, 1]]", "robot.toml:2: Expected two different bearings in `sectors`"),
-        ("[lidar]\nbaud = 9600", "robot.toml:2: Expected one of 0, 19200, 38400"),
+        ("[lidar]\ndevice = '/dev/ttyS1@9600'", "robot.toml:2: Expected a line rate of 19200, 38400"),
+        ("[lidar]\ndevice = 'auto:'", "robot.toml:2: Expected `auto`, `auto:SERIAL`, `none`, a path"),
+        ("[lidar]\ndevice = 'auto:a b'", "robot.toml:2: Expected a serial number behind `auto:`, as in auto:H0906091"),
+        (
+            "[lidar]\nserial = 'H1'",
+            'robot.toml:2: `lidar.serial` is now part of `lidar.device`: write lidar.device = "auto:SERIAL"',
+        ),
+        (
+            "lidar.baud = 19200",
+            "robot.toml:1: `lidar.baud` is now part of `lidar.device`: write the rate behind the path, as in",
+        ),
+        ("allow = ['10.0.0.1/24']", "robot.toml:1: Expected `10.0.0.0/24` (the network) or an address without `/`"),
+        ("allow = ['::1', 'plc']", "Expected an address or a network such as 192.168.0.0/24, got `plc` in `allow[1]`"),
+        ("[modbus]\nserial = 'ttyUSB1'", "robot.toml:2: Expected a path with its line rate and our unit, as in"),
+        ("[modbus]\nserial = '/dev/a@9601'", "robot.toml:2: Expected a line rate of 1200, 2400, 4800, 9600"),
+        ("[modbus]\nserial = '/dev/a@9600,7E1'", "robot.toml:2: Expected a format of 8E1, 8O1, 8N1, 8N2 behind"),
+        ("[modbus]\nserial = '/dev/a#0'", "robot.toml:2: Expected a unit from 1 to 247 behind `#`, got `/dev/a#0`"),
+        (
+            "[lidar]\ndevice = '/dev/a@19200'\n[modbus]\nserial = '/dev/a#2'",
+            "Expected another line than the lidar's in `modbus.serial`, got `/dev/a#2`",
+        ),
+        ("[pose]\nreceivers = ['*:1', '*:2']", "robot.toml:2: Expected one port to subscribe on, `*:port`"),
+        ("[pose]\nreceivers = ['*:1502']", "Expected a port of its own in `pose.receivers`, got `*:1502`"),
         ("bind = 'robot'", "robot.toml:1: Expected an IP address of this machine in `bind`, got `robot`"),
-        ("[pose]\nreceivers = ['plc']", "robot.toml:2: Expected `host:port` or `[ipv6]:port`, got `plc`"),
+        ("[pose]\nreceivers = ['plc']", "robot.toml:2: Expected `host:port`, `[ipv6]:port` or `*:port`, got `plc`"),
         ("[pose]\nreceivers = ['a:1', 'plc:0']", "got `plc:0` in `receivers[1]` - at `$.pose`"),
         ("[odometry]\nport = 1502", "robot.toml:2: Expected a port other than Modbus's in `odometry.port`, got 1502"),
         (
@@ -104,6 +126,31 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
 )
 def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, text: str, expected: str) -> None:
     assert expected in refused(tmp_path, text)
+
+
+def test_the_parts_of_a_place_are_told_apart() -> None:
+    assert parse_lidar("auto:H0906091") == LidarPlace("auto", serial="H0906091")
+    assert parse_lidar("/dev/ttyUSB0@115200") == LidarPlace("/dev/ttyUSB0", baud=115200)
+    for whole in ("auto", "none", "/dev/serial/by-id/usb-x@y", "tcp://10.0.0.3:10940", "other:/dev/x@1,2"):
+        assert parse_lidar(whole) == LidarPlace(whole)
+    assert parse_line("/dev/ttyUSB1@115200#1") == RtuLine("/dev/ttyUSB1", 115200, "8E1", 1)
+    assert parse_line("/dev/ttyUSB1@9600,8N2#17") == RtuLine("/dev/ttyUSB1", 9600, "8N2", 17)
+    assert parse_line("/dev/serial/by-path/pci-0:1.0") == RtuLine("/dev/serial/by-path/pci-0:1.0", 19200, "8E1", 1)
+    assert parse_line("/dev/a#247") == RtuLine("/dev/a", 19200, "8E1", 247)
+
+
+def test_the_tree_of_an_earlier_version_is_brought_up() -> None:
+    """As recordings hold it; what the run did stays what it was."""
+    earlier = msgspec.to_builtins(Config())
+    for old, device in (
+        ({"device": "auto", "serial": "H1", "baud": 0}, "auto:H1"),
+        ({"device": "/dev/ttyS1", "serial": "", "baud": 19200}, "/dev/ttyS1@19200"),
+        ({"device": "/dev/ttyS1", "serial": "H1", "baud": 0}, "/dev/ttyS1"),
+        ({"device": "tcp://10.0.0.3", "serial": "", "baud": 19200}, "tcp://10.0.0.3"),
+    ):
+        tree = configfile.brought_up(earlier | {"lidar": old})
+        assert msgspec.convert(tree, Config) == Config(lidar=LidarConfig(device=device))
+    assert configfile.brought_up({}) == {}
 
 
 def test_lights_alone_are_a_configuration(tmp_path: Path) -> None:
@@ -187,9 +234,11 @@ configs = st.builds(
     Config,
     name=st.from_regex(r"\A[A-Za-z0-9_.-]{1,32}\Z"),
     bind=st.sampled_from(["127.0.0.1", "0.0.0.0", "::1"]),
+    allow=st.lists(st.sampled_from(["10.0.0.0/8", "::1", "192.168.0.7"]), max_size=2).map(tuple),
     lidar=st.builds(
         LidarConfig,
-        device=st.just("auto") | st.from_regex(r"tcp://[a-z]{1,9}(:[1-9][0-9]{3})?|/[ -~]+", fullmatch=True),
+        device=st.sampled_from(["auto", "auto:H1", "/dev/a@19200"])
+        | st.from_regex(r"tcp://[a-z]{1,9}(:[1-9][0-9]{3})?|/[ -?A-~]+", fullmatch=True),
         mount=st.builds(Mount, x=st.floats(-100, 100), y=st.floats(-100, 100), yaw=bearings, inverted=st.booleans()),
         mask=st.builds(
             Mask,
@@ -226,7 +275,7 @@ def test_the_reference_page_is_current_and_can_be_pasted(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("plc:9000", ("plc", 9000)), ("10.0.0.2:1", ("10.0.0.2", 1)), ("[::1]:65535", ("::1", 65535))],
+    [("plc:9000", ("plc", 9000)), ("*:5", ("*", 5)), ("10.0.0.2:1", ("10.0.0.2", 1)), ("[::1]:65535", ("::1", 65535))],
 )
 def test_endpoints(text: str, expected: tuple[str, int]) -> None:
     assert parse_endpoint(text) == expected

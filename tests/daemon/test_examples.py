@@ -79,7 +79,7 @@ def test_every_example_starts(file: Path) -> None:
     async def go() -> tuple[list[Snapshot], Daemon, dict[str, object]]:
         clock = LoopClock(asyncio.get_running_loop())
         plugs = FakeOpener(clock)
-        device = FakeHokuyo(UST_10LX, Room(UST_10LX), unit=Unit(serial=settings.lidar.serial or "H0000001"))
+        device = FakeHokuyo(UST_10LX, Room(UST_10LX), unit=Unit(serial=settings.lidar.place.serial or "H0000001"))
         plugs.plug("lidar", device)
 
         async def open_whatever(name: str, baud: int) -> Port:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from daemon.budget import FixedBudget
-from daemon.config import NO_DEVICE, Config, LidarConfig, LightsConfig, ModbusConfig, PhotodiodeConfig
+from daemon.config import Config, LidarConfig, LightsConfig, ModbusConfig, PhotodiodeConfig
+from daemon.endpoints import NO_DEVICE
 from daemon.lights import Lights, SurveyError, load_lights
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import LightPicture, Snapshot

@@ -12,7 +12,7 @@ from socket import create_connection
 import pytest
 
 from daemon.health import Fault
-from daemon.publish.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
+from daemon.publish.holding import COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.publish.snapshot import State
 from tests.daemon.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
 
@@ -30,7 +30,7 @@ def ask(daemon: Running, number: int, code: CommandCode) -> Outcome:
     """Order something over Modbus; what became of it."""
     modbus(daemon.modbus, struct.pack(">BHHBHH", 16, COMMAND_ADDRESS, 2, 4, number, code))
     for _ in range(200):
-        answer = modbus(daemon.modbus, struct.pack(">BHH", 3, COMMAND_ADDRESS + COMMAND.words - 2, 2))
+        answer = modbus(daemon.modbus, struct.pack(">BHH", 3, COMMAND_ADDRESS + 8, 2))
         acknowledged, outcome = struct.unpack(">HH", answer[2:])
         if acknowledged == number and outcome != Outcome.RUNNING:
             return Outcome(outcome)

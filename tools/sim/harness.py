@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from daemon.budget import FixedBudget
-from daemon.config import NO_DEVICE, Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
 from daemon.cycle import Cycle, Sink
+from daemon.endpoints import NO_DEVICE
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot, State
 from daemon.worker import CycleWorker

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.publish import registers
-from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
+from daemon.publish.holding import CommandCode, Holding, Outcome, Request, WrittenOdometry
 from daemon.publish.requests import Responder, frame_size
 from tests.daemon.publish.test_registers import snapshot
 
@@ -163,12 +163,20 @@ def test_a_newer_command_replaces_a_running_one() -> None:
     assert result(bench) == (6, Outcome.REFUSED)
 
 
-@pytest.mark.parametrize("code", [0, 5, 65535])
+@pytest.mark.parametrize("code", [0, 9, 65535])
 def test_an_unknown_command_says_so(code: int) -> None:
     bench = Bench()
     bench.ask(write(1000, 5, code))
     assert bench.commands == []
     assert result(bench) == (5, Outcome.UNKNOWN)
+
+
+def test_a_map_to_switch_to_is_written_before_the_request() -> None:
+    bench = Bench()
+    bench.ask(write(1010, 0xDEAD, 0xBEEF))
+    bench.ask(write(1000, 5, CommandCode.SWITCH_MAP))
+    assert [(r.code, r.map_id) for r in bench.commands] == [(CommandCode.SWITCH_MAP, 0xDEADBEEF)]
+    assert bench.ask(read(3, 1010, 2)) == b"\x03\x04\xde\xad\xbe\xef"
 
 
 def test_a_pose_that_is_not_known_is_refused() -> None:
@@ -181,9 +189,9 @@ def test_a_pose_that_is_not_known_is_refused() -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        write(0, 1), write(999, 1, 1), write(1008, 1), write(1007, 1, 1), write(1010, 1), write(1100, 1),
-        write(1101, 1), write(1100, *range(9)), write(65535, 1), struct.pack(">BHH", 6, 1008, 1),
-        struct.pack(">BHH", 6, 1100, 1),
+        write(0, 1), write(999, 1, 1), write(1008, 1), write(1007, 1, 1), write(1009, 1, 1), write(1011, 1, 1),
+        write(1012, 1), write(1100, 1), write(1101, 1), write(1100, *range(9)), write(65535, 1),
+        struct.pack(">BHH", 6, 1008, 1), struct.pack(">BHH", 6, 1100, 1),
     ],
 )  # fmt: skip
 def test_what_may_not_be_written_is_an_illegal_address(body: bytes) -> None:

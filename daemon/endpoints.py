@@ -1,0 +1,136 @@
+"""How the configuration writes down where things are: lidars, lines, receivers, networks. Each in one string.
+
+lidar       auto, auto:H0906091, /dev/ttyACM0, /dev/ttyUSB0@115200, tcp://host:port, none
+RTU line    /dev/ttyUSB1, /dev/ttyUSB1@115200, /dev/ttyUSB1@9600,8N1#17
+receiver    host:port, 239.1.2.3:port, [ipv6]:port, *:port
+network     192.168.0.0/24, 192.168.0.7, fd00::/8
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+AUTO: Final = "auto"
+NO_DEVICE: Final = "none"
+"""A lidar that is not there: lights alone."""
+ANYBODY: Final = "*"
+"""Host of a receiver that stands for whoever subscribes."""
+
+SCIP_BAUDS: Final = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
+"""Line rates that SCIP knows (command SS, C-42-03320B)."""
+RTU_BAUDS: Final = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
+RTU_FORMATS: Final = ("8E1", "8O1", "8N1", "8N2")
+DEFAULT_RTU: Final = (19200, "8E1", 1)
+"""Rate and format that every device has to know (MODBUS over Serial Line V1.02, 2.5.1 and 3.3), and the first unit."""
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+@dataclass(frozen=True, slots=True)
+class LidarPlace:
+    """Where a lidar is: ``device`` without its rate; ``serial`` to insist on, ``baud`` to use (0: find it)."""
+
+    device: str
+    serial: str = ""
+    baud: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RtuLine:
+    """A serial line on which Modbus RTU is served: path, bit/s, character format, our unit address."""
+
+    path: str
+    baud: int
+    format: str
+    unit: int
+
+
+def parse_endpoint(text: str) -> tuple[str, int]:
+    """Split ``host:port`` or ``[ipv6]:port`` into its parts; the host may be ``*``.
+
+    Raises:
+        ValueError: naming what is wrong and what was expected.
+    """
+    match = re.fullmatch(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[A-Za-z0-9_.-]+|\*)):(?P<port>\d{1,5})", text)
+    if match is None:
+        raise ValueError(f"Expected `host:port`, `[ipv6]:port` or `*:port`, got `{text}`")
+    port = int(match["port"])
+    if not 1 <= port <= 65535:
+        raise ValueError(f"Expected a port from 1 to 65535, got `{text}`")
+    if match["v6"] is not None and not is_address(match["v6"]):
+        raise ValueError(f"Expected an IPv6 address in the brackets, got `{text}`")
+    return match["v6"] or match["host"], port
+
+
+def is_address(text: str) -> bool:
+    """Whether this is an IP address."""
+    for family in (socket.AF_INET, socket.AF_INET6):
+        try:
+            socket.inet_pton(family, text)
+        except OSError:
+            continue
+        return True
+    return False
+
+
+def parse_lidar(text: str) -> LidarPlace:
+    """Take a lidar's device string apart; what a driver of its own is to understand is left as it is.
+
+    Raises:
+        ValueError: naming what is wrong and what was expected.
+    """
+    if text.startswith(f"{AUTO}:"):
+        serial = text.removeprefix(f"{AUTO}:")
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", serial):
+            raise ValueError(f"Expected a serial number behind `auto:`, as in auto:H0906091, got `{text}`")
+        return LidarPlace(AUTO, serial)
+    if (rate := re.fullmatch(r"(/.*)@(\d+)", text)) is None:
+        return LidarPlace(text)
+    if int(rate[2]) not in SCIP_BAUDS:
+        raise ValueError(f"Expected a line rate of {', '.join(map(str, SCIP_BAUDS))} behind `@`, got `{text}`")
+    return LidarPlace(rate[1], baud=int(rate[2]))
+
+
+def parse_line(text: str) -> RtuLine:
+    """Take ``path@rate,format#unit`` apart; rate, format and unit may be left out.
+
+    Raises:
+        ValueError: naming what is wrong and what was expected.
+    """
+    form = r"(?P<path>/[^@#]+)(?:@(?P<baud>\d+)(?:,(?P<format>\w+))?)?(?:#(?P<unit>\d+))?"
+    if (match := re.fullmatch(form, text)) is None:
+        raise ValueError(f"Expected a path with its line rate and our unit, as in /dev/ttyUSB1@115200#1, got `{text}`")
+    baud, style, unit = DEFAULT_RTU
+    line = RtuLine(match["path"], int(match["baud"] or baud), match["format"] or style, int(match["unit"] or unit))
+    if line.baud not in RTU_BAUDS:
+        raise ValueError(f"Expected a line rate of {', '.join(map(str, RTU_BAUDS))} behind `@`, got `{text}`")
+    if line.format not in RTU_FORMATS:
+        raise ValueError(f"Expected a format of {', '.join(RTU_FORMATS)} behind the rate, got `{text}`")
+    if not 1 <= line.unit <= 247:
+        raise ValueError(f"Expected a unit from 1 to 247 behind `#`, got `{text}`")
+    return line
+
+
+def parse_network(text: str) -> Network:
+    """An address or a network of them.
+
+    Raises:
+        ValueError: naming what is wrong and what was expected.
+    """
+    try:
+        return ipaddress.ip_network(text)
+    except ValueError as error:
+        if "host bits set" in str(error):
+            whole = ipaddress.ip_network(text, strict=False)
+            raise ValueError(f"Expected `{whole}` (the network) or an address without `/`, got `{text}`") from None
+        raise ValueError(f"Expected an address or a network such as 192.168.0.0/24, got `{text}`") from None
+
+
+def subscription_port(receivers: Sequence[str]) -> int:
+    """Port on which whoever subscribes gets pose datagrams; 0: none."""
+    return next((port for host, port in map(parse_endpoint, receivers) if host == ANYBODY), 0)

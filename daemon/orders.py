@@ -1,0 +1,95 @@
+"""Orders that come in over Modbus: each goes to who carries it out, and its end back to the client."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from daemon.publish.holding import CommandCode, Outcome, Request
+from daemon.publish.snapshot import Snapshot
+from estimator.records import Command, Order
+from hal.clock import Clock
+
+if TYPE_CHECKING:
+    from daemon.network import Feeds
+
+log = logging.getLogger(__name__)
+
+Told = Callable[[str], None]
+"""Told the end of something: empty, or why it came to nothing."""
+
+NOT_HERE: Final = "this run cannot do that"
+
+
+@dataclass(slots=True)
+class _Asked:
+    """A request whose cycle has yet to publish; ``placed``: with a pose."""
+
+    number: int
+    placed: bool
+
+
+class Orders:
+    """Hands orders on.
+
+    Args:
+        acknowledge: tells the client what became of its request.
+    """
+
+    def __init__(self, clock: Clock, feeds: Feeds, acknowledge: Callable[[int, Outcome], None]) -> None:
+        self._clock = clock
+        self._feeds = feeds
+        self._acknowledge = acknowledge
+        self._asked: list[_Asked] = []
+
+    def take(self, request: Request) -> None:
+        """An order as it was written."""
+        feeds, code = self._feeds, request.code
+        log.info("Modbus: %s", _said(request))
+        told = partial(self._ended, request)
+        if code is CommandCode.SAVE_MAP:
+            feeds.on_save(told)
+        elif code in (CommandCode.PAUSE, CommandCode.RESUME):
+            if feeds.on_pause is None:
+                told(NOT_HERE)
+                return
+            feeds.on_pause(code is CommandCode.PAUSE)
+            self._asked.append(_Asked(request.number, placed=False))
+        elif code is CommandCode.DUMP_RECORDER:
+            told(NOT_HERE) if feeds.on_dump is None else feeds.on_dump(told)
+        elif code is CommandCode.SWITCH_MAP:
+            told(NOT_HERE) if feeds.on_switch is None else feeds.on_switch(request.map_id, told)
+        else:
+            self._to_estimator(request)
+
+    def _to_estimator(self, request: Request) -> None:
+        """Carried out by the next cycle."""
+        order = Order[request.code.name]
+        pose = np.array(request.pose) if order is Order.SET_POSE else None
+        self._feeds.on_command(Command(self._clock.now(), order, pose))
+        self._asked.append(_Asked(request.number, placed=True))
+
+    def published(self, snapshot: Snapshot) -> None:
+        """The cycle that took the orders has published: they are done; a sink of the cycle."""
+        if self._asked:
+            placed = snapshot.pose is not None
+            done = [asked for asked in self._asked if placed or not asked.placed]
+            self._asked = [asked for asked in self._asked if not placed and asked.placed]
+            for asked in done:
+                self._acknowledge(asked.number, Outcome.DONE)
+
+    def _ended(self, request: Request, reason: str) -> None:
+        if reason:
+            log.warning("Modbus: %s refused: %s", request.code.name, reason)
+        self._acknowledge(request.number, Outcome.REFUSED if reason else Outcome.DONE)
+
+
+def _said(request: Request) -> str:
+    """The order with what it carries."""
+    carried = {CommandCode.SET_POSE: f" {request.pose}", CommandCode.SWITCH_MAP: f" {request.map_id:08x}"}
+    return request.code.name + carried.get(request.code, "")

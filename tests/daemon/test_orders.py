@@ -1,0 +1,82 @@
+"""Orders over Modbus: who carries each out, and when its end is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from daemon.network import Feeds
+from daemon.orders import Orders
+from daemon.publish.holding import CommandCode, Outcome, Request
+from estimator.records import Command, Order
+from hal.clock import SystemClock
+from tests.daemon.publish.test_registers import snapshot
+
+Told = Callable[[str], None]
+
+
+class Bench:
+    """Orders with what they set off."""
+
+    def __init__(self, **able: Any) -> None:
+        self.ended: list[tuple[int, Outcome]] = []
+        self.commands: list[Command] = []
+        self.saves: list[Told] = []
+        feeds = Feeds(lambda _: None, lambda _: None, self.commands.append, self.saves.append, **able)
+
+        self.orders = Orders(SystemClock(), feeds, lambda number, outcome: self.ended.append((number, outcome)))
+
+    def ask(self, number: int, code: CommandCode, map_id: int = 0) -> None:
+        self.orders.take(Request(number, code, (1.0, 2.0, 0.5), map_id))
+
+
+@pytest.mark.parametrize("order", list(Order))
+def test_the_estimators_orders_are_done_when_a_pose_is_published(order: Order) -> None:
+    bench = Bench()
+    bench.ask(7, CommandCode[order.name])
+    assert [command.order for command in bench.commands] == [order]
+    assert (bench.commands[0].T_map_base is not None) == (order is Order.SET_POSE)
+    bench.orders.published(snapshot(pose=None))
+    assert bench.ended == []
+    bench.orders.published(snapshot())
+    bench.orders.published(snapshot())
+    assert bench.ended == [(7, Outcome.DONE)]
+
+
+def test_a_pause_is_done_with_the_next_snapshot_pose_or_not() -> None:
+    pauses: list[bool] = []
+    bench = Bench(on_pause=pauses.append)
+    bench.ask(3, CommandCode.PAUSE)
+    bench.ask(4, CommandCode.RESUME)
+    bench.ask(5, CommandCode.RESET)
+    assert bench.ended == []
+    bench.orders.published(snapshot(pose=None))
+    assert (pauses, bench.ended) == ([True, False], [(3, Outcome.DONE), (4, Outcome.DONE)])
+
+
+def test_what_takes_long_is_done_when_it_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    dumps: list[Told] = []
+    switches: list[tuple[int, Told]] = []
+    bench = Bench(on_dump=dumps.append, on_switch=lambda map_id, told: switches.append((map_id, told)))
+    bench.ask(1, CommandCode.SAVE_MAP)
+    bench.ask(2, CommandCode.DUMP_RECORDER)
+    bench.ask(3, CommandCode.SWITCH_MAP, 0xABC)
+    bench.orders.published(snapshot())
+    assert bench.ended == []
+    bench.saves[0]("")
+    dumps[0]("the disk is full")
+    switches[0][1]("")
+    assert switches[0][0] == 0xABC
+    assert bench.ended == [(1, Outcome.DONE), (2, Outcome.REFUSED), (3, Outcome.DONE)]
+    assert "DUMP_RECORDER refused: the disk is full" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "code", [CommandCode.PAUSE, CommandCode.RESUME, CommandCode.DUMP_RECORDER, CommandCode.SWITCH_MAP]
+)
+def test_what_a_run_cannot_do_is_refused(code: CommandCode) -> None:
+    bench = Bench()
+    bench.ask(9, code)
+    assert bench.ended == [(9, Outcome.REFUSED)]
