@@ -40,15 +40,14 @@ class Feeds:
     """Who takes what comes in.
 
     ``on_save`` is asked to save the map, ``on_dump`` to write the flight recorder, ``on_switch`` to go on in another
-    map; each tells the end of it: empty, or why it came to nothing. ``on_pause``: whether the map is to be left alone.
-    What is None is refused.
+    map; each tells the end of it: empty, or why it came to nothing. What
+    is None is refused.
     """
 
     on_odometry: OnOdometry
     on_imu: Callable[[RawImu], None]
     on_command: Callable[[Command], None]
     on_save: Callable[[Told], None]
-    on_pause: Callable[[bool], None] | None = None
     on_dump: Callable[[Told], None] | None = None
     on_switch: Callable[[int, Told], None] | None = None
 

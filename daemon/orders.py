@@ -28,7 +28,7 @@ NOT_HERE: Final = "this run cannot do that"
 
 @dataclass(slots=True)
 class _Asked:
-    """A request whose cycle has yet to publish; ``placed``: with a pose."""
+    """A request whose cycle has yet to publish; ``placed``: it is done when there is a pose."""
 
     number: int
     placed: bool
@@ -54,25 +54,19 @@ class Orders:
         told = partial(self._ended, request)
         if code is CommandCode.SAVE_MAP:
             feeds.on_save(told)
-        elif code in (CommandCode.PAUSE, CommandCode.RESUME):
-            if feeds.on_pause is None:
-                told(NOT_HERE)
-                return
-            feeds.on_pause(code is CommandCode.PAUSE)
-            self._asked.append(_Asked(request.number, placed=False))
         elif code is CommandCode.DUMP_RECORDER:
             told(NOT_HERE) if feeds.on_dump is None else feeds.on_dump(told)
         elif code is CommandCode.SWITCH_MAP:
             told(NOT_HERE) if feeds.on_switch is None else feeds.on_switch(request.map_id, told)
         else:
-            self._to_estimator(request)
+            self._to_cycle(request)
 
-    def _to_estimator(self, request: Request) -> None:
+    def _to_cycle(self, request: Request) -> None:
         """Carried out by the next cycle."""
         order = Order[request.code.name]
         pose = np.array(request.pose) if order is Order.SET_POSE else None
         self._feeds.on_command(Command(self._clock.now(), order, pose))
-        self._asked.append(_Asked(request.number, placed=True))
+        self._asked.append(_Asked(request.number, placed=order not in (Order.PAUSE, Order.RESUME)))
 
     def published(self, snapshot: Snapshot) -> None:
         """The cycle that took the orders has published: they are done; a sink of the cycle."""
