@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from daemon.publish import integrity, lights, registers
+from daemon.publish import integrity, lights, pulse, registers
 from daemon.publish.points import U16, Value
-from daemon.publish.snapshot import LightFix, LinkUse, State
+from daemon.publish.snapshot import LightFix, LinkUse, Stage, State
 
 if TYPE_CHECKING:
     from daemon.config import Config
@@ -89,6 +89,7 @@ class Reader:
                 ) from error
             reading = self._reading(answer)
             reading |= self._block(integrity.ADDRESS, integrity.BLOCK_WORDS, integrity.decode_integrity)
+            reading |= self._block(pulse.ADDRESS, pulse.BLOCK_WORDS, pulse.decode_pulse)
             if reading["links"] is not None:
                 reading |= self._block(lights.ADDRESS, lights.BLOCK_WORDS, lights.decode_lights)
             return reading
@@ -238,7 +239,7 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("loops", _loops(reading)),
         *_lights(reading),
         ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
-        ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget"),
+        ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget{_left_out(reading)}"),
         ("devices", _devices(reading["devices"])),
         ("snapshot", f"{reading['seq']}, {_date(reading['t_utc'])}"),
     ]
@@ -289,6 +290,18 @@ def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) 
     if x is None and y is None and yaw is None:
         return "not known"
     return f"{_bounded(x, unit)}, {_bounded(y, unit)}, {_angle(yaw)}{per}"
+
+
+def _left_out(reading: Reading) -> str:
+    """How long cycles take, what they leave out, and when they stood still, as far as it is known and worth a word."""
+    long, rung, stalls = reading.get("cycle_p99"), int(reading.get("rung") or 0), reading.get("stalls")
+    said = f", 99 of 100 within {_number(long, 's', 5)}" if long is not None else ""
+    said += f"; {pulse.RUNGS[rung]}" if 0 < rung < len(pulse.RUNGS) else ""
+    if not stalls:
+        return said
+    number = reading["stall_in"]
+    where = "" if number is None else f" in {_name(Stage, number)}"
+    return f"{said}; stood still {stalls:g} times, latest {_number(reading['stall'], 's', 3)}{where}"
 
 
 def _trust(reading: Reading) -> list[tuple[str, str]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.health import FAULTS
-from daemon.publish import holding, integrity, lights, modbus, registers, requests
+from daemon.publish import holding, integrity, lights, modbus, pulse, registers, requests
 from daemon.publish.points import Layout, Point, Rule
 from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
 from daemon.reasons import REASONS
@@ -152,6 +152,7 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 
 {_lights()}
 {_integrity()}
+{_pulse()}
 {_writing()}
 ## Limits
 
@@ -238,6 +239,25 @@ How far the pose can be trusted; what a protection level is, and at which risk i
 {table(("bit of `witnesses`", "name", "set when"), _bit_rows(integrity.WITNESSES))}
 
 {table(("`loop_reason`", "name", "meaning"), [(str(why.value), why.name, _LOOPS[why]) for why in LoopReason])}
+"""
+
+
+def _pulse() -> str:
+    first = pulse.ADDRESS
+    last = first + pulse.BLOCK_WORDS - 1
+    block = [
+        (str(first), "`magic`", "uint16", "", "", f"0x{pulse.MAGIC:04X} (\"LC\")."),
+        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {pulse.VERSION}."),
+        *_rows(pulse.BLOCK, pulse.BODY_ADDRESS, 1),
+        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
+    ]  # fmt: skip
+    return f"""## The cycle: input registers {first} to {last}
+
+What the daemon leaves out where the computer is too slow, how long the stages of a cycle take, and when it stood still.
+Medians and the like are those of the last half minute to minute. Read **{pulse.BLOCK_WORDS} registers from address
+{first} in one request**.
+
+{table(("address", "name", "type", "step", "not known", "meaning"), block)}
 """
 
 

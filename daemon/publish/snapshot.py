@@ -60,6 +60,47 @@ class LoopReason(IntEnum):
     PLACED = 5  # found in the whole map: the one place that fits all that was seen since the place was lost
 
 
+class Stage(IntEnum):
+    """Parts of a cycle, in the order in which they are published. Numbers are part of the contract: never renumber."""
+
+    BRIDGE = 0  # answers of the worker; devices' readings become SI records
+    LIGHTS = 1  # decoding a block of samples, the filter of lights, odometry up to then
+    SEARCH = 2  # for lamps that are not followed yet
+    MATCH = 3  # the scan against the map, and what comes of it
+    MAP = 4  # keyframes and loops
+    STEP = 5  # what else belongs to the estimate
+    JUDGE = 6  # state, bound, snapshot
+    PUBLISH = 7  # registers, datagrams, stream, recording
+    OUTSIDE = 8  # no cycle was running
+
+
+Spread = tuple[int, int, int]
+"""Median, 99 of 100, and largest, microseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """How the cycle itself is doing; None: not known.
+
+    Attributes:
+        rung: what is left out for lack of time, or by a pause (`estimator.records.Rung`).
+        thinned, without_map, carried: cycles on rung 1, 2, 3 since the start.
+        stalls: how often no cycle began in time; stall_s, stall_in: how long the latest lasted, and where.
+        cycle, late: computing time of a cycle, and how late it began. stages: of each of :class:`Stage`, in order.
+    """
+
+    rung: int = 0
+    thinned: int = 0
+    without_map: int = 0
+    carried: int = 0
+    stalls: int = 0
+    stall_s: float | None = None
+    stall_in: Stage | None = None
+    cycle: Spread | None = None
+    late: Spread | None = None
+    stages: tuple[Spread | None, ...] = ()
+
+
 @dataclass(frozen=True, slots=True)
 class LightLink:
     """One lamp in view.
@@ -143,6 +184,7 @@ class Snapshot:
         scan_rate: scans per second. missed: scans lost. overruns: cycles over budget. cycle_us: last cycle's duration.
         lidar_ok, adc_ok, odometry_ok: None where not configured.
         fault: number of the gravest present fault, 0: none. trust: how far the pose can be trusted.
+        pulse: how the cycle itself is doing.
     """
 
     seq: int
@@ -176,3 +218,4 @@ class Snapshot:
     trust: Trust = Trust()
     loop_reason: int | None = None
     loop_residual: float | None = None
+    pulse: Pulse | None = None
