@@ -39,10 +39,10 @@ environment() {
     mkdir -p "$ROOT"
     touch "$ROOT/$MARK"
     "$PYTHON" -m venv "$ROOT"
-    "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --require-hashes -r "$SOURCE/requirements/core.lock"
+    "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r "$SOURCE/requirements/core.lock"
     wheel=$(mktemp -d)
     tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator | tar -C "$wheel" -xf -
-    PIP_CONSTRAINT="$SOURCE/requirements/build.txt" "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps "$wheel"
+    PIP_CONSTRAINT="$SOURCE/requirements/build.txt" "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --no-deps "$wheel"
     rm -rf "$wheel"
     "$ROOT/bin/python" -m pip uninstall --quiet --disable-pip-version-check --yes setuptools pip
     rm -f "$ROOT"/bin/activate* "$ROOT"/bin/Activate.ps1 "$ROOT"/bin/pip* "$ROOT"/bin/wheel
@@ -54,7 +54,7 @@ environment() {
     find "$ROOT" -name direct_url.json -delete
     find "$ROOT/lib" -type d -name tests -prune -exec rm -rf {} +
     find "$ROOT" -name __pycache__ -prune -exec rm -rf {} +
-    "$PYTHON" -m compileall -q -s "$DESTDIR" --invalidation-mode checked-hash "$ROOT/lib" || true
+    "$PYTHON" -m compileall -q -j 0 -s "$DESTDIR" --invalidation-mode checked-hash "$ROOT/lib" || true
     mkdir -p "$DESTDIR/usr/bin"
     ln -sfn "$PREFIX/bin/lumiloop" "$DESTDIR/usr/bin/lumiloop"
 }

@@ -1,14 +1,17 @@
 """A Debian with a real systemd as its first process, in a container of this machine (systemd-nspawn(1)).
 
-The base is built once and kept as a tar; each test session unpacks a fresh copy. Nothing is left behind: the container
-is stopped, its files are removed, and it has no mounts of its own outside of its name spaces.
+The base is built once and kept as a tar; each test session unpacks a fresh copy, in memory where there is enough of
+it. Nothing is left behind: the container is stopped, its files are removed, and it has no mounts of its own outside of
+its name spaces. What a killed session could not remove, the next one does.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +22,10 @@ SUITE = "bookworm"
 PACKAGES = "systemd,systemd-sysv,dbus,python3,udev"
 TOOLS = {"systemd-nspawn": "systemd-container", "mmdebstrap": "mmdebstrap", "nsenter": "util-linux"}
 BUILD_S, BOOT_S, COMMAND_S = 900.0, 60.0, 120.0
+MEMORY = Path("/dev/shm")
+ROOM = 3_000_000_000
+"""Bytes that one session may need: the tree, its package, the base and what is installed there."""
+NAME = "lumiloop-container-"
 
 
 def missing() -> str:
@@ -82,6 +89,27 @@ class Container:
             time.sleep(0.05)
 
 
+@contextmanager
+def workspace() -> Iterator[Path]:
+    """A folder of this process that is gone afterwards."""
+    in_memory = MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM and _memory_available() > 2 * ROOM
+    parent = MEMORY if in_memory else Path(tempfile.gettempdir())
+    for left in parent.glob(f"{NAME}*"):
+        if not Path("/proc", left.name.removeprefix(NAME)).exists():
+            shutil.rmtree(left, ignore_errors=True)
+    folder = parent / f"{NAME}{os.getpid()}"
+    folder.mkdir(mode=0o755)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def _memory_available() -> int:
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+
+
 def unpack(root: Path) -> None:
     """A fresh copy of the base system."""
     root.mkdir()
@@ -100,21 +128,20 @@ def inside(root: Path, *command: str, seconds: float = BUILD_S) -> str:
 
 @contextmanager
 def booted(root: Path, *binds: str) -> Iterator[Container]:
-    """Boot it; ``binds``: as nspawn's ``--bind``. Powered off at the end."""
+    """Boot it; ``binds``: as nspawn's ``--bind``. Pulled off the mains at the end."""
     command = ["systemd-nspawn", "-q", "-D", str(root), "-b", "--register=no", "--keep-unit", "--console=pipe"]
     command += [f"--machine=lumiloop-{os.getpid()}", "--private-network", *(f"--bind={bind}" for bind in binds)]
     command += ["--property=DeviceAllow=char-pts rw"] if binds else []
     with (root.parent / "console").open("w") as console:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=console, stderr=subprocess.STDOUT)
+    leader = 0
     try:
-        yield Container(root, _wait_for_boot(process, root.parent / "console"))
+        leader = _wait_for_boot(process, root.parent / "console")
+        yield Container(root, leader)
     finally:
-        process.terminate()
-        try:
-            process.wait(timeout=BOOT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        # all of its processes die with its first one, before that is gone; then nspawn ends, and leaves nothing
+        os.kill(leader or process.pid, signal.SIGKILL)
+        process.wait(timeout=BOOT_S)
 
 
 def _wait_for_boot(process: subprocess.Popen[bytes], console: Path) -> int:
