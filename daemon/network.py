@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.access import Access
-from daemon.config import Config
+from daemon.config import Config, ModbusConfig
 from daemon.cycle import Sink
 from daemon.reasons import REASONS, Reason
 from estimator.records import Command
@@ -88,8 +88,8 @@ class Network:
         self._access = Access(settings.allow, settings.bind)
         self._odometry = OneSender(feeds.on_odometry)
         self.modbus: ModbusPublisher | None = None
-        if settings.modbus.port:
-            self._add_modbus()
+        if settings.modbus.port or settings.modbus.line is not None:
+            self._add_modbus(settings.modbus)
         if settings.pose.receivers:
             self._add_pose()
         if settings.odometry.port:
@@ -98,13 +98,13 @@ class Network:
         if stream is not None:
             self._add_stream(stream)
 
-    def _add_modbus(self) -> None:
+    def _add_modbus(self, settings: ModbusConfig) -> None:
         from daemon.orders import Orders
         from daemon.publish.modbus import ModbusPublisher
 
         modbus = ModbusPublisher(
             self._clock,
-            write=self._settings.modbus.write,
+            write=settings.write,
             allowed=self._access,
             on_command=lambda request: orders.take(request),
             on_odometry=self._from("Modbus"),
@@ -112,9 +112,12 @@ class Network:
         orders = Orders(self._clock, self._feeds, modbus.acknowledge)
         self.modbus = modbus
         self.sinks += [modbus.publish, orders.published]
-        self.parts["modbus"] = lambda: _open(
-            lambda: modbus.start(self._settings.bind, self._settings.modbus.port), modbus.close
-        )
+        if settings.port:
+            self.parts["modbus"] = lambda: _open(lambda: modbus.start(self._settings.bind, settings.port), modbus.close)
+        if settings.line is not None:
+            from daemon.publish.rtu import RtuServer
+
+            self.parts["modbus serial"] = RtuServer(settings.line, modbus.answer).run
 
     def _add_pose(self) -> None:
         from daemon.publish.udp import PoseSender

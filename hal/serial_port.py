@@ -112,15 +112,15 @@ class SerialPort:
             self._loop.remove_reader(self._fd)
 
 
-async def open_serial_port(device: str, baud: int, clock: Clock | None = None) -> SerialPort:
-    """Open ``device`` exclusively (advisory lock), raw, 8N1, without flow control.
+async def open_serial_port(device: str, baud: int, clock: Clock | None = None, style: str = "8N1") -> SerialPort:
+    """Open ``device`` exclusively (advisory lock), raw, without flow control; ``style``: bits, parity, stop bits.
 
     The kernel may block in ``open`` for seconds when a USB device is wedged, so that one call runs outside the loop.
 
     Raises:
         DeviceMissing: nothing there. DeviceRefused: permission, busy, not a serial port, impossible rate.
     """
-    opening = asyncio.ensure_future(asyncio.to_thread(_open_line, device, baud))
+    opening = asyncio.ensure_future(asyncio.to_thread(_open_line, device, baud, style))
     try:
         line = await asyncio.shield(opening)
     except asyncio.CancelledError:
@@ -131,8 +131,18 @@ async def open_serial_port(device: str, baud: int, clock: Clock | None = None) -
     return SerialPort(line, clock or SystemClock())
 
 
-def _open_line(device: str, baud: int) -> serial.Serial:
-    line = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True, inter_byte_timeout=0)
+def _open_line(device: str, baud: int, style: str) -> serial.Serial:
+    line = serial.Serial(
+        device,
+        baud,
+        bytesize=int(style[0]),
+        parity=style[1],
+        stopbits=int(style[2]),
+        timeout=0,
+        write_timeout=0,
+        exclusive=True,
+        inter_byte_timeout=0,
+    )
     if "ttyUSB" in os.path.realpath(device):  # FTDI: 1 ms instead of 16 ms between transfers; others have no such timer
         with contextlib.suppress(ValueError, OSError):
             line.set_low_latency_mode(True)

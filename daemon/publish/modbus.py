@@ -297,6 +297,10 @@ class ModbusPublisher:
         self.port = 0
         self.publish(Snapshot(seq=0, t_mono=0.0, t_sent=0.0, t_utc=0.0, state=State.STARTING, reason=0))
 
+    def answer(self, body: bytes) -> bytes:
+        """The answer to a function's body, for transports of another kind."""
+        return self._responder.answer_body(body)
+
     async def start(self, bind: str, port: int) -> None:
         """Listen on UDP and TCP.
 

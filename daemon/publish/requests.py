@@ -107,6 +107,11 @@ class Responder:
         message.dev_id, message.transaction_id = unit, transaction
         return self._framer.buildFrame(message)
 
+    def answer_body(self, body: bytes) -> bytes:
+        """The answer to a function's body alone, as serial lines carry it."""
+        message = self._respond(body)
+        return bytes([message.function_code]) + message.encode()
+
     def _respond(self, body: bytes) -> ModbusPDU:
         function = body[0]
         try:
