@@ -51,18 +51,20 @@ class RtuLine:
 
 
 def parse_endpoint(text: str) -> tuple[str, int]:
-    """Split ``host:port`` or ``[ipv6]:port`` into its parts; the host may be ``*``.
+    """Split ``host:port`` or ``[ipv6]:port`` into its parts; the host may be ``*``, or a group ``ff15::42%eth0``.
 
     Raises:
         ValueError: naming what is wrong and what was expected.
     """
-    match = re.fullmatch(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[A-Za-z0-9_.-]+|\*)):(?P<port>\d{1,5})", text)
+    match = re.fullmatch(
+        r"(?:\[(?P<v6>[0-9A-Fa-f:.]+(?:%[\w.-]+)?)\]|(?P<host>[A-Za-z0-9_.-]+|\*)):(?P<port>\d{1,5})", text
+    )
     if match is None:
         raise ValueError(f"Expected `host:port`, `[ipv6]:port` or `*:port`, got `{text}`")
     port = int(match["port"])
     if not 1 <= port <= 65535:
         raise ValueError(f"Expected a port from 1 to 65535, got `{text}`")
-    if match["v6"] is not None and not is_address(match["v6"]):
+    if match["v6"] is not None and not is_address(match["v6"].partition("%")[0]):
         raise ValueError(f"Expected an IPv6 address in the brackets, got `{text}`")
     return match["v6"] or match["host"], port
 
@@ -134,3 +136,9 @@ def parse_network(text: str) -> Network:
 def subscription_port(receivers: Sequence[str]) -> int:
     """Port on which whoever subscribes gets pose datagrams; 0: none."""
     return next((port for host, port in map(parse_endpoint, receivers) if host == ANYBODY), 0)
+
+
+def interface_of(bind: str) -> str:
+    """The network that `bind` names, for datagrams to groups; empty: none of its own (all, loopback, IPv6)."""
+    address = ipaddress.ip_address(bind)
+    return bind if address.version == 4 and not address.is_unspecified and not address.is_loopback else ""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from daemon.access import Access
 from daemon.config import Config, ModbusConfig
 from daemon.cycle import Sink
+from daemon.endpoints import ANYBODY, interface_of, parse_endpoint, subscription_port
 from daemon.reasons import REASONS, Reason
 from estimator.records import Command
 from hal.clock import Clock
@@ -120,9 +121,15 @@ class Network:
             self.parts["modbus serial"] = RtuServer(settings.line, modbus.answer).run
 
     def _add_pose(self) -> None:
+        from daemon.publish.subscribe import Subscriptions
         from daemon.publish.udp import PoseSender
 
-        sender = PoseSender(self._settings.pose.receivers)
+        settings, subscriptions = self._settings, None
+        if port := subscription_port(settings.pose.receivers):
+            subscriptions = Subscriptions(settings.bind, port, self._access)
+            self.parts["pose subscriptions"] = lambda: _open(subscriptions.start, subscriptions.close)
+        fixed = [receiver for receiver in settings.pose.receivers if parse_endpoint(receiver)[0] != ANYBODY]
+        sender = PoseSender(fixed, interface_of(settings.bind), subscriptions)
         self.sinks.append(sender.publish)
         self.parts["pose"] = lambda: _open(sender.start, sender.close)
 

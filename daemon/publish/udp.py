@@ -1,4 +1,8 @@
-"""Pose datagrams to configured receivers. Nothing here waits: what the kernel does not take at once is dropped."""
+"""Pose datagrams to configured receivers, single ones and multicast groups, and to whoever has subscribed.
+
+Nothing here waits: what the kernel does not take at once is dropped. Datagrams to a group are sent once however many
+listen, and do not leave the local network (time to live 1, RFC 1112).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ from typing import Final
 
 from daemon.publish import registers
 from daemon.publish.snapshot import Snapshot
+from daemon.publish.subscribe import Subscriptions
 from hal import inet
 from hal.errors import DeviceMissing, DeviceRefused
 
@@ -58,13 +63,19 @@ class PoseSender:
 
     Args:
         receivers: `host:port` each.
+        interface: address of this computer from which groups are sent to; empty: as the system routes them.
+        subscriptions: who has asked for datagrams; None: nobody can.
 
     Raises:
         DeviceRefused: a receiver that is not of that form.
     """
 
-    def __init__(self, receivers: Sequence[str]) -> None:
+    def __init__(
+        self, receivers: Sequence[str], interface: str = "", subscriptions: Subscriptions | None = None
+    ) -> None:
         self.receivers = [parse_receiver(text) for text in receivers]
+        self._interface = interface
+        self._subscriptions = subscriptions
         self._sockets: dict[socket.AddressFamily, socket.socket] = {}
         self._lookups: list[asyncio.Task[None]] = []
 
@@ -78,11 +89,14 @@ class PoseSender:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Send to all; never waits, never raises for the network."""
-        if not self.receivers:
+        subscribed = self._subscriptions is not None and len(self._subscriptions.leases) > 0
+        if not self.receivers and not subscribed:
             return
         data = registers.encode_datagram(snapshot)
         for receiver in self.receivers:
             self._send(receiver, data)
+        if self._subscriptions is not None:
+            self._subscriptions.send(data)
 
     async def close(self) -> None:
         """Stop; idempotent."""
@@ -102,7 +116,7 @@ class PoseSender:
         sock = self._sockets.get(family)
         try:
             if sock is None:
-                sock = self._sockets[family] = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+                sock = self._sockets[family] = self._open(family)
             sock.sendto(data, where)
         except BlockingIOError:
             receiver.dropped += 1
@@ -114,6 +128,17 @@ class PoseSender:
             if not receiver.reachable:
                 receiver.reachable = True
                 log.info("pose receiver %s can be reached again", receiver.name)
+
+    def _open(self, family: socket.AddressFamily) -> socket.socket:
+        """A socket to send from; datagrams to groups leave by the interface that was named."""
+        sock = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        if self._interface and family == socket.AF_INET:
+            try:
+                sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._interface))
+            except OSError:
+                sock.close()
+                raise
+        return sock
 
     def _lost(self, receiver: Receiver, problem: str) -> None:
         if receiver.reachable:
