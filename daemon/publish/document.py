@@ -3,63 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from daemon.health import FAULTS
 from daemon.publish import holding, integrity, lights, modbus, pulse, registers, requests
-from daemon.publish.points import Layout, Point, Rule
+from daemon.publish.document_udp import udp_page
+from daemon.publish.holding import CommandCode
+from daemon.publish.rtu import SILENCE_S
 from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.publish.tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, table
 from daemon.reasons import REASONS
-from hal import input_codec, inputs
-
-_NOTICE: Final = (
-    "<!-- Written by `python -m daemon.publish.document`; edit the tables in daemon/publish, not this file. -->"
-)
-_NOT_KNOWN: Final = """A value that is not known reads as all ones (unsigned) or as the smallest number (signed), as
-SunSpec's "not implemented"; the column says where that can happen. Measurements saturate and never wrap. Counters wrap:
-take differences, modulo their width."""
-
-
-def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    """A Markdown table."""
-    lines = [head, tuple("---" for _ in head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _step(point: Point) -> str:
-    unit = f" {point.unit}" if point.unit else ""
-    return f"1/{point.per_unit}{unit}" if point.per_unit > 1 else point.unit
-
-
-def _not_known(point: Point) -> str:
-    width = point.wire.bits // 4
-    return f"0x{point.wire.not_known % (1 << point.wire.bits):0{width}X}" if point.can_be_unknown else ""
-
-
-def _describe(point: Point) -> str:
-    wraps = " Wraps." if point.rule is Rule.WRAP else ""
-    return f"{point.label[0].upper()}{point.label[1:]}. {point.text}{wraps}".strip()
-
-
-def _rows(layout: Layout, start: int, step: int) -> list[tuple[str, ...]]:
-    """Rows of a layout; `start` and `step` turn a word offset into a register address or a byte."""
-    return [
-        (str(start + step * offset), f"`{p.name}`", p.wire.name, _step(p), _not_known(p), _describe(p))
-        for offset, p in zip(layout.offsets, layout.points, strict=True)
-    ]
-
-
-def _holding_rows(layout: Layout, start: int) -> list[tuple[str, ...]]:
-    return [
-        (str(start + offset), f"`{p.name}`", p.wire.name, p.access, _step(p), _not_known(p), _describe(p))
-        for offset, p in zip(layout.offsets, layout.points, strict=True)
-    ]
-
-
-def _bit_rows(bits: tuple[registers.Bit, ...]) -> list[tuple[str, ...]]:
-    return [(str(number), f"`{name}`", text) for number, (name, text, _) in enumerate(bits)]
 
 
 def _state_rows() -> list[tuple[str, ...]]:
@@ -95,11 +50,11 @@ def _codes() -> str:
 
 ## Bits of `flags`
 
-{table(("bit", "name", "set when"), _bit_rows(registers.FLAGS))}
+{table(("bit", "name", "set when"), bit_rows(registers.FLAGS))}
 
 ## Bits of `devices`
 
-{table(("bit", "name", "set when"), _bit_rows(registers.DEVICES))}
+{table(("bit", "name", "set when"), bit_rows(registers.DEVICES))}
 """
 
 
@@ -109,7 +64,7 @@ def modbus_page() -> str:
     block = [
         ("0", "`magic`", "uint16", "", "", f"0x{registers.MODBUS_MAGIC:04X} (\"LL\")."),
         ("1", "`version`", "uint16", "", "", f"Version of this table: {registers.VERSION}."),
-        *_rows(registers.BODY, registers.BODY_ADDRESS, 1),
+        *layout_rows(registers.BODY, registers.BODY_ADDRESS, 1),
         (str(end), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
     ]  # fmt: skip
     first = registers.MIRROR_ADDRESS
@@ -122,22 +77,25 @@ def modbus_page() -> str:
         ),
         (str(last), "`seq_end`", "uint32", "", "The same as `seq`."),
     ]  # fmt: skip
-    return f"""{_NOTICE}
+    return f"""{NOTICE}
 # Modbus
 
 The daemon is a Modbus server on UDP and TCP, port 1502 unless `modbus.port` says otherwise, on the loopback address
-unless `bind` does. Read **{registers.BLOCK_WORDS} input registers from address 0 in one request** (function 4; function
-3 shows the same): the answer is one snapshot, whole, of the last cycle. It is not a safety function.
+unless `bind` does, and on a serial line (RTU) where `modbus.serial` names one. All three show the same tables. Read
+**{registers.BLOCK_WORDS} input registers from address 0 in one request** (function 4; function 3 shows the same): the
+answer is one snapshot, whole, of the last cycle. It is not a safety function.
 
 * Addresses are the protocol's, from 0. Tools that count from 1 call the first register 30001 (function 4) or 40001.
 * Big-endian: high byte first within a register, **high word first** in 32- and 64-bit values.
-* Any unit identifier is answered. Over UDP, one datagram is one request; repeat it when no answer comes.
+* On UDP and TCP any unit identifier is answered, on a serial line only ours. Over UDP, one datagram is one request;
+  repeat it when no answer comes.
 * A register map never changes under the same `version`. Check `magic` and `version` once.
 * In two requests you may see two snapshots: compare `seq` with `seq_end`.
-* Modbus has no password: keep the port on a network you trust.
+* Modbus has no password: keep the port on a network you trust. `allow` names the addresses and networks that are
+  answered; this computer always is.
 * Watch `heartbeat`: if it stands still, the daemon's cycle does. Use the pose only in a `state` your machine accepts.
 
-{_NOT_KNOWN}
+{NOT_KNOWN}
 
 ## The block: input registers 0 to {registers.BLOCK_WORDS - 1}
 
@@ -154,6 +112,15 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 {_integrity()}
 {_pulse()}
 {_writing()}
+## Serial line (RTU)
+
+`modbus.serial = "/dev/ttyUSB1@115200#1"`: the line, its rate, our unit. Without a rate it is 19200 bit/s; characters
+are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2). An answer goes
+out 3.5 characters after its request at the earliest; a request that pauses for more than {1e3 * SILENCE_S:g} ms is
+given up. What is sent to unit 0 is carried out and not answered. Adapters that echo are fine. Try it with
+`mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0` from the other end, and with
+`mbpoll -m tcp -p 1502 -t 3 -0 -r 0 -c 64 HOST` over the network.
+
 ## Limits
 
 {_limits()}
@@ -185,9 +152,9 @@ _FIXES: Final[dict[LightFix, str]] = {
 def _lights() -> str:
     first, width = lights.ADDRESS, lights.ROW_WORDS
     last = first + lights.BLOCK_WORDS - 1
-    head = [row for row in _rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if not row[1].startswith("`link_")]
+    head = [row for row in layout_rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if not row[1].startswith("`link_")]
     start = lights.BODY_ADDRESS + lights.BLOCK.offsets[len(head)]
-    rows = [row for row in _rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if row[1].startswith("`link_1_")]
+    rows = [row for row in layout_rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if row[1].startswith("`link_1_")]
     block = [
         (str(first), "`magic`", "uint16", "", "", f"0x{lights.MAGIC:04X} (\"LI\")."),
         (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {lights.VERSION}."),
@@ -226,7 +193,7 @@ def _integrity() -> str:
     block = [
         (str(first), "`magic`", "uint16", "", "", f"0x{integrity.MAGIC:04X} (\"LP\")."),
         (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {integrity.VERSION}."),
-        *_rows(integrity.BLOCK, integrity.BODY_ADDRESS, 1),
+        *layout_rows(integrity.BLOCK, integrity.BODY_ADDRESS, 1),
         (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
     ]  # fmt: skip
     return f"""## Integrity: input registers {first} to {last}
@@ -236,7 +203,7 @@ How far the pose can be trusted; what a protection level is, and at which risk i
 
 {table(("address", "name", "type", "step", "not known", "meaning"), block)}
 
-{table(("bit of `witnesses`", "name", "set when"), _bit_rows(integrity.WITNESSES))}
+{table(("bit of `witnesses`", "name", "set when"), bit_rows(integrity.WITNESSES))}
 
 {table(("`loop_reason`", "name", "meaning"), [(str(why.value), why.name, _LOOPS[why]) for why in LoopReason])}
 """
@@ -248,7 +215,7 @@ def _pulse() -> str:
     block = [
         (str(first), "`magic`", "uint16", "", "", f"0x{pulse.MAGIC:04X} (\"LC\")."),
         (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {pulse.VERSION}."),
-        *_rows(pulse.BLOCK, pulse.BODY_ADDRESS, 1),
+        *layout_rows(pulse.BLOCK, pulse.BODY_ADDRESS, 1),
         (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
     ]  # fmt: skip
     return f"""## The cycle: input registers {first} to {last}
@@ -265,26 +232,47 @@ def _capital(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
+_COMMANDS: Final[dict[CommandCode, str]] = {
+    CommandCode.SET_POSE: "The robot is at `x`, `y`, `yaw` in the map. Done when a pose is published.",
+    CommandCode.RESET: "Map and pose are forgotten, a new map is begun. The stored ones stay.",
+    CommandCode.SAVE_MAP: "The map is written to the disk. Done when it is there and has been read back.",
+    CommandCode.RELOCALISE: "The robot was carried off: it is looked for everywhere in the map.",
+    CommandCode.PAUSE: "The map is left alone and the laser does not move the pose, which light and odometry carry; "
+    "the state is DEGRADED. For a hall full of people, or a robot on a lift.",
+    CommandCode.RESUME: "The end of a pause.",
+    CommandCode.DUMP_RECORDER: "What the flight recorder holds is written to the disk. Done when it is there.",
+    CommandCode.SWITCH_MAP: "The map in use is saved, then the stored map `map_id` is loaded and the robot is looked "
+    "for in it. Done when the map is in use; refused where there is no such map, and then nothing changes.",
+}
+
+
+def _command_rows() -> list[tuple[str, ...]]:
+    return [(str(code.value), code.name, _COMMANDS[code]) for code in CommandCode]
+
+
 def _writing() -> str:
     head = ("address", "name", "type", "access", "step", "not known", "meaning")
     return f"""## Writing: holding registers
 
 Only with `modbus.write = true`; otherwise every write is answered with exception 1. Functions 6 and 16; function 3
-reads back. Anyone who can reach the port can write.
+reads back. Whoever is answered can write.
 
 ### Command block, {holding.COMMAND_ADDRESS} to {holding.COMMAND_ADDRESS + holding.COMMAND.words - 1}
 
 Write `command` and its parameters, and a new number into `request` (all in one request, or `request` last). The
 command is finished when `acknowledge` equals that number; `result` says how it ended. Writing a request again does
-nothing, so a repeated UDP datagram does no harm; a newer request replaces one that is still running.
+nothing, so a repeated UDP datagram does no harm; a newer request replaces one that is still running. A client for it
+is `tools/clients/send_command.py`.
 
-{table(head, _holding_rows(holding.COMMAND, holding.COMMAND_ADDRESS))}
+{table(("`command`", "name", "what happens"), _command_rows())}
+
+{table(head, holding_rows(holding.COMMAND, holding.COMMAND_ADDRESS))}
 
 ### Odometry input, {holding.ODOMETRY_ADDRESS} to {holding.ODOMETRY_ADDRESS + holding.ODOMETRY.words - 1}
 
 All {holding.ODOMETRY.words} registers in one request (function 16), at a steady rate of 10 per second or more.
 
-{table(head, _holding_rows(holding.ODOMETRY, holding.ODOMETRY_ADDRESS))}
+{table(head, holding_rows(holding.ODOMETRY, holding.ODOMETRY_ADDRESS))}
 """
 
 
@@ -302,76 +290,6 @@ def _limits() -> str:
         ("what is not Modbus", "", "UDP: ignored and counted; TCP: closed"),
     ]  # fmt: skip
     return table(("what", "limit", "beyond it"), rows)
-
-
-def udp_page() -> str:
-    """The text of `docs/udp.md`."""
-    crc = registers.DATAGRAM_SIZE - 4
-    rows = [
-        ("0", "`magic`", "4 bytes", "", "", f'"{registers.DATAGRAM_MAGIC.decode()}".'),
-        ("4", "`version`", "uint16", "", "", f"{registers.VERSION}."),
-        ("6", "`length`", "uint16", "", "", f"Bytes of the whole datagram, {registers.DATAGRAM_SIZE} or more; "
-         f"{registers.SMALLEST_DATAGRAM} from programs that knew no lights, which sent no more than `devices`; "
-         f"{registers.TRUST_OFFSET + 4} from those that sent no more than `light_age`."),
-        *_rows(registers.BODY, registers.BODY_OFFSET, 2),
-        *_rows(lights.TAIL, registers.TAIL_OFFSET, 2),
-        *_rows(integrity.TAIL, registers.TRUST_OFFSET, 2),
-        ("length - 4", "`crc`", "uint32", "", "", f"CRC-32 of all bytes before it (at {crc} in this version)."),
-    ]  # fmt: skip
-    return f"""{_NOTICE}
-# UDP
-
-## Pose datagrams
-
-After each cycle the daemon sends one datagram to every `pose.receivers` entry (`host:port`). Little-endian, every value
-naturally aligned, CRC-32 as in zlib and IEEE 802.3. Nothing is repeated: a lost datagram is followed by a newer one.
-Readers go by `length`: a later version of the program may append values under the same `version` number. A reference
-reader in C is `tools/clients/listen_pose.c`.
-
-{_NOT_KNOWN}
-
-{table(("byte", "name", "type", "step", "not known", "meaning"), rows)}
-
-States, reasons, faults, the numbers of `light_fix` and the bits of `flags`, `devices` and `witnesses` are those of
-[Modbus](modbus.md), where every single link can be read too.
-
-## Odometry and IMU datagrams
-
-With `odometry.port` set, the daemon takes wheel odometry and gyro readings as datagrams on that port. Little-endian,
-CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
-
-{table(("byte", "type", "meaning"), _input_rows())}
-
-* Odometry is cumulative, so a lost datagram loses nothing; one that was overtaken is dropped, and so is a repeated one.
-* A sender that restarts draws a new `session` (or is silent for {inputs.SESSION_TIMEOUT_S:g} s) and may begin again
-  at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored
-  and counted.
-* The time of a reading is the kernel's time of arrival. A sender on the same computer does better: it sets bit 0 of
-  `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {inputs.MAX_AGE_S:g} s old is not
-  believed.
-* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped and counted.
-"""
-
-
-def _input_rows() -> list[tuple[str, ...]]:
-    return [
-        ("0", "4 bytes", '`magic`: "LUOD" odometry, "LUIM" IMU.'),
-        ("4", "uint16", f"`version`: {input_codec.VERSION}."),
-        (
-            "6",
-            "uint16",
-            f"`length` of the whole datagram: {input_codec.ODOMETRY_SIZE} odometry, {input_codec.IMU_SIZE} IMU.",
-        ),
-        ("8", "uint32", "`session`: a random number drawn when the sender starts."),
-        ("12", "uint32", "`seq`: one more with every datagram of this kind, wraps."),
-        ("16", "uint32", "`flags`: bit 0: `time` is CLOCK_MONOTONIC of the daemon's own computer."),
-        ("20", "uint32", "0."),
-        ("24", "float64", "`time` of the reading in seconds, in the sender's clock."),
-        ("32", "float64", "Odometry: `x`, m. IMU: `yaw_rate`, rad/s, counter-clockwise."),
-        ("40", "float64", "Odometry: `y`, m."),
-        ("48", "float64", "Odometry: `yaw`, rad, counter-clockwise, wrapped or not."),
-        ("length - 4", "uint32", "`crc`."),
-    ]
 
 
 def pages() -> dict[str, str]:

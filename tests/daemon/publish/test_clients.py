@@ -6,21 +6,25 @@ import asyncio
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
 from daemon.publish import lights, registers
+from daemon.publish.holding import CommandCode, Outcome, Request
 from daemon.publish.snapshot import LightFix, LinkUse, Trust
+from daemon.publish.subscribe import Subscriptions
+from daemon.publish.udp import PoseSender
 from hal.clock import SystemClock
 from hal.imu import RawImu
 from hal.inputs import InputPort
 from hal.odometry import RawOdometry
-from tests.daemon.publish.network import publishing
+from tests.daemon.publish.network import publishing, until
 from tests.daemon.publish.test_lights import picture
 from tests.daemon.publish.test_registers import snapshot
-from tools.clients import read_lights, read_modbus, send_odometry
+from tools.clients import read_lights, read_modbus, send_command, send_odometry, subscribe_pose
 
 CLIENTS = Path(read_modbus.__file__).parent
 
@@ -125,6 +129,86 @@ def test_odometry_sender() -> None:
     assert [(o.x, o.y, o.yaw) for o in odometry] == [(float(n), -1.0, 0.5) for n in range(5)]
     assert all(o.t_rx - o.t_mono >= 0.009 for o in odometry), "the sender's time is used, not the arrival"
     assert [i.yaw_rate for i in imu] == [0.25] * 5
+
+
+def test_subscriber() -> None:
+    def read(port: int, ready: threading.Event) -> list[dict[str, float | int | str | None]]:
+        subscription = subscribe_pose.Subscription("127.0.0.1", port)
+        taken = []
+        for pose in subscription.poses():
+            taken.append(pose)
+            ready.set()
+            if len(taken) == 3:
+                break
+        subscription.close()
+        return taken
+
+    async def run() -> list[dict[str, float | int | str | None]]:
+        server = Subscriptions("127.0.0.1", 0, lambda _: True)
+        await server.start()
+        sender = PoseSender([], "", server)
+        reading = asyncio.create_task(asyncio.to_thread(read, server.port, threading.Event()))
+        number = 0
+        async with asyncio.timeout(10.0):
+            while not reading.done():
+                number += len(server.leases)
+                sender.publish(snapshot(seq=number, pose=None if number == 2 else (1.2345, -2.3456, 3.0)))
+                await asyncio.sleep(0.01)
+            await until(lambda: len(server.leases) == 0)
+        await server.close()
+        return reading.result()
+
+    first, second, third = asyncio.run(run())
+    assert first == {
+        "seq": first["seq"], "state": "TRACKING", "reason": 7, "fault": 9, "x": 1.2345, "y": -2.3456, "yaw": 3.0,
+    }  # fmt: skip
+    assert (second["seq"], second["x"], third["seq"]) == (2, None, 3)
+
+
+def test_subscriber_passes_over_what_is_no_pose() -> None:
+    good = registers.encode_datagram(snapshot())
+    for bad in (b"", good[:50], good[:-1] + bytes([good[-1] ^ 1]), b"LUSB" + good[4:], good + b"\x00"):
+        assert subscribe_pose.decode(bad) is None
+
+
+@pytest.mark.parametrize("name", send_command.COMMANDS)
+def test_commander(name: str) -> None:
+    asked: list[Request] = []
+
+    def give(port: int) -> str:
+        commander = send_command.Commander("127.0.0.1", port)
+        try:
+            return commander.wait(commander.order(name, (1.25, -2.5, 0.5), 0x1A2B3C4D), 5.0)
+        finally:
+            commander.close()
+
+    async def run() -> str:
+        async with publishing(write=True, on_command=asked.append) as publisher:
+            giving = asyncio.create_task(asyncio.to_thread(give, publisher.port))
+            await until(lambda: bool(asked))
+            publisher.acknowledge(asked[0].number, Outcome.REFUSED)
+            return await giving
+
+    assert asyncio.run(run()) == "refused"
+    (request,) = asked
+    assert (request.code.name, request.pose) == (name.upper(), (1.25, -2.5, 0.5))
+    assert request.map_id == (0x1A2B3C4D if name == "switch_map" else 0)
+
+
+def test_commander_where_writing_is_not_allowed() -> None:
+    async def run() -> None:
+        async with publishing() as publisher:
+            commander = send_command.Commander("127.0.0.1", publisher.port)
+            with pytest.raises(ValueError, match=r"modbus\.write"):
+                await asyncio.to_thread(commander.order, "reset")
+            commander.close()
+
+    asyncio.run(run())
+
+
+def test_the_commander_knows_every_name_of_the_document() -> None:
+    assert [code.name.lower() for code in CommandCode] == list(send_command.COMMANDS)
+    assert [outcome.name.lower() for outcome in Outcome] == list(send_command.RESULTS)
 
 
 def test_listener_in_c(tmp_path: Path) -> None:

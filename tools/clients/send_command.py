@@ -1,0 +1,85 @@
+"""Give an order over Modbus UDP and wait for its end, with nothing but the standard library.
+
+    python send_command.py save_map [HOST [PORT]]
+    python send_command.py set_pose X Y YAW [HOST [PORT]]         m, m, rad
+    python send_command.py switch_map 1a2b3c4d [HOST [PORT]]      as `lumiloop map info` names it
+
+Needs `modbus.write = true`. Written from docs/modbus.md alone: it shares no code with the daemon.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import sys
+import time
+
+COMMANDS = ("set_pose", "reset", "save_map", "relocalise", "pause", "resume", "dump_recorder", "switch_map")
+RESULTS = ("none", "running", "done", "refused", "unknown")
+COMMAND, ANSWER, MAP_ID = 1000, 1008, 1010
+
+
+class Commander:
+    """Writes the command block and reads its answer."""
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 1502) -> None:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._sock = socket.socket(family, kind)
+        self._sock.settimeout(0.5)
+        self._sock.connect(address)
+        self._transaction = 0
+
+    def order(self, name: str, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), map_id: int = 0) -> int:
+        """Give an order; returns its number."""
+        (before,) = struct.unpack(">H", self._ask(struct.pack(">BHH", 3, COMMAND, 1))[2:])
+        number = before % 0xFFFF + 1
+        if name == "switch_map":
+            self._ask(struct.pack(">BHHBI", 16, MAP_ID, 2, 4, map_id))
+        x, y, yaw = round(pose[0] * 1e4), round(pose[1] * 1e4), round(pose[2] * 1e6)
+        body = struct.pack(">HHiii", number, 1 + COMMANDS.index(name), x, y, yaw)
+        self._ask(struct.pack(">BHHB", 16, COMMAND, 8, 16) + body)
+        return number
+
+    def wait(self, number: int, seconds: float = 30.0) -> str:
+        """How an order ended; "running" where it has not by then."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            acknowledged, result = struct.unpack(">HH", self._ask(struct.pack(">BHH", 3, ANSWER, 2))[2:])
+            if acknowledged == number and result != 1:
+                return RESULTS[result] if result < len(RESULTS) else str(result)
+            time.sleep(0.05)
+        return "running"
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()
+
+    def _ask(self, body: bytes) -> bytes:
+        """An answer's body. A write is repeated when its answer is lost: the same number does nothing twice."""
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        frame = struct.pack(">HHHB", self._transaction, 0, len(body) + 1, 1) + body
+        for _ in range(5):
+            self._sock.send(frame)
+            try:
+                while True:
+                    answer = self._sock.recv(512)
+                    if answer[:2] == frame[:2]:
+                        if answer[7] & 0x80:
+                            raise ValueError(f"Modbus exception {answer[8]} (1: set modbus.write = true)")
+                        return answer[7:]
+            except TimeoutError:
+                continue
+        raise TimeoutError("no answer")
+
+
+if __name__ == "__main__":
+    words = sys.argv[1:]
+    if not words or words[0] not in COMMANDS:
+        sys.exit(__doc__)
+    count = {"set_pose": 3, "switch_map": 1}.get(words[0], 0)
+    given, where = words[1 : 1 + count], words[1 + count :]
+    commander = Commander(where[0] if where else "127.0.0.1", int(where[1]) if len(where) > 1 else 1502)
+    place = (float(given[0]), float(given[1]), float(given[2])) if count == 3 else (0.0, 0.0, 0.0)
+    result = commander.wait(commander.order(words[0], place, int(given[0], 16) if count == 1 else 0))
+    print(result)
+    sys.exit(result != "done")
