@@ -65,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
     _status(commands.add_parser("status", help="show what a running daemon publishes"))
+    _explain(commands.add_parser("explain", help="what a key, a state, a fault, a reason or a register means"))
     _map(commands.add_parser("map", help="work with maps"))
     _calibrate(commands.add_parser("calibrate", help="lamps, receiver, wheels and mount, from a recorded drive"))
     _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
@@ -125,6 +126,11 @@ def _status(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
     _config_arguments(parser)
     parser.set_defaults(body=_later("daemon.publish.client", "main"))
+
+
+def _explain(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("words", nargs="+", metavar="WORD", help="as in: alert_m; DEGRADED; fault 302; map_yaw; 1008")
+    parser.set_defaults(body=_loaded("daemon.explain", "main"))
 
 
 def _map(parser: argparse.ArgumentParser) -> None:

@@ -162,7 +162,7 @@ def reference() -> str:
         if parent != table:
             table = parent
             lines += ["", f"[{parent}]"]
-        lines += [f"# {option.description} ({option.kind})", f"{key} = {_value(option.default)}"]
+        lines += [f"# {option.description} ({option.kind})", f"{key} = {value_text(option.default)}"]
     return REFERENCE_HEAD + "```toml\n" + "\n".join(lines) + "\n```\n"
 
 
@@ -293,18 +293,19 @@ def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
     if prefix:
         lines += ["", f"[{prefix}]"]
-    lines += [f"{key} = {_value(value)}" for key, value in plain.items()]
+    lines += [f"{key} = {value_text(value)}" for key, value in plain.items()]
     for key, value in table.items():
         if key not in plain:
             _dump_table(value, f"{prefix}.{key}".lstrip("."), lines)
 
 
-def _value(value: object) -> str:
+def value_text(value: object) -> str:
+    """A value of the tree as TOML writes it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (int, float)):
         return repr(value)
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
+        return "[" + ", ".join(value_text(item) for item in value) + "]"
     # a JSON string is a TOML basic string, except that TOML wants DEL escaped too
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007F")

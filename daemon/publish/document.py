@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from daemon.health import FAULTS
 from daemon.publish import holding, integrity, lights, modbus, pulse, registers, requests
 from daemon.publish.document_udp import udp_page
 from daemon.publish.holding import CommandCode
+from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.rtu import SILENCE_S
 from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
 from daemon.publish.tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, table
@@ -18,17 +19,7 @@ from daemon.reasons import REASONS
 
 
 def _state_rows() -> list[tuple[str, ...]]:
-    meaning: dict[State, str] = {
-        State.STARTING: "warming up, nothing to say yet",
-        State.NO_LIDAR: "no valid scan for three scan periods",
-        State.MAPPING: "the pose follows the laser, but no witness has proved it yet",
-        State.TRACKING: "two witnesses agree, or one has proved itself",
-        State.DEGRADED: "the pose is held, at least one axis or witness is missing",
-        State.AMBIGUOUS: "several places fit",
-        State.LOST: "no pose worth using",
-        State.RELOCATING: "looking for the place",
-    }
-    return [(str(state.value), state.name, meaning[state]) for state in State]
+    return [(str(state.value), state.name, STATES[state]) for state in State]
 
 
 def _meaning_rows(meanings: Mapping[Any, tuple[str, str]]) -> list[tuple[str, ...]]:
@@ -127,28 +118,6 @@ given up. What is sent to unit 0 is carried out and not answered. Adapters that 
 """
 
 
-_USES: Final[dict[LinkUse, str]] = {
-    LinkUse.OTHER: "something that this version does not know",
-    LinkUse.ACCEPTED: "used",
-    LinkUse.OCCLUDED: "weaker than it can be here: something stands in its way",
-    LinkUse.REJECTED: "stronger than it can be here, or from the wrong place: moved, or exchanged",
-    LinkUse.RIM: "at the edge of the receiver's field of view",
-    LinkUse.FAINT: "not above the noise",
-    LinkUse.TWIN: "two lamps of this code are in view",
-    LinkUse.UNSURVEYED: "no lamp of this code is known",
-    LinkUse.MISSING: "not received, though it must be here: dead, or covered",
-    LinkUse.PAUSED: "clear, but not among those that are used",
-}
-_FIXES: Final[dict[LightFix, str]] = {
-    LightFix.NONE: "no lamps in view, or too few",
-    LightFix.STARTING: "position known, heading and strengths still being found",
-    LightFix.GOOD: "position and heading known",
-    LightFix.HELD: "carried on by odometry alone, every link is paused",
-    LightFix.AMBIGUOUS: "several places fit",
-    LightFix.LOST: "what is received contradicts the position: starting anew",
-}
-
-
 def _lights() -> str:
     first, width = lights.ADDRESS, lights.ROW_WORDS
     last = first + lights.BLOCK_WORDS - 1
@@ -171,20 +140,10 @@ begins at {start} + {width} (k - 1), and the table shows the first.
 
 {table(("address", "name", "type", "step", "not known", "meaning"), block)}
 
-{table(("`light_fix`", "name", "meaning"), [(str(fix.value), fix.name, _FIXES[fix]) for fix in LightFix])}
+{table(("`light_fix`", "name", "meaning"), [(str(fix.value), fix.name, FIXES[fix]) for fix in LightFix])}
 
-{table(("`link_..._use`", "name", "meaning"), [(str(use.value), use.name, _USES[use]) for use in LinkUse])}
+{table(("`link_..._use`", "name", "meaning"), [(str(use.value), use.name, USES[use]) for use in LinkUse])}
 """
-
-
-_LOOPS: Final[dict[LoopReason, str]] = {
-    LoopReason.OTHER: "something that this version does not know",
-    LoopReason.NEAR: "laser: the scan fits the map where it was expected",
-    LoopReason.SEARCHED: "laser: the scan fits the map in one place of all that were possible",
-    LoopReason.SUPPORTED: "laser, twice: two keyframes from different places agree on it",
-    LoopReason.LIT: "light and laser: the same lamps are seen from the same place, and the scan fits the map there",
-    LoopReason.PLACED: "found in the whole map: the one place that fits all that was seen since the place was lost",
-}
 
 
 def _integrity() -> str:
@@ -205,7 +164,7 @@ How far the pose can be trusted; what a protection level is, and at which risk i
 
 {table(("bit of `witnesses`", "name", "set when"), bit_rows(integrity.WITNESSES))}
 
-{table(("`loop_reason`", "name", "meaning"), [(str(why.value), why.name, _LOOPS[why]) for why in LoopReason])}
+{table(("`loop_reason`", "name", "meaning"), [(str(why.value), why.name, LOOPS[why]) for why in LoopReason])}
 """
 
 
@@ -232,22 +191,8 @@ def _capital(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-_COMMANDS: Final[dict[CommandCode, str]] = {
-    CommandCode.SET_POSE: "The robot is at `x`, `y`, `yaw` in the map. Done when a pose is published.",
-    CommandCode.RESET: "Map and pose are forgotten, a new map is begun. The stored ones stay.",
-    CommandCode.SAVE_MAP: "The map is written to the disk. Done when it is there and has been read back.",
-    CommandCode.RELOCALISE: "The robot was carried off: it is looked for everywhere in the map.",
-    CommandCode.PAUSE: "The map is left alone and the laser does not move the pose, which light and odometry carry; "
-    "the state is DEGRADED. For a hall full of people, or a robot on a lift.",
-    CommandCode.RESUME: "The end of a pause.",
-    CommandCode.DUMP_RECORDER: "What the flight recorder holds is written to the disk. Done when it is there.",
-    CommandCode.SWITCH_MAP: "The map in use is saved, then the stored map `map_id` is loaded and the robot is looked "
-    "for in it. Done when the map is in use; refused where there is no such map, and then nothing changes.",
-}
-
-
 def _command_rows() -> list[tuple[str, ...]]:
-    return [(str(code.value), code.name, _COMMANDS[code]) for code in CommandCode]
+    return [(str(code.value), code.name, COMMANDS[code]) for code in CommandCode]
 
 
 def _writing() -> str:

@@ -1,0 +1,132 @@
+"""``lumiloop explain WORD``: what a key, a state, a number in the log or a register means, and what to do about it.
+
+Everything comes from the tables that the daemon itself works by, so that an explanation cannot lag behind it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final
+
+from daemon import configfile
+from daemon.cli import FAILED, OK, fail
+from daemon.health import FAULTS
+from daemon.publish import holding, integrity, lights, pulse, registers
+from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
+from daemon.publish.points import Layout
+from daemon.reasons import REASONS
+
+_BLOCKS: Final = (
+    ("input register", registers.BODY_ADDRESS, registers.BODY),
+    ("input register", lights.BODY_ADDRESS, lights.BLOCK),
+    ("input register", integrity.BODY_ADDRESS, integrity.BLOCK),
+    ("input register", pulse.BODY_ADDRESS, pulse.BLOCK),
+    ("holding register", holding.COMMAND_ADDRESS, holding.COMMAND),
+    ("holding register", holding.ODOMETRY_ADDRESS, holding.ODOMETRY),
+)
+_BITS: Final = (
+    ("bit of `flags`", registers.FLAGS),
+    ("bit of `devices`", registers.DEVICES),
+    ("bit of `witnesses`", integrity.WITNESSES),
+)
+_MOST: Final = 12
+"""Explanations shown for one word; a whole table of keys has fewer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Something that can be asked about.
+
+    Attributes:
+        kind: fault, reason, configuration key... name: how it is written. numbers: that stand for it.
+        text: what it is. remedy: what to do, empty where there is nothing to be done.
+    """
+
+    kind: str
+    name: str
+    numbers: range
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        number = f" {self.numbers[0]}" if self.numbers else ""
+        remedy = f"\n  what to do: {self.remedy}" if self.remedy else ""
+        return f"{self.kind}{number}: {self.name}\n  {self.text}{remedy}"
+
+
+def main(args: argparse.Namespace) -> int:
+    """Body of the command; ``args.words`` is what was asked: one word, or a kind and a word as in `fault 302`."""
+    asked = " ".join(args.words).strip().strip("`")
+    everything = list(entries())
+    found = find(asked, everything)
+    if not found:
+        near = difflib.get_close_matches(asked.lower(), {entry.name.lower() for entry in everything}, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else "ask for a key, a state, a fault, a reason, a register"
+        return fail(f"{asked}: nothing of that name or number; {hint}", FAILED)
+    sys.stdout.write("\n\n".join(str(entry) for entry in found[:_MOST]) + "\n")
+    if len(found) > _MOST:
+        sys.stdout.write(f"\nand {len(found) - _MOST} more; ask more exactly\n")
+    return OK
+
+
+def entries() -> Iterator[Entry]:
+    """All that can be asked about."""
+    for option in configfile.options():
+        default = configfile.value_text(option.default)
+        yield Entry(
+            "configuration key", option.path, range(0), f"{option.description} ({option.kind}; default {default})"
+        )
+    for path, remedy in configfile.MOVED.items():
+        yield Entry("configuration key of earlier versions", path, range(0), "there is no such key any more", remedy)
+    yield from _meanings("reason", REASONS)
+    yield from _meanings("fault", FAULTS)
+    yield from _names("state", STATES)
+    yield from _names("light fix", FIXES)
+    yield from _names("link use", USES)
+    yield from _names("loop reason", LOOPS)
+    yield from _names("command", COMMANDS)
+    yield from _registers()
+
+
+def _meanings(kind: str, table: Mapping[Any, tuple[str, str]]) -> Iterator[Entry]:
+    for code, (text, remedy) in table.items():
+        yield Entry(kind, code.name, _one(code), text, remedy)
+
+
+def _names(kind: str, table: Mapping[Any, str]) -> Iterator[Entry]:
+    for code, text in table.items():
+        yield Entry(kind, code.name, _one(code), text)
+
+
+def _registers() -> Iterator[Entry]:
+    for kind, start, layout in _BLOCKS:
+        yield from _points(kind, start, layout)
+    for kind, bits in _BITS:
+        for number, (name, text, _) in enumerate(bits):
+            yield Entry(kind, name, range(number, number + 1), f"set when {text}")
+
+
+def _points(kind: str, start: int, layout: Layout) -> Iterator[Entry]:
+    for offset, point in zip(layout.offsets, layout.points, strict=True):
+        step = f", steps of 1/{point.per_unit} {point.unit}" if point.per_unit > 1 else ""
+        text = f"{point.label}. {point.text}".strip().rstrip(".") + f" ({point.wire.name}{step})"
+        yield Entry(kind, point.name, range(start + offset, start + offset + point.wire.words), text)
+
+
+def _one(code: IntEnum) -> range:
+    return range(code.value, code.value + 1)
+
+
+def find(asked: str, everything: Sequence[Entry]) -> list[Entry]:
+    """Entries of that number or name, of one kind where the first words name it; a table's name gives its keys."""
+    kind, _, last = asked.lower().rpartition(" ")
+    of_kind = [entry for entry in everything if kind in entry.kind]
+    if last.isascii() and last.isdigit():
+        return [entry for entry in of_kind if int(last) in entry.numbers]
+    exact = [entry for entry in of_kind if entry.name.lower() == last]
+    return exact or [entry for entry in of_kind if f".{last}." in f".{entry.name.lower()}."]

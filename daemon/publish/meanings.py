@@ -1,0 +1,59 @@
+"""What the published numbers mean, in words, beside those that have a table of their own (faults, reasons, points)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from daemon.publish.holding import CommandCode
+from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
+
+STATES: Final[dict[State, str]] = {
+    State.STARTING: "warming up, nothing to say yet",
+    State.NO_LIDAR: "no valid scan for three scan periods",
+    State.MAPPING: "the pose follows the laser, but no witness has proved it yet",
+    State.TRACKING: "two witnesses agree, or one has proved itself",
+    State.DEGRADED: "the pose is held, at least one axis or witness is missing",
+    State.AMBIGUOUS: "several places fit",
+    State.LOST: "no pose worth using",
+    State.RELOCATING: "looking for the place",
+}
+USES: Final[dict[LinkUse, str]] = {
+    LinkUse.OTHER: "something that this version does not know",
+    LinkUse.ACCEPTED: "used",
+    LinkUse.OCCLUDED: "weaker than it can be here: something stands in its way",
+    LinkUse.REJECTED: "stronger than it can be here, or from the wrong place: moved, or exchanged",
+    LinkUse.RIM: "at the edge of the receiver's field of view",
+    LinkUse.FAINT: "not above the noise",
+    LinkUse.TWIN: "two lamps of this code are in view",
+    LinkUse.UNSURVEYED: "no lamp of this code is known",
+    LinkUse.MISSING: "not received, though it must be here: dead, or covered",
+    LinkUse.PAUSED: "clear, but not among those that are used",
+}
+FIXES: Final[dict[LightFix, str]] = {
+    LightFix.NONE: "no lamps in view, or too few",
+    LightFix.STARTING: "position known, heading and strengths still being found",
+    LightFix.GOOD: "position and heading known",
+    LightFix.HELD: "carried on by odometry alone, every link is paused",
+    LightFix.AMBIGUOUS: "several places fit",
+    LightFix.LOST: "what is received contradicts the position: starting anew",
+}
+LOOPS: Final[dict[LoopReason, str]] = {
+    LoopReason.OTHER: "something that this version does not know",
+    LoopReason.NEAR: "laser: the scan fits the map where it was expected",
+    LoopReason.SEARCHED: "laser: the scan fits the map in one place of all that were possible",
+    LoopReason.SUPPORTED: "laser, twice: two keyframes from different places agree on it",
+    LoopReason.LIT: "light and laser: the same lamps are seen from the same place, and the scan fits the map there",
+    LoopReason.PLACED: "found in the whole map: the one place that fits all that was seen since the place was lost",
+}
+COMMANDS: Final[dict[CommandCode, str]] = {
+    CommandCode.SET_POSE: "The robot is at `x`, `y`, `yaw` in the map. Done when a pose is published.",
+    CommandCode.RESET: "Map and pose are forgotten, a new map is begun. The stored ones stay.",
+    CommandCode.SAVE_MAP: "The map is written to the disk. Done when it is there and has been read back.",
+    CommandCode.RELOCALISE: "The robot was carried off: it is looked for everywhere in the map.",
+    CommandCode.PAUSE: "The map is left alone and the laser does not move the pose, which light and odometry carry; "
+    "the state is DEGRADED. For a hall full of people, or a robot on a lift.",
+    CommandCode.RESUME: "The end of a pause.",
+    CommandCode.DUMP_RECORDER: "What the flight recorder holds is written to the disk. Done when it is there.",
+    CommandCode.SWITCH_MAP: "The map in use is saved, then the stored map `map_id` is loaded and the robot is looked "
+    "for in it. Done when the map is in use; refused where there is no such map, and then nothing changes.",
+}

@@ -1,0 +1,84 @@
+"""`lumiloop explain`: everything that has a name or a number can be asked about, and is found."""
+
+from __future__ import annotations
+
+import pytest
+
+from daemon.cli import FAILED, OK, main
+from daemon.configfile import options
+from daemon.explain import entries, find
+from daemon.health import FAULTS
+from daemon.publish import holding
+from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
+from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.reasons import REASONS
+
+
+def _told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert main(["explain", *words]) == OK
+    return capsys.readouterr().out
+
+
+def test_a_key_by_its_path_and_by_its_last_part(capsys: pytest.CaptureFixture[str]) -> None:
+    by_path = _told(capsys, "integrity.alert_m")
+    assert "configuration key: integrity.alert_m" in by_path
+    assert "default 0.0" in by_path
+    assert _told(capsys, "alert_m") == by_path
+    assert _told(capsys, "`alert_m`") == by_path
+
+
+def test_a_table_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, "photodiode")
+    assert all(option.path in told for option in options() if option.path.startswith("photodiode."))
+
+
+def test_a_key_of_an_earlier_version_says_what_to_write(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "/dev/ttyUSB0@115200" in _told(capsys, "lidar.baud")
+
+
+def test_faults_and_reasons_by_number(capsys: pytest.CaptureFixture[str]) -> None:
+    text, remedy = FAULTS[next(code for code in FAULTS if code == 302)]
+    told = _told(capsys, "fault", "302")
+    assert text in told
+    assert remedy in told
+    assert told.count("\n\n") == 0
+    assert REASONS[next(code for code in REASONS if code == 6)][0] in _told(capsys, "reason 6")
+
+
+def test_a_bare_number_gives_all_that_it_stands_for(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, "202")
+    assert "fault 202" in told
+    assert "input register" in told
+
+
+def test_a_register_in_the_middle_of_a_value_is_that_value(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "map_x" in _told(capsys, "register", "19")
+    assert "acknowledge" in _told(capsys, "holding register", str(holding.COMMAND_ADDRESS + 8))
+
+
+def test_names_in_any_case(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "two witnesses agree" in _told(capsys, "tracking")
+    assert "weaker than it can be here" in _told(capsys, "OCCLUDED")
+
+
+def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "sigma_jaw"]) == FAILED
+    assert "sigma_yaw" in capsys.readouterr().err
+    assert main(["explain", "99999"]) == FAILED
+    assert "ask for" in capsys.readouterr().err
+
+
+def test_every_published_number_has_its_words() -> None:
+    assert set(STATES) == set(State)
+    assert set(FIXES) == set(LightFix)
+    assert set(USES) == set(LinkUse)
+    assert set(LOOPS) == set(LoopReason)
+    assert set(COMMANDS) == set(holding.CommandCode)
+
+
+def test_every_entry_can_be_asked_for() -> None:
+    everything = list(entries())
+    for entry in everything:
+        assert entry in find(f"{entry.kind} {entry.name}", everything)
+        for number in entry.numbers:
+            assert entry in find(f"{entry.kind} {number}", everything)
