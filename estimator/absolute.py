@@ -178,7 +178,7 @@ def on_lights(state: State, lights: LightsResult) -> None:
 def on_order(state: State, command: Command) -> None:
     """What a person orders holds for light too: it looks about the given pose, or begins anew."""
     tie, T_map_base = state.absolute, command.T_map_base
-    if tie is None or state.light is None:
+    if tie is None or state.light is None or command.order is Order.REMEMBERED:
         return
     if command.order is Order.RESET:
         state.light.reset()

@@ -257,9 +257,9 @@ def decide(state: State) -> None:
     one = state.atlas.seek.favourite()
     if one is None:
         return
-    witnessed = said(state, one) is True
-    if state.atlas.seek.sure(one, witnessed):
-        land(state, one, not witnessed)
+    told, seek = said(state, one), state.atlas.seek
+    if seek.sure(one, told is True) or (told is not False and seek.recalled(one)):
+        land(state, one, told is not True)
 
 
 def said(state: State, one: Hypothesis) -> bool | None:

@@ -18,10 +18,14 @@ def obey(state: State, command: Command) -> None:
     in it is not known, only what is adrift moves. A map that was restored stays as it is, and the robot is looked for
     in it about that pose. A pose that is no number is ignored; RESET without a pose begins at the origin. RELOCALISE
     looks for the robot everywhere in the map, and begins a new local map, because the old one may be that of another
-    place. ``T_odom_base`` stays as it is.
+    place. REMEMBERED tells a robot that has been switched on in a stored map where it was last: it is believed there
+    without driving if it fits nowhere else. ``T_odom_base`` stays as it is.
     """
     T_map_base = command.T_map_base
     if T_map_base is not None and not np.isfinite(T_map_base).all():
+        return
+    if command.order is Order.REMEMBERED:
+        remember(state, T_map_base)
         return
     if command.order is Order.RELOCALISE:
         if adrift.begin(state):
@@ -37,6 +41,15 @@ def obey(state: State, command: Command) -> None:
         if state.atlas.adrift is not None:
             adrift.hinted(state)
             look_at_once(state)
+
+
+def remember(state: State, T_map_base: Array | None) -> None:
+    """Guess that the robot stands where it stood; of no use where its place is known, or was looked for anew since."""
+    atlas = state.atlas
+    if T_map_base is None or atlas.adrift is None or not atlas.kept or atlas.seek.hint is not None:
+        return
+    place(state, T_map_base)
+    atlas.seek.remembered = state.T_map_odom
 
 
 def look_at_once(state: State) -> None:

@@ -40,6 +40,9 @@ BEHIND: Final = 0.15
 NEARLY, NEARLY_M, NEARLY_RAD = 0.75, 0.1, 0.03
 """Share of the beams, and deviations, of a place that another witness may confirm though no look has held it."""
 
+MOVED_M, MOVED_RAD = 1.0, 0.5
+"""A robot that is farther from where it was remembered has been moved: more than it rolls on once it is not steered."""
+
 AGAIN_M, AGAIN_RAD = 1.0, 1.0
 """Way or turn after which it is searched again."""
 
@@ -88,6 +91,7 @@ class Seek:
         job: ID of the look under way. looks: so far. hint: T_map_odom by a person who has said where the robot is, and
             how many looks have not found it there. lit: keyframe and number of light's windows of the latest look.
         t_begin: instant of the first keyframe. way_begin: way driven when light was first good.
+        remembered: T_map_odom if the robot has not been moved since the run before; None: nobody knows.
     """
 
     alive: tuple[Hypothesis, ...] = ()
@@ -101,6 +105,7 @@ class Seek:
     lit: tuple[int, int] = (0, 0)
     t_begin: float = math.inf
     way_begin: float = math.inf
+    remembered: Array | None = None
 
     def due(self, frame: Keyframe) -> bool:
         """Whether a keyframe is to be searched for, and not only looked at where it should be."""
@@ -146,6 +151,17 @@ class Seek:
         if not self.complete or one.idle:
             return False
         return witnessed or (len(self.alive) == 1 and len(one.held) >= HELD and one.apart() >= HELD_M)
+
+    def recalled(self, one: Hypothesis) -> bool:
+        """Whether a place is the robot's because it stood there last, and fits nowhere else in the whole map.
+
+        Neither is enough by itself: a robot that was carried off may stand where it looks alike, and of two places
+        that fit the remembered one may be the wrong one.
+        """
+        if self.remembered is None or not self.complete or one.idle or len(self.alive) != 1 or self.alive[0] is not one:
+            return False
+        x, y, yaw = se2.between(self.remembered, one.T_map_odom).tolist()
+        return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
 
 
 def nearly(one: Hypothesis) -> Hypothesis | None:

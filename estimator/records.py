@@ -80,6 +80,7 @@ class Order(Enum):
     RELOCALISE = "relocalise"
     PAUSE = "pause"  # obeyed by the cycle: it asks for no more than :attr:`Rung.CARRIED`, and applies no answer
     RESUME = "resume"
+    REMEMBERED = "remembered"  # by nobody: the pose that was stored when the run before ended; a witness, no order
 
 
 @dataclass(frozen=True, slots=True, eq=False)
