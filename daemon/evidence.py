@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,9 @@ from daemon.reasons import Reason as Cause
 from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
 from daemon.witness import Witnesses
 from estimator import result as light
-from estimator.records import Array, Command, LightEpoch, Odometry, Record, SampleBlock
+from estimator import se2
+from estimator.hypotheses import MOVED_M, MOVED_RAD
+from estimator.records import Array, Command, LightEpoch, Odometry, Order, Record, SampleBlock
 from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
 
@@ -58,6 +61,7 @@ class Observer:
         self._guessed = [False] * 3
         self._anew = 0
         self._begun = False
+        self._remembered: Array | None = None
 
     def odometry_ok(self, t_mono: float) -> bool | None:
         """Whether odometry is arriving; None where none is configured."""
@@ -86,7 +90,7 @@ class Observer:
                 self.witnesses.on_odometry(record)
             elif isinstance(record, SampleBlock | LightEpoch):
                 self._t_samples = t_mono
-        ordered = any(isinstance(record, Command) for record in records)
+        ordered = self._take_orders(records)
         match = self._match(result)
         if match is not None and result is not None:
             match = self._without_guesses(match, result, t_mono, ordered)
@@ -113,7 +117,25 @@ class Observer:
             lidar=self._lidar,
             light=self._light(t_mono, result) if self._lights else None,
             unused=self.unused,
+            recalled=self._recalled(result),
         )
+
+    def _take_orders(self, records: tuple[Record, ...]) -> bool:
+        """Whether a person has ordered something; where the robot was last is remembered until it is found."""
+        commands = [record for record in records if isinstance(record, Command)]
+        for command in commands:
+            self._remembered = command.T_map_base if command.order is Order.REMEMBERED else None
+        return any(command.order is not Order.REMEMBERED for command in commands)
+
+    def _recalled(self, result: StepResult | None) -> bool:
+        """Whether the robot has just been found in the whole map, and where the run before has left it."""
+        remembered = self._remembered
+        if result is None or result.loop is None or result.loop.reason is not LoopReason.PLACED or remembered is None:
+            return False
+        self._remembered = None
+        T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
+        x, y, yaw = se2.between(remembered, T_map_base).tolist()
+        return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
 
     def _light(self, t_mono: float, result: StepResult | None) -> Light:
         """What light says in this cycle; a cycle without a step repeats nothing but the silence."""
@@ -143,7 +165,8 @@ class Observer:
         self._mapped = found.reason is not Reason.NO_MAP
         if not self._mapped:
             return None
-        match = Match(good(found), _axes(result.known_axes))
+        off_m, off_rad = math.hypot(*found.correction[:2].tolist()), abs(float(found.correction[2]))
+        match = Match(good(found), _axes(result.known_axes), off_m, off_rad)
         laser = found.known_axes if result.placed else result.known_axes  # what light has shown is no echo of the laser
         self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
         return match
@@ -171,7 +194,7 @@ class Observer:
             elif result.keyframe >= 0 and t_mono - self._t_shown[axis] > GUESS_S:
                 self._guessed[axis] = True
         x, y, yaw = (known and not guess for known, guess in zip(match.known, self._guessed, strict=True))
-        return Match(match.good, (x, y, yaw))
+        return replace(match, known=(x, y, yaw))
 
     def _sigma(
         self, match: Match | None, result: StepResult | None, ordered: bool, odometry: bool | None

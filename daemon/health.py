@@ -53,6 +53,7 @@ class Fault(IntEnum):
     RECORDER_FAILED = 402
     MAP_NOT_SAVED = 403
     MAP_REFUSED = 404
+    POSE_NOT_KEPT = 405
 
 
 FAULTS: Final[dict[Fault, tuple[str, str]]] = {
@@ -153,6 +154,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.MAP_REFUSED: (
         "a stored map cannot be used",
         "the log names the file, why, and what to do; without one a new map is begun",
+    ),
+    Fault.POSE_NOT_KEPT: (
+        "the pose cannot be kept for the next start",
+        "read the log; free disk space, or name another `map.folder` that may be written",
     ),
 }
 """For every fault what it means and what a person can do."""
@@ -294,7 +299,7 @@ def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.WORKER_FAILED
 
 
-STORE: Final = {"map": Fault.MAP_NOT_SAVED, "stored map": Fault.MAP_REFUSED}
+STORE: Final = {"map": Fault.MAP_NOT_SAVED, "stored map": Fault.MAP_REFUSED, "last pose": Fault.POSE_NOT_KEPT}
 """Parts of the store, by name, and what it means that they are down."""
 
 

@@ -9,6 +9,7 @@ a person anyway.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
@@ -25,10 +26,12 @@ from daemon.publish.snapshot import Snapshot, State
 log = logging.getLogger(__name__)
 
 FILE: Final = "last-pose"
-MOVED_M, MOVED_RAD: Final = 0.02, 0.01
+MOVED_M: Final = 0.02
+MOVED_RAD: Final = 0.01
 """Less is not worth writing."""
 WRITE_S: Final = 0.2
 SYNC_S: Final = 10.0
+RETRY_S: Final = 5.0
 CLOSE_S: Final = 1.0
 SURE: Final = (State.TRACKING, State.DEGRADED)
 LOST: Final = (State.LOST, State.RELOCATING, State.AMBIGUOUS)
@@ -78,7 +81,7 @@ def read(path: Path) -> Remembered | None:
     """The latest whole slot; None where there is none. What cannot be read is said and passed over."""
     try:
         content = path.read_bytes()[: 2 * _SLOT_BYTES]
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
         log.warning("%s cannot be read: %s; the robot is looked for in the whole map", path, error.strerror)
@@ -108,6 +111,7 @@ class LastPose:
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._stop = False
+        self._file, self._dirty, self._synced = -1, False, time.monotonic()
         self._thread: threading.Thread | None = None
 
     def of_map(self, map_id: int) -> Pose | None:
@@ -155,43 +159,50 @@ class LastPose:
     # in the thread
 
     def _work(self) -> None:
-        file, dirty, synced = -1, False, time.monotonic()
-        while not self._stop or self._next is not None:
-            self._wake.wait(SYNC_S if dirty else None)
+        while not self._stop:
+            self._wake.wait(RETRY_S if self.error else SYNC_S if self._dirty else None)
             self._wake.clear()
+            self._turn()
+        self._turn()
+        self._close()
+
+    def _turn(self) -> None:
+        """Write the newest pose, if there is one, and now and then see to it that the disk has it."""
+        with self._lock:
+            told, self._next = self._next, None
+        self.busy_since = time.monotonic()
+        try:
+            if told is not None:
+                self._write(told)
+            if self._dirty and (self._stop or time.monotonic() - self._synced >= SYNC_S):
+                os.fdatasync(self._file)
+                self._dirty, self._synced = False, time.monotonic()
+        except OSError as error:
+            self._say(f"{self.path}: {error.strerror or error}")
+            self._close()
             with self._lock:
-                told, self._next = self._next, None
-            self.busy_since = time.monotonic()
-            try:
-                if file < 0 and told is not None:
-                    file = self._open()
-                if told is not None:
-                    os.pwrite(file, packed(told), _SLOT_BYTES * (told.number % 2))
-                    dirty = True
-                if dirty and (self._stop or time.monotonic() - synced >= SYNC_S):
-                    os.fdatasync(file)
-                    dirty, synced = False, time.monotonic()
-                self._say("")
-            except OSError as error:
-                file, dirty = self._reopen(file), False
-                self._say(f"{self.path}: {error.strerror or error}")
-            self.busy_since = None
-        if file >= 0:
-            os.close(file)
+                self._next = self._next or told
+        else:
+            self._say("" if told is not None or not self.error else self.error)
+        self.busy_since = None
 
-    def _open(self) -> int:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        return os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    def _write(self, told: Remembered) -> None:
+        if self._file < 0:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        os.pwrite(self._file, packed(told), _SLOT_BYTES * (told.number % 2))
+        self._dirty = True
 
-    def _reopen(self, file: int) -> int:
-        """Let go of a file that fails; the next write opens it anew."""
+    def _close(self) -> None:
+        """Let go of the file; the next write opens it anew."""
+        file, self._file, self._dirty = self._file, -1, False
         if file >= 0:
-            os.close(file)
-        return -1
+            with contextlib.suppress(OSError):
+                os.close(file)
 
     def _say(self, error: str) -> None:
         if error and not self.error:
-            log.warning("the pose cannot be kept for the next start: %s; it is tried again with the next one", error)
+            log.warning("the pose cannot be kept for the next start: %s; it is tried again", error)
         elif self.error and not error:
             log.info("the pose is kept for the next start again")
         self.error = error

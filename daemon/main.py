@@ -10,6 +10,7 @@ import argparse
 import asyncio
 import gc
 import logging
+import math
 import secrets
 import signal
 import time
@@ -18,6 +19,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
 
 from daemon import configfile
 from daemon.bridge import SampleBridge, ScanBridge
@@ -28,6 +31,7 @@ from daemon.cycle import Cycle, Pacemaker, Parts, Sink, Step
 from daemon.endpoints import parse_lidar
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
+from daemon.lastpose import LastPose
 from daemon.lights import Lights, SurveyError, load_lights, new_state
 from daemon.logs import start_log
 from daemon.network import Feeds, Network
@@ -43,7 +47,7 @@ from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.warmup import CannotLoad, Warmth, warm_up
 from daemon.worker import ThreadWorker, Worker
-from estimator.records import Limits, Record
+from estimator.records import Command, Limits, Order, Record
 from estimator.result import StepResult
 from hal.clock import Clock, SystemClock
 from hal.errors import HalError
@@ -178,12 +182,14 @@ class Daemon:
             )
         )
         self.keeper = self._keeper(settings, lights)
+        self.last_pose = None if world.store is None else LastPose(world.store.folder)
         self.pacemaker = Pacemaker(self.cycle)
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
         on_samples = self.pacemaker.on_samples
         self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
         self.network = Network(settings, world.clock, self._feeds(), world.stream)
-        self.cycle.parts.sinks += [*self.network.sinks, *world.sinks, _FirstPose()]
+        kept = [] if self.last_pose is None else [self.last_pose.take]
+        self.cycle.parts.sinks += [*self.network.sinks, *kept, *world.sinks, _FirstPose()]
         self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle))
         self.cycle.parts.fault = self.heartbeat.fault
 
@@ -196,6 +202,8 @@ class Daemon:
         tasks = {name: asyncio.create_task(part, name=name) for name, part in self._parts().items()}
         stopped = asyncio.create_task(stop.wait(), name="stop")
         warming = asyncio.create_task(self._warm_up(), name="warm-up")
+        if self.last_pose is not None:
+            self.last_pose.start()
         try:
             await _first_to_end(warming, stopped, tasks["heartbeat"])
             if not stop.is_set():
@@ -214,6 +222,8 @@ class Daemon:
             for task in (stopped, warming):
                 await _stop(task)
             self.cycle.parts.worker.close()
+            if self.last_pose is not None:
+                self.last_pose.close()
             await saving
             if self._recorder is not None:
                 self._recorder.close()
@@ -226,6 +236,14 @@ class Daemon:
             self._estimator.load()
             gc.freeze()  # the map stays
             self.keeper.loaded()
+            self._remember()
+
+    def _remember(self) -> None:
+        """Tell the estimator where the run before has left the robot."""
+        pose = None if self.last_pose is None else self.last_pose.of_map(self.cycle.map_id)
+        if pose is not None:
+            log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
+            self.cycle.inbox.put_command(Command(self._world.clock.now(), Order.REMEMBERED, np.array(pose)))
 
     def _keeper(self, settings: Config, lights: Lights | None) -> Keeper:
         survey = "" if lights is None else digest_of(lights.survey)
@@ -270,6 +288,8 @@ class Daemon:
             failed.add("recorder")
         if self.keeper.error:
             failed.add("map")
+        if self.last_pose is not None and self.last_pose.error:
+            failed.add("last pose")
         if self.keeper.refused:
             failed.add("stored map")
         return vitals(self.cycle, failed, lateness)

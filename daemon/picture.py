@@ -6,10 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from daemon.publish.lights import ROWS
 from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
 from daemon.state_memory import Memory
 from estimator import se2
+from estimator.motion import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN
 from estimator.records import Array
 from estimator.result import Fix, Link, LinkState, Loop, StepResult
 from estimator.result import LoopReason as Why
@@ -77,7 +80,7 @@ class Painter:
             pose=None if estimate is None else _pose(estimate),
             odom=None if estimate is None else _triple(estimate.T_odom_base),
             predicted=None if estimate is None else _predicted(estimate, facts),
-            covariance=None if estimate is None or guessed else _upper(estimate.covariance),
+            covariance=None if estimate is None or guessed else _upper(_aged(estimate, facts)),
             velocity=None if estimate is None else _triple(estimate.velocity),
             known=(False, False, False) if guessed else verdict.known,
             jumps=0 if estimate is None else estimate.jumps,
@@ -143,6 +146,15 @@ def _link(link: Link) -> LightLink:
 
 def _pose(result: StepResult) -> Triple:
     return _triple(se2.compose(result.T_map_odom, result.T_odom_base))
+
+
+def _aged(result: StepResult, facts: Facts) -> Array:
+    """The covariance now: a robot that nothing has told of since may have moved, as the next step will reckon."""
+    unseen = facts.t_mono - result.t_mono - LONGEST_CARRY_S
+    if unseen <= 0.0:
+        return result.covariance
+    grown: Array = np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
+    return result.covariance + grown
 
 
 def _predicted(result: StepResult, facts: Facts) -> Triple | None:

@@ -28,6 +28,8 @@ DISAGREE_S: Final = 1.0
 LOST_M: Final = 1.0
 LOST_RAD: Final = 0.26
 """One-sigma uncertainty beyond which a pose is not worth using."""
+RECALLED_S: Final = 0.3
+"""The same where the pose was proved before a gap, or before the daemon ended, and is found again where it was."""
 CONTRADICTED_S: Final = 0.3
 """Light has to contradict the place for this long: an epoch may be spoiled by who walks by."""
 HELD: Final = (State.TRACKING, State.DEGRADED)
@@ -42,7 +44,8 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
     state, reason = _say(memory, evidence)
     lost = state is State.LOST or (memory.lost and state in (State.RELOCATING, State.AMBIGUOUS, State.NO_LIDAR))
     doubt = lost or evidence.places is not None or (memory.doubt and state is not State.TRACKING)
-    return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt)
+    recalled = memory.recalled and state is not State.TRACKING  # it has served
+    return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt, recalled=recalled)
 
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
@@ -180,8 +183,13 @@ def _proved(memory: Memory, evidence: Evidence) -> bool:
 
 
 def _agreed(memory: Memory, evidence: Evidence) -> bool:
-    """Whether two witnesses tell the same motion, or place; the motion says nothing about a place in doubt."""
+    """Whether two witnesses tell the same motion, or place; the motion says nothing about a place in doubt.
+
+    What was known before a gap is one of them: the pose is found again where it was left.
+    """
     light = evidence.light
+    if memory.recalled and not memory.doubt and all(memory.known):
+        return memory.good >= AXIS_FOUND_SCANS and evidence.t_mono - memory.known_since >= RECALLED_S
     if light is not None and light.used and light.agrees and not light.moved:
         proof = RELOCATED_PROOF_S if memory.doubt else CLEAN_S
         if memory.lit_since is not None and evidence.t_mono - memory.lit_since >= proof:

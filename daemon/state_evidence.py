@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,10 +22,13 @@ class Match:
     Attributes:
         good: it is a result and enough of the scan took part.
         known: (x, y, yaw) whether the match fixed the axis.
+        off_m, off_rad: by how much it moved the pose from where it was taken to be.
     """
 
     good: bool
     known: tuple[bool, bool, bool]
+    off_m: float = math.inf
+    off_rad: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,7 @@ class Evidence:
         ordered: a person has set the pose or reset the map in this cycle.
         lidar: there is one. light: None where no photodiode is configured.
         unused: why the laser is not used though it is there; None: it is.
+        recalled: the robot has just been found in the whole map, and where the run before has left it.
     """
 
     t_mono: float
@@ -84,3 +89,4 @@ class Evidence:
     lidar: bool = True
     light: Light | None = None
     unused: Reason | None = None
+    recalled: bool = False

@@ -22,6 +22,13 @@ DARK_S: Final = 5.0
 """Light that tells nothing for this long is a witness that is missing: the way between two lamps is shorter."""
 
 
+BLIND_S: Final = 60.0
+"""A robot that nothing watches for longer may have been carried off, and put down where it looks alike."""
+THERE_M: Final = 0.15
+THERE_RAD: Final = 0.06
+"""A pose that was proved is found again where it was taken to be: the first match moves it by no more than this."""
+
+
 Streak = tuple[int, float]
 """How many in a row, and when it began."""
 
@@ -38,6 +45,7 @@ class Memory:
         disagree_since: None while the witnesses do not disagree.
         doubt: the place itself has to be proved again, because nothing told the motion for a while.
         lost: the pose was given up and is not confirmed yet; implies ``doubt``.
+        sure: the pose was proved when the laser fell silent. recalled: the laser is back, and has found it there.
         lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
         odd_since: since when light has contradicted the place; both None while it does not.
     """
@@ -54,6 +62,8 @@ class Memory:
     disagree_since: float | None = None
     doubt: bool = False
     lost: bool = False
+    sure: bool = False
+    recalled: bool = False
     lit_since: float | None = None
     lit_last: float | None = None
     odd_since: float | None = None
@@ -69,7 +79,10 @@ def remember(memory: Memory, evidence: Evidence) -> Memory:
     since = memory.disagree_since if memory.disagree_since is not None else now
     memory = replace(memory, disagree_since=since if evidence.agree is False else None)
     if evidence.places is not None:
-        memory = replace(memory, good=0)  # what fits the surroundings proves nothing of the place in the map
+        # what fits the surroundings proves nothing of the place in the map
+        memory = replace(memory, good=0, sure=False, recalled=False)
+    if evidence.recalled:
+        memory = replace(memory, recalled=True, doubt=False)
     if evidence.match is None:
         return memory
     return _take_good(memory, evidence.match, now) if evidence.match.good else _take_failed(memory)
@@ -84,6 +97,7 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
     return replace(
         Memory(memory.state, memory.reason, lost=memory.lost, doubt=memory.doubt or blind),
         good_last=memory.good_last,
+        sure=_sure(memory, carried or now - (memory.good_last or now) < BLIND_S),
         known=known,
         lit_since=memory.lit_since,
         lit_last=memory.lit_last,
@@ -91,12 +105,19 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
     )
 
 
+def _sure(memory: Memory, watched: bool) -> bool:
+    """Whether the pose was proved when the laser fell silent, or left out, and nobody can have carried it off since."""
+    held = memory.state is State.TRACKING or (memory.state is State.DEGRADED and memory.good > 0 and all(memory.known))
+    proved = held and not (memory.doubt or memory.lost)
+    return (proved or memory.sure or memory.recalled) and watched
+
+
 def _take_light(memory: Memory, light: Light, now: float) -> Memory:
     """Remember since when light has told the place, and since when it has contradicted the pose."""
     odd = light.agrees is False
     memory = replace(memory, odd_since=(now if memory.odd_since is None else memory.odd_since) if odd else None)
     if light.moved or light.lost:
-        memory = replace(memory, doubt=True, lit_since=None, good=0)
+        memory = replace(memory, doubt=True, lit_since=None, good=0, sure=False, recalled=False)
     if light.used and light.placed and not odd:
         begun = memory.lit_since is None or now - (memory.lit_last or now) > DARK_S
         return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now)
@@ -106,14 +127,26 @@ def _take_light(memory: Memory, light: Light, now: float) -> Memory:
 def _take_failed(memory: Memory) -> Memory:
     failed = memory.failed + 1
     known = memory.known if failed < FAILED_SCANS else (False, False, False)
-    return replace(memory, good=0, failed=failed, known=known)
+    gone = failed >= FAILED_SCANS
+    return replace(
+        memory,
+        good=0,
+        failed=failed,
+        known=known,
+        sure=memory.sure and not gone,
+        recalled=memory.recalled and not gone,
+    )
 
 
 def _take_good(memory: Memory, match: Match, now: float) -> Memory:
     x, y, yaw = (_axis(*axis, now) for axis in zip(memory.known, memory.axes, match.known, strict=True))
     known = (x[0], y[0], yaw[0])
+    there = memory.sure and match.off_m <= THERE_M and match.off_rad <= THERE_RAD
     return replace(
         memory,
+        sure=False,
+        recalled=memory.recalled or there,
+        doubt=memory.doubt and not there,
         good=memory.good + 1,
         good_since=memory.good_since if memory.good else now,
         good_last=now,

@@ -303,6 +303,58 @@ def test_light_alone_tracks_when_there_is_no_laser_to_wait_for() -> None:
     assert said(run(memory, alone(3.0, 3, lost, odometry=True))) == (State.RELOCATING, Reason.LIGHT_LOST)
 
 
+NEAR = Match(True, ALL, 0.02, 0.01)
+FAR = Match(True, ALL, 0.5, 0.01)
+
+
+def gap(begin: float, seconds: float, **more: object) -> list[Evidence]:
+    """A silence of the laser, with the cycles that go on through it."""
+    evidence = [Evidence(begin + PERIOD * i, silence=3.0 + i, mapped=True) for i in range(round(seconds / PERIOD))]
+    return [replace(item, **more) for item in evidence]  # type: ignore[arg-type]  # test shorthand
+
+
+@pytest.mark.parametrize(("seconds", "odometry"), [(1.0, None), (20.0, None), (300.0, True)])
+def test_a_pose_that_is_found_where_it_was_left_is_tracked_within_a_second(seconds: float, odometry: bool) -> None:
+    silent = run(tracking(odometry=odometry), gap(3.0, seconds, odometry=odometry))
+    assert silent.state is State.NO_LIDAR
+    back = [*scans(3.0 + seconds, 1, NEAR, odometry=odometry), *scans(3.1 + seconds, 9, odometry=odometry)]
+    assert run(silent, back[:5]).state is not State.TRACKING, "a few scans are no proof"
+    assert run(silent, back).state is State.TRACKING
+
+
+def test_a_pose_that_is_found_elsewhere_or_was_never_proved_takes_as_long_as_ever() -> None:
+    silent = run(tracking(), gap(3.0, 10.0))
+    moved = [*scans(13.0, 1, FAR), *scans(13.1, 40)]
+    assert run(silent, moved).state is State.MAPPING
+    young = run(Memory(), scans(0.0, 5))
+    assert young.state is State.MAPPING
+    assert run(run(young, gap(0.5, 1.0)), scans(1.5, 10, NEAR)).state is State.MAPPING
+    long = run(tracking(), gap(3.0, 90.0))
+    assert run(long, scans(93.0, 40, NEAR)).state is State.MAPPING, "nobody has watched it for a minute and a half"
+
+
+def test_a_laser_that_comes_and_goes_does_not_forget_what_was_proved() -> None:
+    memory, t = tracking(odometry=True), 3.0
+    for _ in range(5):
+        memory = run(memory, [*gap(t, 1.0, odometry=True), *scans(t + 1.0, 3, NEAR, odometry=True)])
+        t += 1.3
+    assert run(memory, scans(t, 7, NEAR, odometry=True)).state is State.TRACKING
+    failing = run(memory, scans(t, FAILED_SCANS, BAD, odometry=True))
+    assert not failing.sure
+    assert not failing.recalled
+
+
+def test_after_the_start_a_pose_that_is_found_where_the_run_before_has_left_it_is_tracked_at_once() -> None:
+    looking = run(Memory(), scans(0.0, 10, places=0))
+    assert said(looking) == (State.RELOCATING, Reason.SEARCHING)
+    found = run(judge(looking, seen(1.0, recalled=True)), scans(1.1, 8))
+    assert found.state is State.TRACKING
+    assert not found.doubt
+    assert run(judge(looking, seen(1.0)), scans(1.1, 40)).state is State.MAPPING, (
+        "without a memory it takes five seconds"
+    )
+
+
 @pytest.mark.parametrize("why", [Reason.PAUSED, Reason.OVERLOADED])
 def test_a_laser_that_is_left_out_degrades_and_says_why(why: Reason) -> None:
     paused = run(tracking(odometry=True), scans(3.0, 30, None, odometry=True, unused=why))
@@ -328,7 +380,10 @@ def test_every_reason_has_a_meaning_and_every_trouble_a_remedy() -> None:
     assert [reason for reason, (_, remedy) in REASONS.items() if not remedy] == [Reason.NONE]
 
 
-matches = st.none() | st.builds(Match, st.booleans(), st.tuples(st.booleans(), st.booleans(), st.booleans()))
+offs = st.sampled_from([0.0, 0.1, 1.0])
+matches = st.none() | st.builds(
+    Match, st.booleans(), st.tuples(st.booleans(), st.booleans(), st.booleans()), offs, offs
+)
 lights = st.none() | st.builds(
     Light,
     alive=st.sampled_from([True, True, False]),
@@ -356,6 +411,7 @@ evidences = st.lists(
         ordered=st.sampled_from([False, False, True]),
         light=lights,
         unused=st.sampled_from([None, None, None, Reason.PAUSED, Reason.OVERLOADED]),
+        recalled=st.sampled_from([False, False, True]),
     ),
     max_size=60,
 )
