@@ -10,6 +10,8 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,12 +29,24 @@ BACKLOG_BYTES: Final = 32 << 20
 """Bytes that may wait for a slow disk; beyond, records are dropped and counted."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """Between two records: a new segment begins here.
+
+    Attributes:
+        then: called by the writing thread, with the number of the segment, or None where it could not be begun.
+    """
+
+    then: Callable[[int | None], None]
+
+
 class SegmentWriter:
     """Appends records to segments in a folder of its own; see `hal.replay.recording` for the format.
 
     Attributes:
         folder: where this recording goes.
-        records, bytes: written so far. lost: records that could not be written.
+        records, bytes: written so far. lost: records that could not be written. taken: bytes of the records taken.
+        closed: is told of every segment that is complete: its number, its path. Called by the writing thread.
         error: why nothing is being written at the moment; empty while all is well.
     """
 
@@ -42,14 +56,15 @@ class SegmentWriter:
         Raises:
             DeviceRefused: that is not possible; names the folder, why, and what to do.
         """
-        self.records = self.bytes = self.lost = 0
+        self.records = self.bytes = self.lost = self.taken = 0
         self.error = ""
+        self.closed: Callable[[int, Path], None] = _nobody
         self._header = header
         self._segment_bytes = segment_bytes
         self._segment = -1
         self._file = -1
         self._good = 0  # bytes of the open segment that end with a whole record
-        self._ready: list[bytes] = []
+        self._ready: list[bytes | Turn] = []
         self._waiting = 0
         self._lock = threading.Lock()
         self._noted = 0
@@ -76,7 +91,16 @@ class SegmentWriter:
                 return
             self._ready.append(frame)
             self._waiting += len(frame)
+            self.taken += len(frame)
             self._t_mono = t_mono
+
+    def begin(self, then: Callable[[int | None], None]) -> None:
+        """Begin a new segment with the next record; ``then`` is called as :class:`Turn` says. Returns at once."""
+        with self._lock:
+            if not self._stop.is_set():
+                self._ready.append(Turn(then))
+                return
+        then(None)
 
     def close(self) -> None:
         """Write and sync what is left; idempotent."""
@@ -94,16 +118,25 @@ class SegmentWriter:
     def _turn(self) -> None:
         """Write what is ready; on trouble drop it, count it, and try again later in a new segment."""
         with self._lock:
-            frames, self._ready, self._waiting = self._ready, [], 0
+            ready, self._ready, self._waiting = self._ready, [], 0
+        batches = _batches(ready)
         try:
             if self._file < 0:
                 if time.monotonic() < self._retry_at:
-                    self._lose(frames)
+                    self._lose(batches)
                     return
                 self._open()
-            self._write(frames)
+            while batches:
+                turn, frames = batches[0]
+                if turn is not None:
+                    self._close()
+                    self._open()
+                    turn.then(self._segment)
+                    batches[0] = None, frames
+                self._write(frames)
+                del batches[0]
         except OSError as error:
-            self._fail(error, frames)
+            self._fail(error, batches)
 
     def _write(self, frames: list[bytes]) -> None:
         """Append whole records; rotates first where the segment is full."""
@@ -131,17 +164,20 @@ class SegmentWriter:
         note = f"{self.lost - self._noted} records before this one were lost: {self.error or 'the disk is too slow'}"
         return pack_frame(Kind.NOTE, 0, self._t_mono, note.encode())
 
-    def _fail(self, error: OSError, frames: list[bytes]) -> None:
+    def _fail(self, error: OSError, batches: list[Batch]) -> None:
         if not self.error:
             log.error("recording into %s has stopped: %s; it goes on when there is room", self.folder, error.strerror)
         self.error = f"{self.folder}: {error.strerror or error}"
-        self._lose(frames)
+        self._lose(batches)
         self._close()
         self._retry_at = time.monotonic() + RETRY_S
 
-    def _lose(self, frames: list[bytes]) -> None:
+    def _lose(self, batches: list[Batch]) -> None:
         with self._lock:
-            self.lost += len(frames)
+            self.lost += sum(len(frames) for _, frames in batches)
+        for turn, _ in batches:
+            if turn is not None:
+                turn.then(None)
 
     def _open(self) -> None:
         """Start the next segment with a head of its own."""
@@ -169,6 +205,26 @@ class SegmentWriter:
             log.warning("segment %d in %s may end within a record: %s", self._segment, self.folder, error.strerror)
         finally:
             os.close(file)
+        if self._good:
+            self.closed(self._segment, self.folder / segment_name(self._segment))
+
+
+Batch = tuple[Turn | None, list[bytes]]
+"""Where a new segment begins, if one does, and the records from there on."""
+
+
+def _batches(ready: list[bytes | Turn]) -> list[Batch]:
+    batches: list[Batch] = [(None, [])]
+    for one in ready:
+        if isinstance(one, Turn):
+            batches.append((one, []))
+        else:
+            batches[-1][1].append(one)
+    return batches
+
+
+def _nobody(segment: int, path: Path) -> None:
+    """Nobody wants to know."""
 
 
 def _write_all(file: int, data: bytes) -> None:

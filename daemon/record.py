@@ -8,19 +8,22 @@ same caps. The published pose is kept too, so that a replay can say whether it i
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 
+from daemon.blackbox import BlackBox
 from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.disk import SegmentWriter
 from daemon.lights import RESIDUALS, Lights
-from daemon.store import Start
+from daemon.store import START, Start
 from daemon.versions import versions
 from daemon.wholefile import write_whole
 from estimator.records import UNLIMITED, Array, Command, Limits, Order
@@ -36,9 +39,6 @@ from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_samples, pa
 
 MAP: Final = "map"
 """Key of a recording's head where the run began with a map."""
-START: Final = "start.lumimap"
-"""File of a recording's folder: that map."""
-
 LIDAR, PHOTODIODE = 0, 0
 """Channels: which device of its kind."""
 
@@ -141,12 +141,18 @@ class Recorder:
     """
 
     def __init__(
-        self, folder: Path, config: Config, clock: Clock, lights: Lights | None = None, start: Start | None = None
+        self,
+        folder: Path,
+        config: Config,
+        clock: Clock,
+        lights: Lights | None = None,
+        start: Start | None = None,
+        keep_s: float = math.inf,
     ) -> None:
         """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
 
         ``lights``, ``start``: what the estimator is told of lights, and the map that it begins with: a replay has to
-        tell it again.
+        tell it again. ``keep_s``: how far back it reaches, see `daemon.flight`.
 
         Raises:
             DeviceRefused: the folder cannot be made or written.
@@ -167,6 +173,7 @@ class Recorder:
             self._keep(RESIDUALS, lights.residuals)
         if start is not None:
             self._keep(START, start.content)
+        self.box: Final = BlackBox(self.disk, clock, header, keep_s)
 
     def _keep(self, name: str, content: bytes) -> None:
         """Once beside the segments: it is too large for every head."""
@@ -182,19 +189,22 @@ class Recorder:
         """Why nothing is being written at the moment; empty while all is well."""
         return self.disk.error
 
-    def close(self) -> None:
-        """Write and sync what is left; idempotent."""
+    def close(self, ended: bool = True) -> None:
+        """Write and sync what is left; idempotent. ``ended``: the run has, as it should."""
         self.disk.close()
+        self.box.close(ended)
 
     def on_cycle(self, record: CycleRecord) -> None:
         """Keep a cycle's decisions (`daemon.cycle.Tap`)."""
         self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
+        self.box.on_cycle(record)
 
     def on_scan(self, then: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
         """A scan callback that marks the scan and passes it on."""
 
         def mark(scan: RawScan) -> None:
             self.disk.put(Kind.SCAN, LIDAR, scan.t_rx, pack_scan(scan))
+            self.box.line.scan()
             then(scan)
 
         return mark
@@ -231,20 +241,24 @@ class Recorder:
 
         async def open_tapped(device: str, baud: int) -> Port:
             port = await opener(device, baud)
-            self.disk.put(Kind.OPEN, channel, self._clock.now(), f"{port.name} {baud}".encode())
-            return _TappedPort(port, self.disk, self._clock, channel)
+            self._passed(channel, Kind.OPEN, self._clock.now(), f"{port.name} {baud}".encode())
+            return _TappedPort(port, partial(self._passed, channel), self._clock)
 
         return open_tapped
+
+    def _passed(self, channel: int, kind: Kind, t_mono: float, payload: bytes) -> None:
+        self.disk.put(kind, channel, t_mono, payload)
+        if channel == LIDAR:
+            self.box.line.passed(kind, t_mono, payload)
 
 
 class _TappedPort:
     """A port that keeps everything that passes through it (`hal.port.Port`)."""
 
-    def __init__(self, port: Port, disk: SegmentWriter, clock: Clock, channel: int) -> None:
+    def __init__(self, port: Port, passed: Callable[[Kind, float, bytes], None], clock: Clock) -> None:
         self._port = port
-        self._disk = disk
+        self._passed = passed
         self._clock = clock
-        self._channel = channel
 
     @property
     def name(self) -> str:
@@ -253,14 +267,14 @@ class _TappedPort:
 
     def start(self, on_data: OnData, on_lost: OnLost) -> None:
         """Begin delivering; bytes are kept before anybody else sees them."""
-        put, channel = self._disk.put, self._channel
+        passed = self._passed
 
         def keep(data: bytes, t_rx: float) -> None:
-            put(Kind.RX, channel, t_rx, data)
+            passed(Kind.RX, t_rx, data)
             on_data(data, t_rx)
 
         def lose(error: HalError) -> None:
-            put(Kind.LOST, channel, self._clock.now(), str(error).encode())
+            passed(Kind.LOST, self._clock.now(), str(error).encode())
             on_lost(error)
 
         self._port.start(keep, lose)
@@ -268,14 +282,14 @@ class _TappedPort:
     def write(self, data: bytes) -> None:
         """Send a short command; it is kept once the port has taken it."""
         self._port.write(data)
-        self._disk.put(Kind.TX, self._channel, self._clock.now(), data)
+        self._passed(Kind.TX, self._clock.now(), data)
 
     def set_baud(self, baud: int) -> None:
         """Change the line rate."""
         self._port.set_baud(baud)
-        self._disk.put(Kind.BAUD, self._channel, self._clock.now(), str(baud).encode())
+        self._passed(Kind.BAUD, self._clock.now(), str(baud).encode())
 
     def close(self) -> None:
         """Close the port."""
         self._port.close()
-        self._disk.put(Kind.LOST, self._channel, self._clock.now(), b"closed")
+        self._passed(Kind.LOST, self._clock.now(), b"closed")

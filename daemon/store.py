@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 
 NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap")
 BROKEN: Final = ".broken"
+START: Final = "start.lumimap"
+"""File of a recording's folder: the map that the run began with."""
 MAPS: Final = "maps"
 """Folder below the state directory."""
 NEWEST: Final = 2

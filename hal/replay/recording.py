@@ -63,6 +63,7 @@ class Kind(IntEnum):
     IMU = 17
     COMMAND = 18
     CYCLE = 32
+    STATE = 33  # the state beside this segment takes the place of the one there was
     NOTE = 48  # text for people: gaps of the recording itself
 
 

@@ -1,0 +1,255 @@
+"""The flight recorder: when a recording gets a state to be replayed from, and when a dump of it is made.
+
+All of it runs in the loop's thread, at the end of a cycle: it takes what is there (`daemon.checkpoint.take`) and hands
+it to the threads that write.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from daemon.checkpoint import CannotTake, Taken, take
+from daemon.cycle import Cycle, CycleRecord
+from daemon.disk import SEGMENT_BYTES, SegmentWriter
+from daemon.flight import Begun, Flight, Told
+from daemon.health import FAULTS, Fault
+from estimator.records import Job
+from hal.clock import Clock
+from hal.replay.recording import Kind, pack_frame
+
+if TYPE_CHECKING:
+    from estimator.state import State
+
+log = logging.getLogger(__name__)
+
+EVERY_S: Final = 600.0
+"""A recording that is kept as a whole gets a state so often, and with every segment."""
+SHARE, LEAST_S: Final = 5.0, 30.0
+"""A ring gets so many states in the time that it reaches back; not more often than this, s."""
+RETRY_S: Final = 60.0
+AFTER_S: Final = 5.0
+"""A dump because of a fault shows what became of it for so long."""
+AGAIN_S: Final = 300.0
+"""The same fault makes another dump after so long."""
+UNASKED: Final = 16
+"""Jobs that the estimator waits for no longer, but that may still answer."""
+CYCLE_PARTS: Final = (
+    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
+    "alarm", "trust", "inbox",
+)  # fmt: skip
+"""What a cycle remembers."""
+QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
+"""Faults that a dump cannot tell anything about."""
+
+
+class Line:
+    """What a lidar's line has said that whoever joins later must know: how it was opened, and the latest scans."""
+
+    OPENING_BYTES: Final = 64 << 10
+    SCAN_BYTES: Final = 256 << 10
+
+    def __init__(self) -> None:
+        self._opening: list[bytes] = []
+        self._scans: deque[list[bytes]] = deque(maxlen=3)
+        self._opening_bytes = self._scan_bytes = 0
+
+    def passed(self, kind: Kind, t_mono: float, payload: bytes) -> None:
+        """Something passed through the port."""
+        frame = pack_frame(kind, 0, t_mono, payload)
+        if kind in (Kind.OPEN, Kind.LOST):
+            self._opening, self._opening_bytes = [], 0
+            self._scans.clear()
+        if self._scans:
+            self._scan_bytes += len(frame)
+            if self._scan_bytes <= self.SCAN_BYTES:
+                self._scans[-1].append(frame)
+        elif self._opening_bytes + len(frame) <= self.OPENING_BYTES:
+            self._opening.append(frame)
+            self._opening_bytes += len(frame)
+
+    def scan(self) -> None:
+        """A scan was complete."""
+        self._scans.append([])
+        self._scan_bytes = 0
+
+    def said(self) -> bytes:
+        """All of it, as records."""
+        return b"".join((*self._opening, *(frame for scan in self._scans for frame in scan)))
+
+
+class BlackBox:
+    """Looks after the states and dumps of one recording.
+
+    Attributes:
+        line: of the lidar. error: why the latest state could not be taken; empty while all is well.
+        take_s: seconds that taking the latest state took.
+    """
+
+    def __init__(self, disk: SegmentWriter, clock: Clock, header: dict[str, Any], keep_s: float = math.inf) -> None:
+        """``keep_s``: how far back the recording reaches; infinite: as far as there is room."""
+        self.line = Line()
+        self.error = ""
+        self.take_s = 0.0
+        self.flight: Final = Flight(disk.folder, keep_s)
+        disk.closed = self.flight.closed
+        self._disk, self._clock, self._header = disk, clock, header
+        self._every_s = EVERY_S if math.isinf(keep_s) else max(LEAST_S, keep_s / SHARE)
+        self._bytes = 0
+        self._due = clock.now() + self._every_s
+        self._cycle: Cycle | None = None
+        self._state: Callable[[], State | None] = _none
+        self._faults: Callable[[], tuple[Fault, ...]] = tuple
+        self._jobs: dict[int, Job] = {}
+        self._present: frozenset[Fault] = frozenset()
+        self._dumped: dict[Fault, float] = {}
+        self._pending: tuple[float, Fault] | None = None
+
+    @property
+    def failing(self) -> str:
+        """What of states and dumps cannot be kept at the moment, empty while all is well."""
+        return self.error or self.flight.error
+
+    def attach(
+        self, cycle: Cycle, state: Callable[[], State | None], faults: Callable[[], tuple[Fault, ...]] = tuple
+    ) -> None:
+        """Say what is recorded. ``state``: the estimator's, None before it is loaded. ``faults``: that are present."""
+        self._cycle, self._state, self._faults = cycle, state, faults
+
+    def on_cycle(self, record: CycleRecord) -> None:
+        """A cycle has ended and is recorded; nothing that comes from now on belongs to it."""
+        self._follow_jobs(record)
+        now = record.t_mono
+        self._watch_faults(now)
+        if self._pending is not None and now >= self._pending[0]:
+            (_, fault), self._pending = self._pending, None
+            self._dump(f"fault-{int(fault)}", FAULTS[fault][0], _said)
+        elif now >= self._due or self._disk.taken - self._bytes > SEGMENT_BYTES:
+            if self._disk.taken - self._bytes >= self.flight.state_bytes:  # large maps: at most half is states
+                self._begin(_nothing)
+            else:
+                self._due = now + self._every_s
+
+    def dump(self, told: Told) -> None:
+        """Make a dump of what there is, now; ``told`` in this thread when it is there, or why not."""
+        loop = asyncio.get_running_loop()
+
+        def back(reason: str) -> None:
+            loop.call_soon_threadsafe(told, reason)
+
+        self._dump("asked", "somebody has asked for it", back)
+
+    def restarted(self) -> None:
+        """The estimator's state has been exchanged for another one: a replay goes on with that."""
+        self._jobs.clear()
+        self._begin(_nothing, anew=True)
+
+    def close(self, ended: bool) -> None:
+        """Finish what is under way; after the disk."""
+        self.flight.close(ended)
+
+    def _follow_jobs(self, record: CycleRecord) -> None:
+        """Keep the jobs that may still answer."""
+        if record.limits is not None and record.result is not None and record.result.jobs:
+            self._jobs.update((job.job_id, job) for job in record.result.jobs)
+        for job_id in record.answers:
+            self._jobs.pop(job_id, None)
+
+    def _watch_faults(self, now: float) -> None:
+        faults = frozenset(self._faults())
+        if faults == self._present:
+            return
+        new, self._present = faults - self._present - QUIET, faults
+        for fault in sorted(new):
+            if self._pending is None and now - self._dumped.get(fault, -math.inf) >= AGAIN_S:
+                self._pending = now + AFTER_S, fault
+                self._dumped[fault] = now
+
+    def _begin(self, then: Callable[[int | None], None], anew: bool = False) -> None:
+        """Begin a segment with the state of this moment."""
+        now = self._clock.now()
+        taken = self._take()
+        self._due = now + (RETRY_S if taken is None else self._every_s)
+        self._bytes = self._disk.taken
+        cycle = 0 if self._cycle is None else self._cycle.cycles
+        line = self.line.said()
+        if taken is not None:
+            self._disk.begin(partial(self._begun, now, taken, line, cycle, then))
+            if anew:
+                self._disk.put(Kind.STATE, 0, now, b"anew")
+        else:
+            self._disk.begin(partial(self._begun, now, None, line, cycle, then))
+
+    def _begun(
+        self, now: float, taken: Taken | None, line: bytes, cycle: int, then: Callable[[int | None], None], segment: int | None
+    ) -> None:
+        """In the writing thread: the segment has its number."""
+        if segment is not None:
+            header = {**self._header, "segment": segment, "t_state": now, "cycle": cycle}
+            self.flight.begun(Begun(segment, now, taken, line, header))
+        then(segment)
+
+    def _take(self) -> Taken | None:
+        cycle, state = self._cycle, self._state()
+        if cycle is None or state is None:
+            return None
+        unasked = [job_id for job_id in self._jobs if job_id not in state.atlas.asked]
+        for job_id in unasked[:-UNASKED]:
+            del self._jobs[job_id]
+        samples, blocks = cycle.parts.samples, cycle.parts.blocks
+        rest: dict[str, object] = {
+            "cycle": {name: getattr(cycle, name) for name in CYCLE_PARTS},
+            "jobs": dict(self._jobs),
+            "samples": None if samples is None else dict(vars(samples)),
+            "blocks": None if blocks is None else {**vars(blocks), "status": None},
+        }
+        begun = time.perf_counter()
+        try:
+            taken = take(state, rest)
+        except CannotTake as error:
+            if not self.error:
+                log.error("flight recorder: %s; what is recorded replays from an older state", error)
+            self.error = str(error)
+            return None
+        self.take_s = time.perf_counter() - begun
+        self.error = ""
+        return taken
+
+    def _dump(self, reason: str, why: str, told: Told) -> None:
+        utc = datetime.fromtimestamp(self._clock.utc(), UTC)
+        about = {
+            "reason": re.sub(r"[^a-z0-9-]", "-", reason),
+            "why": why,
+            "at": f"{utc:%Y-%m-%dT%H-%M-%SZ}",
+            "t_mono": self._clock.now(),
+            "t_utc": self._clock.utc(),
+            "faults": [int(fault) for fault in sorted(self._present)],
+        }
+
+        def then(segment: int | None) -> None:
+            if segment is None:
+                told("nothing can be written at the moment")
+            else:
+                self.flight.dump(about, told)
+
+        self._begin(then)
+
+
+def _none() -> None:
+    """There is no state yet."""
+
+
+def _nothing(segment: int | None) -> None:
+    """Nobody waits for the segment."""
+
+
+def _said(reason: str) -> None:
+    """Nobody waits for the dump."""

@@ -1,0 +1,284 @@
+"""What becomes of a recording's segments: states beside them, the oldest taken away, dumps. In a thread of its own.
+
+A recording can be replayed from its beginning, and from every segment with a state beside it. What is taken away is
+therefore everything before such a segment, and never the last of them. A dump is a folder of links to the segments that
+are there: it costs next to nothing until the ring goes on without them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import math
+import os
+import queue
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from daemon.checkpoint import CannotTake, Taken
+from daemon.lights import RESIDUALS
+from daemon.statefile import SUFFIX as STATE_SUFFIX
+from daemon.statefile import state_name, write_state
+from daemon.store import START
+from daemon.wholefile import sync_folder, write_whole
+from hal.replay.recording import SUFFIX, segment_name
+
+log = logging.getLogger(__name__)
+
+DUMP: Final = "dump-"
+"""Folders of dumps are named so, by the time."""
+ABOUT: Final = "dump.json"
+DUMPS: Final = 8
+"""Dumps that are kept, the latest."""
+DUMP_S: Final = 600.0
+"""What a dump of a recording that is kept as a whole reaches back."""
+RING: Final = "ring"
+"""File of a ring's folder, locked while somebody writes; empty until the run has ended as it should."""
+MB_A_MINUTE: Final = 24
+"""What a ring may hold at most, twice what a lidar of 1081 beams at 40 Hz and a photodiode make."""
+LEAST_BYTES: Final = 256 << 20
+"""A ring may hold that much in any case: maps may be large."""
+RESERVE_BYTES: Final = 512 << 20
+"""Room that a recording leaves on its disk: the maps have to go there, too."""
+BREATH_S: Final = 0.0005
+"""Pause between two slices of pickling."""
+CLOSE_S: Final = 5.0
+
+Told = Callable[[str], None]
+
+
+class Begun(NamedTuple):
+    """A segment that was begun with a state: the state, the lines it needs, and what is said of it."""
+
+    number: int
+    t_mono: float
+    taken: Taken | None
+    line: bytes
+    header: dict[str, Any]
+
+
+@dataclass(slots=True)
+class _Segment:
+    """A segment that is there; ``t_mono``: when it began, where a state begins it."""
+
+    bytes: int = 0
+    t_mono: float = math.nan
+    state: bool = False
+
+
+class Flight:
+    """The keeper of one recording's folder.
+
+    Attributes:
+        error: what of the latest state or dump could not be kept, empty while all is well.
+        state_bytes: of the latest state. dumps: written so far.
+    """
+
+    def __init__(self, folder: Path, keep_s: float = math.inf) -> None:
+        """``keep_s``: how far back the recording reaches at least; infinite: as far as the disk has room."""
+        self.error = ""
+        self.state_bytes = self.dumps = 0
+        self._folder = folder
+        self._keep_s = keep_s
+        self._most = math.inf if math.isinf(keep_s) else max(LEAST_BYTES, (MB_A_MINUTE << 20) * keep_s / 60.0)
+        self._segments: dict[int, _Segment] = {0: _Segment(t_mono=-math.inf, state=True)}
+        self._said_full = False
+        self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._ring = -1 if math.isinf(keep_s) else _begin_ring(folder)
+        self._thread = threading.Thread(target=self._work, name="lumiloop-flight", daemon=True)
+        self._thread.start()
+
+    def closed(self, number: int, path: Path) -> None:
+        """A segment is complete."""
+        self._tasks.put(partial(self._take_away, number, path))
+
+    def begun(self, begun: Begun) -> None:
+        """A segment was begun; its state is to be written."""
+        self._tasks.put(partial(self._keep, begun))
+
+    def dump(self, about: dict[str, Any], told: Told) -> None:
+        """Link what is complete; ``told``: empty, or why that came to nothing. Called in this thread of its own."""
+        self._tasks.put(partial(self._dump, about, told))
+
+    def close(self, ended: bool) -> None:
+        """Finish what was asked for. ``ended``: as it should; else the ring is kept as a dump by the next start."""
+        self._tasks.put(None)
+        self._thread.join(CLOSE_S)
+        if self._ring >= 0:
+            if ended:
+                with contextlib.suppress(OSError):
+                    os.write(self._ring, b"ended\n")
+            os.close(self._ring)
+            self._ring = -1
+
+    def _work(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # the cycle goes first wherever both want the processor
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        while (task := self._tasks.get()) is not None:
+            try:
+                task()
+            except Exception:  # a defect here must not end the recording, and is told in full
+                log.exception("the recording's folder cannot be looked after")
+                self.error = "a defect, see the log"
+
+    def _keep(self, begun: Begun) -> None:
+        """Write a state, and take away what is too old."""
+        segment = self._segments.setdefault(begun.number, _Segment())
+        segment.t_mono = begun.t_mono
+        if begun.taken is None:
+            return
+        pieces, breathe = begun.taken.pieces(), partial(time.sleep, BREATH_S)
+        try:
+            self.state_bytes = write_state(
+                self._folder / state_name(begun.number), begun.header, begun.line, pieces, breathe
+            )
+        except (OSError, CannotTake) as error:
+            self._fail("the state of the estimator", error)
+            return
+        segment.state = True
+        segment.bytes += self.state_bytes
+        self.error = ""
+        self._prune(begun.t_mono)
+
+    def _fail(self, what: str, error: Exception) -> None:
+        said = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+        if not self.error:
+            log.error("%s cannot be kept in %s: %s; what is recorded then replays from an older one", what, self._folder, said)
+        self.error = f"{what}: {said}"
+
+    def _take_away(self, number: int, path: Path) -> None:
+        with contextlib.suppress(OSError):
+            self._segments.setdefault(number, _Segment()).bytes += path.stat().st_size
+
+    def _prune(self, now: float) -> None:
+        """Take away what is older than asked for, and then what there is no room for."""
+        starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
+        old = [number for number in starts if self._segments[number].t_mono <= now - self._keep_s]
+        if old:
+            self._remove_before(old[-1])
+        for start in starts:
+            if start > min(self._segments) and self._too_much():
+                self._remove_before(start)
+
+    def _too_much(self) -> bool:
+        if sum(segment.bytes for segment in self._segments.values()) > self._most:
+            return True
+        try:
+            room = shutil.disk_usage(self._folder).free
+        except OSError:
+            return False
+        if room < RESERVE_BYTES and not self._said_full:
+            log.warning(
+                "%s has %d MB of room left: the oldest part of the recording is taken away from now on",
+                self._folder,
+                room >> 20,
+            )
+            self._said_full = True
+        return room < RESERVE_BYTES
+
+    def _remove_before(self, first: int) -> None:
+        for number in [number for number in self._segments if number < first]:
+            del self._segments[number]
+            for name in (segment_name(number), state_name(number)):
+                with contextlib.suppress(OSError):
+                    (self._folder / name).unlink(missing_ok=True)
+
+    def _dump(self, about: dict[str, Any], told: Told) -> None:
+        begin = self._dump_from(float(about["t_mono"]))
+        name = f"{DUMP}{about['at']}-{about['reason']}"
+        try:
+            made = _linked(self._folder, self._names(begin), self._folder.parent / name, about)
+            _prune_dumps(self._folder.parent)
+        except OSError as error:
+            self._fail("a dump", error)
+            told(f"{self._folder.parent}: {error.strerror or error}")
+            return
+        self.dumps += 1
+        log.info("flight recorder: %s (%s)", made, about["why"])
+        told("")
+
+    def _dump_from(self, now: float) -> int:
+        """The segment a dump begins with."""
+        reach = min(self._keep_s, DUMP_S) if math.isinf(self._keep_s) else self._keep_s
+        starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
+        old = [number for number in starts if self._segments[number].t_mono <= now - reach]
+        return old[-1] if old else min(starts, default=0)
+
+    def _names(self, begin: int) -> list[str]:
+        """Files of a dump; the segment that is being written has its turn with the next one."""
+        there = {path.name for path in self._folder.iterdir()}
+        names = [segment_name(number) for number, one in sorted(self._segments.items()) if number >= begin and one.bytes]
+        names += [state_name(begin), RESIDUALS, *([START] if begin == 0 else [])]
+        return [name for name in names if name in there]
+
+
+def _linked(source: Path, names: list[str], target: Path, about: dict[str, Any]) -> Path:
+    """A folder with links to these files, or copies where links are not possible; appears whole."""
+    target = _free(target)
+    beside = target.with_name(f".{target.name}.part")
+    beside.mkdir(parents=True)
+    try:
+        for name in names:
+            try:
+                os.link(source / name, beside / name)
+            except OSError:
+                shutil.copyfile(source / name, beside / name)
+        write_whole(beside / ABOUT, (json.dumps(about, indent=2, sort_keys=True) + "\n").encode())
+        beside.replace(target)
+    except OSError:
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+    sync_folder(target.parent)
+    return target
+
+
+def _free(path: Path) -> Path:
+    number = 1
+    free = path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}-{number}")
+    return free
+
+
+def _prune_dumps(parent: Path) -> None:
+    for old in sorted(parent.glob(f"{DUMP}*"))[:-DUMPS]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _begin_ring(folder: Path) -> int:
+    """Mark a folder as a ring that is being written, and see to those that earlier runs have left."""
+    for other in sorted(folder.parent.glob(f"*/{RING}")):
+        if other.parent != folder:
+            _see_to(other)
+    handle = os.open(folder / RING, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return handle
+
+
+def _see_to(mark: Path) -> None:
+    """A ring of an earlier run: nobody needs it if that run has ended as it should; else it is a dump from now on."""
+    try:
+        with mark.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if file.read():
+                shutil.rmtree(mark.parent, ignore_errors=True)
+                return
+        mark.unlink()
+        kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
+        mark.parent.rename(kept)
+        log.warning("the run before this one did not end as it should: what it recorded last is in %s", kept)
+        _prune_dumps(kept.parent)
+    except OSError as error:
+        log.warning("%s: the ring of an earlier run stays as it is: %s", mark.parent, error.strerror)
+
+
+__all__ = ["STATE_SUFFIX", "SUFFIX", "Begun", "Flight", "Told"]
