@@ -17,7 +17,6 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from daemon.checkpoint import CannotTake, Taken, take
 from daemon.cycle import Cycle, CycleRecord
 from daemon.disk import SEGMENT_BYTES, SegmentWriter
 from daemon.flight import Begun, Flight, Told
@@ -26,14 +25,15 @@ from estimator.records import Job
 from hal.clock import Clock
 from hal.replay.recording import Kind, pack_frame
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from daemon.checkpoint import Taken
     from estimator.state import State
 
 log = logging.getLogger(__name__)
 
 EVERY_S: Final = 600.0
 """A recording that is kept as a whole gets a state so often, and with every segment."""
-SHARE, LEAST_S: Final = 5.0, 30.0
+SHARE, LEAST_S = 5.0, 30.0
 """A ring gets so many states in the time that it reaches back; not more often than this, s."""
 RETRY_S: Final = 60.0
 AFTER_S: Final = 5.0
@@ -103,6 +103,7 @@ class BlackBox:
         disk.closed = self.flight.closed
         self._disk, self._clock, self._header = disk, clock, header
         self._every_s = EVERY_S if math.isinf(keep_s) else max(LEAST_S, keep_s / SHARE)
+        self._ring = not math.isinf(keep_s)
         self._bytes = 0
         self._due = clock.now() + self._every_s
         self._cycle: Cycle | None = None
@@ -128,7 +129,10 @@ class BlackBox:
         """A cycle has ended and is recorded; nothing that comes from now on belongs to it."""
         self._follow_jobs(record)
         now = record.t_mono
-        self._watch_faults(now)
+        if record.cycle == 1:
+            self.flight.prepare()
+        if self._ring:  # what is kept as a whole needs no dumps
+            self._watch_faults(now)
         if self._pending is not None and now >= self._pending[0]:
             (_, fault), self._pending = self._pending, None
             self._dump(f"fault-{int(fault)}", FAULTS[fault][0], _said)
@@ -189,7 +193,13 @@ class BlackBox:
             self._disk.begin(partial(self._begun, now, None, line, cycle, then))
 
     def _begun(
-        self, now: float, taken: Taken | None, line: bytes, cycle: int, then: Callable[[int | None], None], segment: int | None
+        self,
+        now: float,
+        taken: Taken | None,
+        line: bytes,
+        cycle: int,
+        then: Callable[[int | None], None],
+        segment: int | None,
     ) -> None:
         """In the writing thread: the segment has its number."""
         if segment is not None:
@@ -211,6 +221,8 @@ class BlackBox:
             "samples": None if samples is None else dict(vars(samples)),
             "blocks": None if blocks is None else {**vars(blocks), "status": None},
         }
+        from daemon.checkpoint import CannotTake, take
+
         begun = time.perf_counter()
         try:
             taken = take(state, rest)

@@ -1,7 +1,7 @@
 """The state of a running daemon, taken within a cycle and written out later: where the replay of a dump begins.
 
-Taking it must not delay the cycle, however large the map. So it is two things. What is small and changes all the time is
-pickled at once (:func:`take`). What is large never changes once it is there (keyframes, settled submaps, patches):
+Taking it must not delay the cycle, however large the map. So it is two things. What is small and changes all the time
+is pickled at once (:func:`take`). What is large never changes once it is there (keyframes, settled submaps, patches):
 it is only referred to, and pickled afterwards by another thread, piece by piece (:meth:`Taken.pieces`). Submaps are
 few and do change, so the values of their fields are taken at once.
 
@@ -156,7 +156,8 @@ def _names(kind: type) -> tuple[str, ...]:
 
 
 def _fields_of(piece: object) -> dict[str, Any]:
-    return {name: getattr(piece, name) for name in _names(type(piece))}
+    kind: type = type(piece)
+    return {name: getattr(piece, name) for name in _names(kind)}
 
 
 def take(state: State, rest: dict[str, object]) -> Taken:
@@ -244,7 +245,7 @@ def _weak(content: Sequence[Any]) -> WeakSet[Any]:
 
 
 def _blank(kind: type) -> object:
-    return kind.__new__(kind)
+    return object.__new__(kind)
 
 
 def _fill(made: object, said: dict[str, Any]) -> None:
@@ -338,7 +339,8 @@ def _restored(pieces: Iterator[Piece]) -> tuple[State, dict[str, Any]]:
         elif piece.kind in whole:
             made[piece.number] = _Reader(piece.content, made.__getitem__).load()
         else:
-            made[piece.number] = _blank(blank[piece.kind])
+            kind = blank[piece.kind]
+            made[piece.number] = {} if kind is dict else _blank(kind)
             said.append((made[piece.number], piece.content))
     for one, content in said:
         _take_in(one, _Reader(content, made.__getitem__).load())

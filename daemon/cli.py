@@ -16,6 +16,8 @@ OK: Final = 0
 FAILED: Final = 1
 USAGE: Final = 2
 INTERRUPTED: Final = 130
+LONGEST_RING: Final = 1440.0
+"""Minutes; whoever wants more keeps all of it."""
 
 Body = Callable[[argparse.Namespace], int]
 
@@ -93,7 +95,26 @@ def _run(parser: argparse.ArgumentParser) -> None:
     _config_arguments(parser)
     parser.add_argument("--lidar", metavar="DEVICE", help="same as --set lidar.device=DEVICE")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record raw bytes and cycles into this directory")
-    parser.set_defaults(body=_later("daemon.main", "main"))
+    parser.add_argument(
+        "--last", type=_minutes, metavar="MINUTES", help="record in a ring; a fault, or a command, makes a dump of it"
+    )
+    parser.set_defaults(body=_recording(_later("daemon.main", "main")))
+
+
+def _minutes(text: str) -> float:
+    minutes = float(text)
+    if not 1.0 <= minutes <= LONGEST_RING:
+        raise argparse.ArgumentTypeError(f"{text} minutes: name 1 to {LONGEST_RING:.0f}")
+    return minutes
+
+
+def _recording(body: Body) -> Body:
+    def check_and_run(args: argparse.Namespace) -> int:
+        if args.last is not None and args.record is None:
+            return fail("--last says how much --record keeps: name a directory with --record DIR", USAGE)
+        return body(args)
+
+    return check_and_run
 
 
 def _check(parser: argparse.ArgumentParser) -> None:

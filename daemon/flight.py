@@ -20,16 +20,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from daemon.checkpoint import CannotTake, Taken
 from daemon.lights import RESIDUALS
-from daemon.statefile import SUFFIX as STATE_SUFFIX
-from daemon.statefile import state_name, write_state
 from daemon.store import START
 from daemon.wholefile import sync_folder, write_whole
-from hal.replay.recording import SUFFIX, segment_name
+from hal.replay.recording import segment_name, state_name
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from daemon.checkpoint import Taken
 
 log = logging.getLogger(__name__)
 
@@ -96,6 +97,10 @@ class Flight:
         self._thread = threading.Thread(target=self._work, name="lumiloop-flight", daemon=True)
         self._thread.start()
 
+    def prepare(self) -> None:
+        """The estimator has been loaded; what is still missing is loaded here, and not within a cycle."""
+        self._tasks.put(_load)
+
     def closed(self, number: int, path: Path) -> None:
         """A segment is complete."""
         self._tasks.put(partial(self._take_away, number, path))
@@ -135,6 +140,9 @@ class Flight:
         segment.t_mono = begun.t_mono
         if begun.taken is None:
             return
+        from daemon.checkpoint import CannotTake
+        from daemon.statefile import write_state
+
         pieces, breathe = begun.taken.pieces(), partial(time.sleep, BREATH_S)
         try:
             self.state_bytes = write_state(
@@ -151,7 +159,9 @@ class Flight:
     def _fail(self, what: str, error: Exception) -> None:
         said = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
         if not self.error:
-            log.error("%s cannot be kept in %s: %s; what is recorded then replays from an older one", what, self._folder, said)
+            log.error(
+                "%s cannot be kept in %s: %s; what is recorded then replays from an older one", what, self._folder, said
+            )
         self.error = f"{what}: {said}"
 
     def _take_away(self, number: int, path: Path) -> None:
@@ -215,9 +225,15 @@ class Flight:
     def _names(self, begin: int) -> list[str]:
         """Files of a dump; the segment that is being written has its turn with the next one."""
         there = {path.name for path in self._folder.iterdir()}
-        names = [segment_name(number) for number, one in sorted(self._segments.items()) if number >= begin and one.bytes]
+        names = [
+            segment_name(number) for number, one in sorted(self._segments.items()) if number >= begin and one.bytes
+        ]
         names += [state_name(begin), RESIDUALS, *([START] if begin == 0 else [])]
         return [name for name in names if name in there]
+
+
+def _load() -> None:
+    import_module("daemon.statefile")
 
 
 def _linked(source: Path, names: list[str], target: Path, about: dict[str, Any]) -> Path:
@@ -279,6 +295,3 @@ def _see_to(mark: Path) -> None:
         _prune_dumps(kept.parent)
     except OSError as error:
         log.warning("%s: the ring of an earlier run stays as it is: %s", mark.parent, error.strerror)
-
-
-__all__ = ["STATE_SUFFIX", "SUFFIX", "Begun", "Flight", "Told"]

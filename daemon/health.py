@@ -54,6 +54,7 @@ class Fault(IntEnum):
     MAP_NOT_SAVED = 403
     MAP_REFUSED = 404
     POSE_NOT_KEPT = 405
+    FLIGHT_RECORDER_FAILED = 406
 
 
 FAULTS: Final[dict[Fault, tuple[str, str]]] = {
@@ -150,6 +151,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.MAP_NOT_SAVED: (
         "the map cannot be saved; what was saved before stays",
         "read the log; free disk space, or name another `map.folder` that may be written",
+    ),
+    Fault.FLIGHT_RECORDER_FAILED: (
+        "the flight recorder cannot keep a state or a dump",
+        "free disk space where it records, see the log for what is in the way",
     ),
     Fault.MAP_REFUSED: (
         "a stored map cannot be used",
@@ -299,8 +304,13 @@ def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.WORKER_FAILED
 
 
-STORE: Final = {"map": Fault.MAP_NOT_SAVED, "stored map": Fault.MAP_REFUSED, "last pose": Fault.POSE_NOT_KEPT}
-"""Parts of the store, by name, and what it means that they are down."""
+STORE: Final = {
+    "map": Fault.MAP_NOT_SAVED,
+    "stored map": Fault.MAP_REFUSED,
+    "last pose": Fault.POSE_NOT_KEPT,
+    "flight recorder": Fault.FLIGHT_RECORDER_FAILED,
+}
+"""Parts that keep things, by name, and what it means that they are down."""
 
 
 def _outputs(now: Vitals) -> Iterable[Fault]:

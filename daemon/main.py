@@ -192,6 +192,8 @@ class Daemon:
         self.cycle.parts.sinks += [*self.network.sinks, *kept, *world.sinks, _FirstPose()]
         self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle))
         self.cycle.parts.fault = self.heartbeat.fault
+        if recorder is not None:
+            recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults)
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set.
@@ -226,7 +228,7 @@ class Daemon:
                 self.last_pose.close()
             await saving
             if self._recorder is not None:
-                self._recorder.close()
+                self._recorder.close(ended=stop.is_set())
 
     async def _warm_up(self) -> None:
         warmth = await self._world.warm_up()
@@ -271,7 +273,7 @@ class Daemon:
         if recorder is None:
             return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command, self.keeper.ask)
         on_odometry, on_imu = recorder.on_odometry(inbox.put_odometry), recorder.on_imu(inbox.put_imu)
-        return Feeds(on_odometry, on_imu, inbox.put_command, self.keeper.ask)
+        return Feeds(on_odometry, on_imu, inbox.put_command, self.keeper.ask, recorder.box.dump)
 
     def _keep_sample_clock(self) -> None:
         result, store = self.cycle.result, self._world.sample_clock
@@ -284,8 +286,8 @@ class Daemon:
             self.cycle.announce()
             notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
         failed = set(self.supervisor.failed)
-        if self._recorder is not None and self._recorder.error:
-            failed.add("recorder")
+        if self._recorder is not None:
+            failed |= self._recorder.failing
         if self.keeper.error:
             failed.add("map")
         if self.last_pose is not None and self.last_pose.error:
@@ -354,7 +356,7 @@ async def _stop(task: asyncio.Task[Any] | None) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``run``. ``args.settings`` holds the configuration, ``args.record`` a directory or None."""
+    """The command ``run``. ``args``: the configuration (``settings``), where to ``record``, how much (``last``)."""
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
@@ -365,7 +367,8 @@ def main(args: argparse.Namespace) -> int:
         if args.record is not None:
             from daemon.record import Recorder
 
-            recorder = Recorder(args.record, settings, world.clock, world.lights, world.start)
+            keep_s = math.inf if args.last is None else 60.0 * args.last
+            recorder = Recorder(args.record, settings, world.clock, world.lights, world.start, keep_s)
         asyncio.run(_run_until_signal(settings, world, recorder))
     except SurveyError as error:
         log.error("%s", error)

@@ -189,6 +189,11 @@ class Recorder:
         """Why nothing is being written at the moment; empty while all is well."""
         return self.disk.error
 
+    @property
+    def failing(self) -> set[str]:
+        """Which parts of the recording do not work at the moment."""
+        return {name for name, error in (("recorder", self.error), ("flight recorder", self.box.failing)) if error}
+
     def close(self, ended: bool = True) -> None:
         """Write and sync what is left; idempotent. ``ended``: the run has, as it should."""
         self.disk.close()

@@ -25,11 +25,11 @@ from daemon.config import Config, Mount
 from daemon.configfile import brought_up
 from daemon.ledger import Ledger
 from daemon.lights import Lights, SurveyError, from_header, load_lights, lost_residuals
-from daemon.record import MAP, START
+from daemon.record import MAP
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused, map_files, tum
 from daemon.sources import Source, open_log, sha256_of
-from daemon.store import NoMap, Start, recorded_start, started
+from daemon.store import START, NoMap, Start, recorded_start, started
 from daemon.store_file import BadMap
 from daemon.store_image import meta_of, packed
 from daemon.versions import versions
@@ -171,6 +171,8 @@ def start_for(source: Source, used: Config, lights: Lights | None, given: Given)
     Raises:
         DataInvalid: the map asked for, or recorded, cannot be used.
     """
+    if source.begin is not None:
+        return None
     try:
         named = given.file and used.map.folder and not source.recorded
         if named or any(key.startswith("map.") for key in given.keys):

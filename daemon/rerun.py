@@ -17,10 +17,11 @@ from daemon.config import Config
 from daemon.cycle import Cycle, CycleRecord, Parts
 from daemon.ledger import Ledger
 from daemon.lights import Lights, new_state
+from daemon.moment import Restored
 from daemon.photodiode import BlockWatch
 from daemon.record import CycleEntry, light_of
 from daemon.results import finest
-from daemon.sources import Event, Source, Turn
+from daemon.sources import Anew, Event, Source, Turn
 from daemon.store import Start
 from daemon.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
@@ -101,6 +102,12 @@ class Rerun:
         journal: MatchJournal | None = None,
         start: Start | None = None,
     ) -> None:
+        """``start``: the map that it begins with; where the log begins with a state, that counts.
+
+        Raises:
+            DataInvalid: that state cannot be used.
+        """
+        begin = None if source.begin is None else source.begin.load()
         self.ledger = Ledger()
         self.comparison = Comparison()
         self.timing = Timing()
@@ -109,7 +116,8 @@ class Rerun:
         self.t_first = math.inf
         self._source = source
         self._clock = ReplayClock()
-        self._state = new_state(lights, pipeline.Settings(history=True, localise=config.map.localise), start)
+        settings = pipeline.Settings(history=True, localise=config.map.localise)
+        self._state = new_state(lights, settings, start) if begin is None else begin.keep_history()
         self._journal = journal
         if journal is not None:
             journal.attach(self._state)
@@ -118,16 +126,18 @@ class Rerun:
         self._latest: tuple[float, float] = (0.0, 0.0)
         self._odometry: RawOdometry | None = None
         self._kept: list[CycleRecord] = []
-        self.cycle: Final = Cycle(self._parts(config, lights))
+        self.cycle: Final = Cycle(self._parts(config, lights, begin))
+        if begin is not None:
+            begin.put_into(self.cycle)
 
-    def _parts(self, config: Config, lights: Lights | None) -> Parts:
-        recorded = self._source.recorded
+    def _parts(self, config: Config, lights: Lights | None, begin: Restored | None) -> Parts:
+        worker = CycleWorker() if not self._source.recorded else self._scheduled(begin)
         return Parts(
             clock=self._clock,
             step=self._step,
             scans=ScanBridge(config.lidar),
             budget=self._caps,
-            worker=ScheduledWorker(self._answers) if recorded else CycleWorker(),
+            worker=worker,
             status=self._source.status,
             lidar=config.lidar.fitted,
             odometry=config.odometry.port > 0,
@@ -138,6 +148,11 @@ class Rerun:
             alert_m=config.integrity.alert_m,
         )
 
+    def _scheduled(self, begin: Restored | None) -> ScheduledWorker:
+        if begin is None:
+            return ScheduledWorker(self._answers)
+        return ScheduledWorker(self._answers, begin.rest["cycle"]["cycles"], begin.jobs)
+
     @property
     def t_mono(self) -> float:
         """Where the log's clock stands."""
@@ -147,6 +162,9 @@ class Rerun:
         """Take one event; runs a cycle where one is due."""
         if isinstance(event, Turn):
             self._repeat(event)
+            return
+        if isinstance(event, Anew):
+            self._begin_anew(event.moment.load())
             return
         self._arrive(event.t1 if isinstance(event, RawSamples) else event.t_rx)
         if isinstance(event, RawSamples):
@@ -209,6 +227,15 @@ class Rerun:
             self.comparison.note(entry.cycle, str(error))
         else:
             self._compare(entry, record)
+
+    def _begin_anew(self, begin: Restored) -> None:
+        """The recorded run went on with another state from here on."""
+        self.ledger.settle(pipeline.keyframe_poses(self._state))
+        self._state = begin.keep_history()
+        begin.put_into(self.cycle)
+        self.cycle.parts.worker = self._scheduled(begin)
+        if self._journal is not None:
+            self._journal.attach(self._state)
 
     def _compare(self, entry: CycleEntry, record: CycleRecord) -> None:
         result = record.result

@@ -7,6 +7,7 @@ also says where each cycle ran (`CycleEntry`); in every other log a cycle runs w
 from __future__ import annotations
 
 import hashlib
+import math
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from typing import Any, ClassVar, Final
 
 import msgspec
 
+from daemon.moment import Moment, beginning, read_moment, state_beside
 from daemon.record import LIDAR, CycleEntry, decode_cycle
 from hal.adc import RawSamples
 from hal.errors import DataInvalid
@@ -31,6 +33,7 @@ from hal.replay.recording import (
     Kind,
     Recording,
     ScanMark,
+    frames_in,
     looks_like_recording,
     open_recording,
     unpack_imu,
@@ -52,7 +55,14 @@ class Turn:
     entry: CycleEntry
 
 
-Event = RawScan | RawSamples | RawOdometry | RawImu | Turn
+@dataclass(frozen=True, slots=True, eq=False)
+class Anew:
+    """A recorded run goes on with another state than it had."""
+
+    moment: Moment
+
+
+Event = RawScan | RawSamples | RawOdometry | RawImu | Turn | Anew
 
 
 class Source(ABC):
@@ -65,6 +75,7 @@ class Source(ABC):
         total: units of progress in the whole log; done: so far.
         mount: (x, y, yaw) of the lidar as the log knows it, m and rad, or None.
         header: of a recording: versions and configuration it was made with.
+        begin: the moment that it begins at, None where that is the start of a run.
     """
 
     kind: ClassVar[str]
@@ -78,6 +89,7 @@ class Source(ABC):
         self.total, self.done = total, 0
         self.mount: Mount | None = None
         self.header: dict[str, Any] = {}
+        self.begin: Moment | None = None
 
     @abstractmethod
     def events(self) -> Iterator[Event]:
@@ -208,9 +220,10 @@ class RecordingSource(Source):
     kind = "recording"
     recorded = True
 
-    def __init__(self, path: Path) -> None:
-        """Open it; raises `HalError`."""
-        self._recording: Recording = open_recording(path)
+    def __init__(self, path: Path, until: float = -math.inf) -> None:
+        """Open it, at its beginning or at the last state before the instant ``until`` (t_mono); raises `HalError`."""
+        whole = open_recording(path)
+        self._recording: Recording = beginning(whole, until)
         self._codec = PassiveHokuyo(device=str(path))
         size = sum(file.stat().st_size for file in self._recording.segments)
         super().__init__(path, LogReport(), self._codec.status, size)
@@ -218,6 +231,10 @@ class RecordingSource(Source):
         self.header = self._recording.header
         self._utc = float(self.header.get("t_utc", 0.0)) - float(self.header.get("t_mono", 0.0))
         self._marks = _Marks()
+        if state_beside(self._recording.segments[0]).exists() and self._recording.first > 0:
+            self.begin = read_moment(state_beside(self._recording.segments[0]))
+        if len(self._recording.segments) < len(whole.segments) and until == -math.inf:
+            self.report.notes.append(f"begins with segment {self._recording.first}: what is before has lost its state")
 
     def stamp(self, scan: RawScan) -> float:
         """UTC as the recording computer knew it when the recording began, carried on by its monotonic clock."""
@@ -229,6 +246,8 @@ class RecordingSource(Source):
 
     def events(self) -> Iterator[Event]:
         """Inputs and cycles in the order in which they happened."""
+        if self.begin is not None:
+            self._listen_in(self.begin)
         for frame in self._recording.frames(self.report):
             self.done += len(frame.payload) + 20
             try:
@@ -239,6 +258,13 @@ class RecordingSource(Source):
             if event is not None:
                 yield event
         self._say()
+
+    def _listen_in(self, moment: Moment) -> None:
+        """Let the codec hear what the line had said before."""
+        for frame in frames_in(moment.line):
+            self._event(frame)
+        self._marks = _Marks()
+        self.report.notes.append(f"begins in the middle of a run, with the state after cycle {moment.cycle}")
 
     def _event(self, frame: Frame) -> Event | None:
         match frame.kind:
@@ -256,9 +282,18 @@ class RecordingSource(Source):
                 return unpack_imu(frame.payload)
             case Kind.CYCLE:
                 return Turn(frame.t_mono, decode_cycle(frame.payload))
+            case Kind.STATE:
+                return self._anew()
             case Kind.NOTE:
                 self.report.notes.append(frame.payload.decode("utf-8", "replace"))
         return None
+
+    def _anew(self) -> Anew | None:
+        """The state of the segment that is being read, unless it is the one that this begins with."""
+        segment = self._recording.segments[self._recording.reading]
+        if self.begin is not None and self._recording.reading == 0:
+            return None
+        return Anew(read_moment(state_beside(segment)))
 
     def _claim(self, mark: ScanMark) -> RawScan | None:
         """The decoded scan that the driver delivered then, under the driver's number and time.

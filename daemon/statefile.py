@@ -24,7 +24,6 @@ from daemon.wholefile import sync_folder
 
 MAGIC: Final = b"LUMISTAT"
 VERSION: Final = 1
-SUFFIX: Final = ".lumistate"
 LINE: Final = -2
 BLOCK_BYTES: Final = 256 << 10
 LONGEST: Final = 1 << 30
@@ -38,11 +37,6 @@ _decode: Final = msgspec.msgpack.Decoder(list[tuple[int, str, bytes]]).decode
 
 class BadState(Exception):
     """A state file that cannot be used; the text says what is wrong with it."""
-
-
-def state_name(segment: int) -> str:
-    """Name of the state file for a segment."""
-    return f"{segment:06d}{SUFFIX}"
 
 
 def write_state(

@@ -137,12 +137,17 @@ class CycleWorker:
 class ScheduledWorker:
     """Replay of a recording: each answer is applied in the cycle in which it was applied when recorded."""
 
-    def __init__(self, schedule: Mapping[int, tuple[int, ...]]) -> None:
-        """Take the schedule: cycle number, counted from 1, to the job IDs applied in it, in order."""
+    def __init__(
+        self, schedule: Mapping[int, tuple[int, ...]], cycle: int = 0, jobs: Mapping[int, Job] | None = None
+    ) -> None:
+        """Take the schedule: cycle number, counted from 1, to the job IDs applied in it, in order.
+
+        ``cycle``: the last one before this, and ``jobs`` by ID that were under way then.
+        """
         self.failed = 0
         self._schedule = schedule
-        self._cycle = 0
-        self._jobs: dict[int, Job] = {}
+        self._cycle = cycle
+        self._jobs: dict[int, Job] = dict(jobs or {})
 
     def submit(self, jobs: Iterable[Job]) -> None:
         """Keep jobs until the schedule calls for them; one it never calls for had not answered when recorded."""

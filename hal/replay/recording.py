@@ -35,6 +35,7 @@ MAGIC: Final = b"LUMIREC\n"
 VERSION: Final = 2
 """Version 2 added SAMPLES, and lights in the header; what version 1 wrote reads as it did."""
 SUFFIX: Final = ".lumirec"
+STATE_SUFFIX: Final = ".lumistate"
 MARKER: Final = b"\xa5\x5a"
 LONGEST: Final = 1 << 20
 """No record is longer; a length beyond it is damage."""
@@ -151,6 +152,11 @@ def segment_name(number: int) -> str:
     return f"{number:06d}{SUFFIX}"
 
 
+def state_name(number: int) -> str:
+    """File name of the state that the ``number``-th segment can be replayed from, where there is one beside it."""
+    return f"{number:06d}{STATE_SUFFIX}"
+
+
 def segments_of(folder: Path) -> list[Path]:
     """Segments of a recording in order.
 
@@ -178,13 +184,17 @@ def _choose(folder: Path, runs: list[Path]) -> list[Path]:
     return []
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Recording:
     """A recording on disk: its header, and its records as a stream."""
 
     path: Path
     header: dict[str, Any]
     segments: tuple[Path, ...]
+    first: int = 0
+    """Number of the segment that it begins with."""
+    reading: int = 0
+    """Index of the segment whose records are being read."""
 
     def frames(self, report: LogReport) -> Iterator[Frame]:
         """Every whole record in order; what is torn or damaged is counted in ``report``, with its place.
@@ -192,8 +202,9 @@ class Recording:
         Raises:
             DeviceRefused: a segment cannot be read.
         """
-        number = -1
-        for path in self.segments:
+        number = self.first - 1
+        for index, path in enumerate(self.segments):
+            self.reading = index
             data = _load(path)
             header, at = _read_head(data)
             if header is None:
@@ -206,6 +217,11 @@ class Recording:
                 report.notes.append(f"{path.name}: the segment before it is missing")
             number = int(header.get("segment", number))
             yield from _frames(path.name, data, at, report)
+
+
+def frames_in(data: bytes) -> Iterator[Frame]:
+    """The whole records in ``data``."""
+    return _frames("", data, 0, LogReport())
 
 
 def open_recording(path: Path) -> Recording:

@@ -11,8 +11,7 @@ import pytest
 from daemon import cli
 from daemon.config import MapConfig
 from daemon.publish.snapshot import State
-from daemon.record import START
-from daemon.store import Start, Store, started
+from daemon.store import START, Start, Store, started
 from daemon.store_image import meta_of, packed
 from estimator import se2
 from estimator.mapimage import Identity, image_of

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,6 +60,7 @@ class Bench:
     folder: Path
     device_name: str = USB
     start: Start | None = None
+    keep_s: float = math.inf
     snapshots: list[Snapshot] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -71,7 +73,7 @@ class Bench:
         self.opener.plug(self.device_name, self.device)
         self.faults = FaultSchedule({"lidar": self.device})
         settings = configured(self.device_name)
-        self.recorder = Recorder(self.folder, settings, self.clock, start=self.start)
+        self.recorder = Recorder(self.folder, settings, self.clock, start=self.start, keep_s=self.keep_s)
         self.daemon = Daemon(settings, self._world(), self.recorder)
         inbox = self.daemon.cycle.inbox
         self.put_odometry = self.recorder.on_odometry(inbox.put_odometry)
@@ -111,10 +113,14 @@ class Bench:
 
 
 def record(
-    folder: Path, scenario: Callable[[Bench], Awaitable[None]], device: str = USB, start: Start | None = None
+    folder: Path,
+    scenario: Callable[[Bench], Awaitable[None]],
+    device: str = USB,
+    start: Start | None = None,
+    keep_s: float = math.inf,
 ) -> Bench:
     async def go() -> Bench:
-        bench = Bench(folder, device, start)
+        bench = Bench(folder, device, start, keep_s)
         stop = asyncio.Event()
         running = asyncio.create_task(bench.daemon.run(stop))
         try:
