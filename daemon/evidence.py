@@ -13,7 +13,7 @@ from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, 
 from daemon.witness import Witnesses
 from estimator import result as light
 from estimator import se2
-from estimator.hypotheses import MOVED_M, MOVED_RAD
+from estimator.hypotheses import near
 from estimator.records import Array, Command, LightEpoch, Odometry, Order, Record, SampleBlock
 from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
@@ -134,8 +134,7 @@ class Observer:
             return False
         self._remembered = None
         T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
-        x, y, yaw = se2.between(remembered, T_map_base).tolist()
-        return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
+        return near(remembered, T_map_base)
 
     def _light(self, t_mono: float, result: StepResult | None) -> Light:
         """What light says in this cycle; a cycle without a step repeats nothing but the silence."""

@@ -254,12 +254,16 @@ def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis
 
 def decide(state: State) -> None:
     """Take the robot to the place that is sure, if one is."""
-    one = state.atlas.seek.favourite()
-    if one is None:
-        return
-    told, seek = said(state, one), state.atlas.seek
-    if seek.sure(one, told is True) or (told is not False and seek.recalled(one)):
-        land(state, one, told is not True)
+    seek = state.atlas.seek
+    one = seek.favourite()
+    if one is not None:
+        witnessed = said(state, one) is True
+        if seek.sure(one, witnessed):
+            land(state, one, not witnessed)
+            return
+    one = seek.recalled()
+    if one is not None and said(state, one) is not False:
+        land(state, one, said(state, one) is not True)
 
 
 def said(state: State, one: Hypothesis) -> bool | None:

@@ -152,16 +152,23 @@ class Seek:
             return False
         return witnessed or (len(self.alive) == 1 and len(one.held) >= HELD and one.apart() >= HELD_M)
 
-    def recalled(self, one: Hypothesis) -> bool:
-        """Whether a place is the robot's because it stood there last, and fits nowhere else in the whole map.
+    def recalled(self) -> Hypothesis | None:
+        """The place where the robot stood last, if the laser holds it, and no other one in the whole map.
 
         Neither is enough by itself: a robot that was carried off may stand where it looks alike, and of two places
         that fit the remembered one may be the wrong one.
         """
-        if self.remembered is None or not self.complete or one.idle or len(self.alive) != 1 or self.alive[0] is not one:
-            return False
-        x, y, yaw = se2.between(self.remembered, one.T_map_odom).tolist()
-        return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
+        here = [one for one in self.alive if self.remembered is not None and near(self.remembered, one.T_map_odom)]
+        if len(here) != 1 or not self.complete or not here[0].held or here[0].idle:
+            return None
+        rivals = [one for one in self.alive if one is not here[0]]
+        return None if any(one.held or one.share >= here[0].share for one in rivals) else here[0]
+
+
+def near(remembered: Array, T_map_odom: Array) -> bool:
+    """Whether a robot that is found there may have been left where it is remembered."""
+    x, y, yaw = se2.between(remembered, T_map_odom).tolist()
+    return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
 
 
 def nearly(one: Hypothesis) -> Hypothesis | None:
