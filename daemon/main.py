@@ -11,24 +11,20 @@ import asyncio
 import gc
 import logging
 import math
-import secrets
 import signal
-import time
-from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass, replace
+from collections.abc import Coroutine
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from daemon import configfile
 from daemon.bridge import SampleBridge, ScanBridge
-from daemon.budget import Budget, MeasuredBudget
 from daemon.cli import FAILED, OK, USAGE
-from daemon.config import Config, LidarConfig
-from daemon.cycle import Cycle, Pacemaker, Parts, Sink, Step
-from daemon.endpoints import parse_lidar
+from daemon.config import Config
+from daemon.cycle import Cycle, Pacemaker, Parts, Step
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.lastpose import LastPose
@@ -36,29 +32,28 @@ from daemon.lights import Lights, SurveyError, load_lights, new_state
 from daemon.logs import start_log
 from daemon.network import Feeds, Network
 from daemon.notify import notify
-from daemon.photodiode import AdcMaker, BlockWatch, make_adc
+from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State
 from daemon.realtime import claim
 from daemon.sampleclock import SampleClock, runtime_folder
-from daemon.store import NoMap, Start, Store, folder_of, started
+from daemon.store import NoMap, Start, folder_of, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.warmup import CannotLoad, Warmth, warm_up
-from daemon.worker import ThreadWorker, Worker
+from daemon.world import NoLidar, World
 from estimator.records import Command, Limits, Order, Record
 from estimator.result import StepResult
-from hal.clock import Clock, SystemClock
+from hal.clock import SystemClock
 from hal.errors import HalError
-from hal.i2c import BusOpener
-from hal.lidar import Lidar, LidarGeometry, LidarStatus, RawScan
-from hal.opening import open_bus, open_port
-from hal.port import PortOpener
+from hal.lidar import Lidar, RawScan
 
 if TYPE_CHECKING:
     from daemon.record import Recorder
     from estimator.state import State as Estimate
+
+__all__ = ["Daemon", "World", "main"]
 
 log = logging.getLogger(__name__)
 
@@ -68,81 +63,6 @@ EXTEND_US: Final = 30_000_000
 """Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
 """States in which there is a pose to speak of."""
-
-
-class LidarMaker(Protocol):
-    """Makes a lidar driver from its configuration."""
-
-    def __call__(self, config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
-        """A driver that is not running yet."""
-        ...
-
-
-def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
-    """The driver that the device string names; HOKUYO's where it names none.
-
-    Raises:
-        DeviceRefused: there is no such driver.
-    """
-    from hal.registry import lidar_factory, split
-
-    name, device = split(config.device)
-    place = parse_lidar(device)
-    return lidar_factory(name)(
-        place.device, clock=clock, opener=opener, serial=place.serial, baud=place.baud, intensity=config.intensity
-    )
-
-
-class NoLidar:
-    """Stands in the lidar's place where there is none (`hal.lidar.Lidar`)."""
-
-    def __init__(self) -> None:
-        self._status = LidarStatus(dialect="no lidar")
-
-    @property
-    def geometry(self) -> LidarGeometry | None:
-        """There is none."""
-        return None
-
-    @property
-    def status(self) -> LidarStatus:
-        """Closed, and without an error."""
-        return self._status
-
-    async def run(self, on_scan: Callable[[RawScan], None]) -> None:
-        """Nothing comes."""
-        await asyncio.Event().wait()
-
-
-@dataclass(slots=True)
-class World:
-    """What the daemon meets outside itself. A test replaces any of it; the defaults are the real thing.
-
-    Attributes:
-        stopwatch: measures stages and budget; None: nothing is measured. sinks: get every snapshot too.
-        warm_up: loads the estimator. draw_map_id: identity of a new map frame.
-        lights: survey and sample clock; None: as configured, and a sample clock that is to be found.
-        sample_clock: keeps the sample clock; None: it is not kept.
-        store: keeps maps; None: they are not kept. start: the map that the run begins with.
-        stream: path of the local stream; None: there is none.
-    """
-
-    clock: Clock
-    opener: PortOpener = open_port
-    make_lidar: LidarMaker = make_lidar
-    make_worker: Callable[[], Worker] = ThreadWorker
-    make_budget: Callable[[], Budget] = MeasuredBudget
-    stopwatch: Callable[[], float] | None = time.perf_counter
-    warm_up: Callable[[], Awaitable[object]] = warm_up
-    sinks: tuple[Sink, ...] = ()
-    draw_map_id: Callable[[], int] = lambda: 1 + secrets.randbelow(2**32 - 1)
-    buses: BusOpener = open_bus
-    make_adc: AdcMaker = make_adc
-    lights: Lights | None = None
-    sample_clock: SampleClock | None = None
-    store: Store | None = None
-    start: Start | None = None
-    stream: Path | None = None
 
 
 class Daemon:
