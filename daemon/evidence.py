@@ -13,7 +13,6 @@ from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, 
 from daemon.witness import Witnesses
 from estimator import result as light
 from estimator import se2
-from estimator.hypotheses import near
 from estimator.records import Array, Command, LightEpoch, Odometry, Order, Record, SampleBlock
 from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link
@@ -132,6 +131,8 @@ class Observer:
         remembered = self._remembered
         if result is None or result.loop is None or result.loop.reason is not LoopReason.PLACED or remembered is None:
             return False
+        from estimator.hypotheses import near  # the estimator has been loaded, by the warm-up
+
         self._remembered = None
         T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
         return near(remembered, T_map_base)

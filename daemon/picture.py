@@ -12,7 +12,6 @@ from daemon.publish.lights import ROWS
 from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
 from daemon.state_memory import Memory
 from estimator import se2
-from estimator.motion import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN
 from estimator.records import Array
 from estimator.result import Fix, Link, LinkState, Loop, StepResult
 from estimator.result import LoopReason as Why
@@ -150,6 +149,8 @@ def _pose(result: StepResult) -> Triple:
 
 def _aged(result: StepResult, facts: Facts) -> Array:
     """The covariance now: a robot that nothing has told of since may have moved, as the next step will reckon."""
+    from estimator.motion import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN  # loaded by the warm-up
+
     unseen = facts.t_mono - result.t_mono - LONGEST_CARRY_S
     if unseen <= 0.0:
         return result.covariance
