@@ -60,6 +60,7 @@ class CycleRecord:
         scan: `RawScan.seq` of the scan consumed, None without one. dropped: those that a later scan replaced.
         odometry, imu, samples: readings, and blocks of light samples, received since the start, all consumed by now.
         commands: consumed. answers: job IDs of the answers applied, in order.
+        switched: SHA-256 of the stored map that the estimator has gone on in with this cycle, empty: none.
         limits: the step's caps; None where nothing had arrived and no step was made.
         result: of the step, or the previous one's; None before the first. snapshot: what was published.
         stage_us: measured microseconds by stage, empty without a stopwatch.
@@ -78,6 +79,7 @@ class CycleRecord:
     snapshot: Snapshot
     stage_us: dict[str, int]
     samples: int = 0
+    switched: str = ""
 
 
 Tap = Callable[[CycleRecord], None]
@@ -145,6 +147,8 @@ class Cycle:
         self.alarm = Alarm(parts.alert_m)
         self.trust = Trust(limit_m=parts.alert_m or None, alert=self.alarm.on)
         self.paused = False
+        self._switch: Callable[[], tuple[int, str]] | None = None
+        self._switched = ""
         self._held: list[Answer] = []
 
     def run(self) -> Snapshot:
@@ -181,6 +185,7 @@ class Cycle:
                 snapshot=snapshot,
                 stage_us=stages.us,
                 samples=taken.samples_total,
+                switched=self._switched,
             )
             self.parts.tap(record)
         return snapshot
@@ -197,6 +202,10 @@ class Cycle:
             return ()
         answers, self._held = tuple(replace(answer, t_begin=t_mono) for answer in self._held), []
         return answers
+
+    def switch(self, take_over: Callable[[], tuple[int, str]]) -> None:
+        """Before the next step, have the estimator go on in another map: ``take_over`` does it, tells ID and digest."""
+        self._switch = take_over
 
     def announce(self) -> None:
         """Publish where we stand without running a cycle: while the estimator is still being loaded."""
@@ -262,8 +271,12 @@ class Cycle:
 
     def _step(self, records: tuple[Record, ...], stages: _Stages) -> Limits | None:
         """Step the estimator under the budget's caps and return them; None where there was nothing to step over."""
+        self._switched = ""
         if not records:
             return None
+        if (switch := self._switch) is not None:
+            self._switch = None
+            self._painter.map_id, self._switched = switch()
         parts = self.parts
         light = any(isinstance(record, SampleBlock) for record in records)
         limits = parts.budget.limits(self.budget_us, light)

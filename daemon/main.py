@@ -30,13 +30,14 @@ from daemon.heartbeat import Heartbeat
 from daemon.lastpose import LastPose
 from daemon.lights import Lights, SurveyError, load_lights, new_state
 from daemon.logs import start_log
+from daemon.mapswitch import Maps, MapSwitch, Switch, take_over
 from daemon.network import Feeds, Network
 from daemon.notify import notify
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State
 from daemon.realtime import claim
 from daemon.sampleclock import SampleClock, runtime_folder
-from daemon.store import NoMap, Start, folder_of, started
+from daemon.store import NoMap, Start, folder_of, judge_for, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
 from daemon.supervise import Supervisor
@@ -103,6 +104,7 @@ class Daemon:
         )
         self.keeper = self._keeper(settings, lights)
         self.last_pose = None if world.store is None else LastPose(world.store.folder)
+        self.maps = self._map_switch(lights)
         self.pacemaker = Pacemaker(self.cycle)
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
         on_samples = self.pacemaker.on_samples
@@ -173,6 +175,22 @@ class Daemon:
         world, cycle = self._world, self.cycle
         return Keeper(world.store, world.start, lambda: self._estimator.state, lambda: cycle.map_id, about, world.clock)
 
+    def _map_switch(self, lights: Lights | None) -> MapSwitch:
+        keep = None if self._recorder is None else self._recorder.keep_switch
+        maps = Maps(self._world.store, judge_for(lights), self._estimator.made, keep)
+        return MapSwitch(maps, self.keeper, self._put_switch)
+
+    def _put_switch(self, switch: Switch, taken: Callable[[], None]) -> None:
+        """The cycle takes it over; what is kept of maps knows it in the same instant."""
+
+        def take_over() -> tuple[int, str]:
+            self._estimator.take_over(switch)
+            asyncio.get_running_loop().call_soon(self.keeper.switched, switch.start)
+            taken()
+            return switch.map_id, switch.sha256
+
+        self.cycle.switch(take_over)
+
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
         parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._take_scan)}
@@ -191,9 +209,11 @@ class Daemon:
     def _feeds(self) -> Feeds:
         inbox, recorder = self.cycle.inbox, self._recorder
         if recorder is None:
-            return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command, self.keeper.ask)
+            return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command, self.keeper.ask, on_switch=self.maps.ask)
         on_odometry, on_imu = recorder.on_odometry(inbox.put_odometry), recorder.on_imu(inbox.put_imu)
-        return Feeds(on_odometry, on_imu, inbox.put_command, self.keeper.ask, recorder.box.dump)
+        return Feeds(
+            on_odometry, on_imu, inbox.put_command, self.keeper.ask, recorder.box.dump, on_switch=self.maps.ask
+        )
 
     def _keep_sample_clock(self) -> None:
         result, store = self.cycle.result, self._world.sample_clock
@@ -230,6 +250,17 @@ class _Estimator:
         self._lights = lights
         self._start = start
         self._step: Step | None = None
+
+    def made(self, start: Start) -> Estimate:
+        """A state as at a start in a stored map; may be called in another thread."""
+        from estimator import pipeline
+
+        return new_state(self._lights, pipeline.Settings(), replace(start, localise=self._localise))
+
+    def take_over(self, switch: Switch) -> None:
+        """Go on in another map."""
+        assert self.state is not None
+        take_over(self.state, switch.donor)
 
     def load(self) -> Step:
         """Load the estimator, and the map into it."""

@@ -45,6 +45,11 @@ LIDAR, PHOTODIODE = 0, 0
 Pose = tuple[float, float, float]
 
 
+def switch_name(sha256: str) -> str:
+    """File of a recording's folder: a map that the run has gone on in."""
+    return f"switch-{sha256[:16]}.lumimap"
+
+
 class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
     """A command as a cycle consumed it."""
 
@@ -61,7 +66,7 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
         odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
         codes: `Limits.codes`, None where nothing was stepped or before there were lights.
         samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
-        rung: `Limits.rung`.
+        rung: `Limits.rung`. switched: `CycleRecord.switched`; the map is in a file of its own, see :func:`switch_name`.
     """
 
     cycle: int
@@ -79,6 +84,7 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
     samples: int = 0
     light: Pose | None = None
     rung: int = 0
+    switched: str = ""
 
     def caps(self) -> Limits | None:
         """The step's caps as the estimator takes them."""
@@ -125,6 +131,7 @@ def _entry(record: CycleRecord) -> CycleEntry:
         samples=record.samples,
         light=light_of(result),
         rung=0 if limits is None else limits.rung,
+        switched=record.switched,
     )
 
 
@@ -203,6 +210,14 @@ class Recorder:
         """Keep a cycle's decisions (`daemon.cycle.Tap`)."""
         self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
         self.box.on_cycle(record)
+
+    def keep_switch(self, sha256: str, content: bytes) -> None:
+        """Keep a map that the run is to go on in; for another thread, it may be large.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        write_whole(self.disk.folder / switch_name(sha256), content)
 
     def on_scan(self, then: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
         """A scan callback that marks the scan and passes it on."""

@@ -17,12 +17,14 @@ from daemon.config import Config
 from daemon.cycle import Cycle, CycleRecord, Parts
 from daemon.ledger import Ledger
 from daemon.lights import Lights, new_state
+from daemon.mapswitch import take_over
 from daemon.moment import Restored
 from daemon.photodiode import BlockWatch
-from daemon.record import CycleEntry, light_of
+from daemon.record import CycleEntry, light_of, switch_name
 from daemon.results import finest
 from daemon.sources import Anew, Event, Source, Turn
-from daemon.store import Start
+from daemon.store import Start, recorded_start
+from daemon.store_file import BadMap
 from daemon.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
 from estimator.grid import Grid
@@ -116,6 +118,7 @@ class Rerun:
         self.t_first = math.inf
         self._source = source
         self._clock = ReplayClock()
+        self._lights, self._localise = lights, config.map.localise
         settings = pipeline.Settings(history=True, localise=config.map.localise)
         self._state = new_state(lights, settings, start) if begin is None else begin.keep_history()
         self._journal = journal
@@ -219,6 +222,8 @@ class Rerun:
         self.t_first = min(self.t_first, turn.t_mono)
         for command in entry.orders():
             self.cycle.inbox.put_command(command)
+        if entry.switched:
+            self.cycle.switch(partial(self._switch, entry.switched))
         self._caps.now = entry.caps() or UNLIMITED
         self._answers[self.cycle.cycles + 1] = entry.answers
         try:
@@ -236,6 +241,21 @@ class Rerun:
         self.cycle.parts.worker = self._scheduled(begin)
         if self._journal is not None:
             self._journal.attach(self._state)
+
+    def _switch(self, sha256: str) -> tuple[int, str]:
+        """Go on in the map that the recorded run went on in.
+
+        Raises:
+            LookupError: it is not with the recording, or not the one.
+        """
+        path = self._source.files[0].parent / switch_name(sha256)
+        try:
+            start = recorded_start(path, sha256, self._lights, self._localise)
+        except (OSError, BadMap) as error:
+            raise LookupError(f"{path.name}, the map that the run went on in, cannot be used: {error}") from error
+        self.ledger.settle(pipeline.keyframe_poses(self._state))
+        take_over(self._state, new_state(self._lights, pipeline.Settings(history=True, localise=self._localise), start))
+        return start.stored.meta.map_id, sha256
 
     def _compare(self, entry: CycleEntry, record: CycleRecord) -> None:
         result = record.result

@@ -195,6 +195,25 @@ class Store:
                 return None
         return None
 
+    def load_map(self, map_id: int, judge: Judge = unjudged) -> Start:
+        """The newest good generation of one map.
+
+        Raises:
+            BadMap: none is good, or it belongs to another building. OSError: it cannot be read.
+        """
+        failure: BadMap | OSError = Foreign(f"there is no map {map_id:08x} in {self.folder}")
+        for generation in self.generations():
+            if generation.map_id == map_id:
+                try:
+                    start = self._read(generation, judge)
+                except (BadMap, OSError) as error:
+                    log.error("%s is refused: %s", generation.path, error)
+                    failure = error
+                else:
+                    self._origin = generation.path
+                    return start
+        raise failure
+
     def _read(self, generation: Generation, judge: Judge) -> Start:
         content = generation.path.read_bytes()
         stored = read(content)

@@ -104,6 +104,21 @@ class Keeper:
         """Whether a stored map was found that cannot be used, and none has been saved since."""
         return self._store is not None and self._store.refused and self.saves == 0
 
+    @property
+    def ready(self) -> bool:
+        """Whether the estimator has been loaded."""
+        return self._state() is not None
+
+    @property
+    def map_id(self) -> int:
+        """Identity of the map in use."""
+        return self._map_id()
+
+    def switched(self, start: Start) -> None:
+        """The estimator goes on in another stored map, which need not be saved as it is."""
+        self._start, self._map_of, self._anew = start, self._map_id(), False
+        self.loaded()
+
     def loaded(self) -> None:
         """The estimator has been loaded: what it begins with need not be saved."""
         state = self._state()

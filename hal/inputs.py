@@ -14,6 +14,7 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from hal import inet
@@ -22,6 +23,7 @@ from hal.errors import DataInvalid
 from hal.imu import RawImu
 from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, decode
 from hal.odometry import RawOdometry
+from hal.share import Reader, Share
 
 SESSION_TIMEOUT_S: Final = 1.0  # another sender is taken when the present one has been silent for this long
 MAX_AGE_S: Final = 1.0  # an older kernel stamp or shared-clock time is not believed
@@ -134,6 +136,8 @@ class InputPort:
         self._option = option
         self._allowed = allowed
         self._sockets: list[socket.socket] = []
+        self._readers: list[Reader] = []
+        self._share = Share()
         self._users = 0
         self._opening = asyncio.Lock()
         self._continuity = Continuity()
@@ -177,7 +181,7 @@ class InputPort:
         self._sockets.append(sock)
         with contextlib.suppress(OSError):  # a kernel without it: the time of reading is used
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        asyncio.get_running_loop().add_reader(sock, self._read, sock)
+        self._readers.append(Reader(sock.fileno(), partial(self._read, sock), self._share))
 
     def close(self) -> None:
         """Undo one `open`."""
@@ -186,10 +190,11 @@ class InputPort:
             self._hang_up()
 
     def _hang_up(self) -> None:
-        loop = asyncio.get_running_loop()
+        for reader in self._readers:
+            reader.close()
         for sock in self._sockets:
-            loop.remove_reader(sock)
             sock.close()
+        self._readers.clear()
         self._sockets.clear()
 
     def _read(self, sock: socket.socket) -> None:

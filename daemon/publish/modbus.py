@@ -4,6 +4,7 @@
 * TCP: every request in a segment is answered, in order. A connection that sends what is not Modbus is closed.
 * A turn of the event loop serves at most 64 requests (8 on each of two UDP sockets, one of each of at most 32
   connections, 16 of those that wait with more), so that no client, and no crowd of them, can delay the cycle.
+* All of them together have half of the loop's time (:mod:`hal.share`), however many ask how fast.
 * Nothing waits for a client: an answer that the kernel does not take at once is dropped (UDP), and a connection whose
   answers are not read is left unserved, then closed (TCP).
 """
@@ -30,6 +31,7 @@ from hal import inet
 from hal.clock import Clock
 from hal.inputs import Continuity
 from hal.odometry import RawOdometry
+from hal.share import Reader, Share
 
 UDP_PER_TURN: Final = 8
 TCP_WAITING_PER_TURN: Final = 16
@@ -67,17 +69,23 @@ class Counts:
 class UdpEndpoint:
     """Serves one bound datagram socket."""
 
-    def __init__(self, sock: socket.socket, responder: Responder, counts: Counts, allowed: Allowed = everyone) -> None:
+    def __init__(
+        self,
+        sock: socket.socket,
+        responder: Responder,
+        counts: Counts,
+        allowed: Allowed = everyone,
+        share: Share | None = None,
+    ) -> None:
         self._sock = sock
         self._allowed = allowed
         self._responder = responder
         self._counts = counts
-        self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(sock, self._serve)
+        self._reader = Reader(sock.fileno(), self._serve, share or Share())
 
     def close(self) -> None:
         """Stop serving and close the socket."""
-        self._loop.remove_reader(self._sock)
+        self._reader.close()
         self._sock.close()
 
     def _serve(self) -> None:
@@ -133,10 +141,17 @@ class Connection(asyncio.Protocol):
         """asyncio: bytes have arrived."""
         self._buffer += data
         self._heard = self._loop.time()
-        if not self.waiting and self.serve(1):
-            self._server.wait(self)
-        elif len(self._buffer) > _READ_HIGH and self._transport is not None:
-            self._transport.pause_reading()
+        share, transport = self._server.share, self._transport
+        if share.begin():
+            if not self.waiting and self.serve(1):
+                self._server.wait(self)
+            elif len(self._buffer) > _READ_HIGH and transport is not None:
+                transport.pause_reading()
+            share.end()
+        elif transport is not None:
+            transport.pause_reading()
+            if not self.waiting:
+                self._server.wait(self)
 
     def eof_received(self) -> bool:
         """asyncio: the client sends no more; it gets the answers it is owed, then the connection closes."""
@@ -192,14 +207,18 @@ class Connection(asyncio.Protocol):
 class TcpEndpoint:
     """Serves listening sockets and shares each turn fairly among their connections."""
 
-    def __init__(self, responder: Responder, counts: Counts, allowed: Allowed = everyone) -> None:
+    def __init__(
+        self, responder: Responder, counts: Counts, allowed: Allowed = everyone, share: Share | None = None
+    ) -> None:
         self.allowed = allowed
+        self.share = share or Share()
         self.responder = responder
         self.counts = counts
         self._loop = asyncio.get_running_loop()
         self._connections: dict[Connection, None] = {}
         self._waiting: deque[Connection] = deque()
         self._servers: list[asyncio.Server] = []
+        self._again: asyncio.TimerHandle | None = None
         self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
 
     async def listen(self, sock: socket.socket) -> None:
@@ -210,6 +229,8 @@ class TcpEndpoint:
     async def close(self) -> None:
         """Stop accepting and drop every connection."""
         self._sweeper.cancel()
+        if self._again is not None:
+            self._again.cancel()
         for server in self._servers:
             server.close()
         for connection in list(self._connections):
@@ -245,6 +266,10 @@ class TcpEndpoint:
 
     def _serve_waiting(self) -> None:
         """Round robin, each its part of the turn's share."""
+        if not self.share.begin():
+            self._again = self.share.later(self._serve_waiting)
+            return
+        self._again = None
         connections = min(len(self._waiting), TCP_WAITING_PER_TURN)
         for _ in range(connections):
             connection = self._waiting.popleft()
@@ -253,6 +278,7 @@ class TcpEndpoint:
                 self._waiting.append(connection)
         if self._waiting:
             self._loop.call_soon(self._serve_waiting)
+        self.share.end()
 
     def _sweep(self) -> None:
         now = self._loop.time()
@@ -291,6 +317,7 @@ class ModbusPublisher:
         self._continuity = Continuity()
         self._holding = Holding(on_command, self._take_odometry) if write else None
         self._responder = Responder(self._holding)
+        self._share = Share()
         self._udp: list[UdpEndpoint] = []
         self._tcp: TcpEndpoint | None = None
         self.counts = Counts()
@@ -313,7 +340,7 @@ class ModbusPublisher:
         """
         self.port = 0
         addresses = await inet.resolve(bind, port, passive=True)
-        self._tcp = TcpEndpoint(self._responder, self.counts, self._allowed)
+        self._tcp = TcpEndpoint(self._responder, self.counts, self._allowed, self._share)
         try:
             for address in addresses:
                 await self._listen(self._tcp, address)
@@ -331,7 +358,7 @@ class ModbusPublisher:
             undo.callback(datagrams.close)
             datagrams.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
             await tcp.listen(stream)
-            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts, self._allowed))
+            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts, self._allowed, self._share))
             undo.pop_all()
 
     def publish(self, snapshot: Snapshot) -> None:

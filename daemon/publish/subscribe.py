@@ -19,9 +19,11 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import Any, Final
 
 from hal import inet
+from hal.share import Reader, Share
 
 MAGIC: Final = b"LUSB"
 VERSION: Final = 1
@@ -140,6 +142,7 @@ class Subscriptions:
         self._wanted = port
         self._allowed = allowed
         self._sock: socket.socket | None = None
+        self._reader: Reader | None = None
 
     @property
     def port(self) -> int:
@@ -158,13 +161,14 @@ class Subscriptions:
         except OSError as error:
             device = f"pose subscriptions on {self._bind}:{self._wanted}"
             raise inet.refusal(device, "pose.receivers", self._wanted, error) from error
-        asyncio.get_running_loop().add_reader(self._sock, self._serve, self._sock)
+        self._reader = Reader(self._sock.fileno(), partial(self._serve, self._sock), Share())
 
     async def close(self) -> None:
         """Stop; idempotent. Leases outlive it."""
         sock, self._sock = self._sock, None
+        if self._reader is not None:
+            self._reader.close()
         if sock is not None:
-            asyncio.get_running_loop().remove_reader(sock)
             sock.close()
 
     def send(self, data: bytes) -> None:
