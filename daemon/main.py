@@ -12,7 +12,7 @@ import gc
 import logging
 import math
 import signal
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
