@@ -25,7 +25,7 @@ from daemon.logs import of_state
 from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
-from daemon.publish.snapshot import Snapshot, Trust
+from daemon.publish.snapshot import Condition, Snapshot, Trust
 from daemon.reasons import REASONS
 from daemon.state import judge
 from daemon.state_evidence import SILENT_PERIODS, Evidence
@@ -94,7 +94,7 @@ class Parts:
         samples, blocks: of the photodiode; None where there is none.
         budget_us: time budget of a cycle, 0: half of the scan period.
         stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
-        fault: number of the gravest present fault. map_id: identity of the map frame.
+        fault: number of the gravest present fault. condition: how the daemon's parts are. map_id: of the map frame.
         alert_m: limit of the position error above which an alert is raised, 0: none.
     """
 
@@ -113,6 +113,7 @@ class Parts:
     sinks: list[Sink] = field(default_factory=list)
     tap: Tap | None = None
     fault: Callable[[], int] = int
+    condition: Callable[[], Condition | None] = lambda: None
     map_id: int = 0
     alert_m: float = 0.0
 
@@ -344,6 +345,7 @@ class Cycle:
             blocks_lost=self.blocks_lost(),
             odometry_ok=self.observer.odometry_ok(t_mono),
             fault=parts.fault(),
+            condition=parts.condition(),
             trust=self.trust,
         )
 

@@ -48,6 +48,7 @@ class SegmentWriter:
         records, bytes: written so far. lost: records that could not be written. taken: bytes of the records taken.
         closed: is told of every segment that is complete: its number, its path. Called by the writing thread.
         error: why nothing is being written at the moment; empty while all is well.
+        busy_since: when the write began that has not ended yet (`time.monotonic`), None: there is none.
     """
 
     def __init__(self, parent: Path, name: str, header: dict[str, Any], segment_bytes: int = SEGMENT_BYTES) -> None:
@@ -58,6 +59,7 @@ class SegmentWriter:
         """
         self.records = self.bytes = self.lost = self.taken = 0
         self.error = ""
+        self.busy_since: float | None = None
         self.closed: Callable[[int, Path], None] = _nobody
         self._header = header
         self._segment_bytes = segment_bytes
@@ -110,7 +112,9 @@ class SegmentWriter:
 
     def _work(self) -> None:
         while not self._stop.wait(WRITE_S):
+            self.busy_since = time.monotonic()
             self._turn()
+            self.busy_since = None
         self._retry_at = 0.0
         self._turn()
         self._close()

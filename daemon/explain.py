@@ -16,7 +16,7 @@ from typing import Any, Final
 from daemon import configfile
 from daemon.cli import FAILED, OK, fail
 from daemon.health import FAULTS
-from daemon.publish import holding, integrity, lights, pulse, registers
+from daemon.publish import holding, integrity, lights, parts, pulse, registers
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.points import Layout
 from daemon.reasons import REASONS
@@ -26,6 +26,7 @@ _BLOCKS: Final = (
     ("input register", lights.BODY_ADDRESS, lights.BLOCK),
     ("input register", integrity.BODY_ADDRESS, integrity.BLOCK),
     ("input register", pulse.BODY_ADDRESS, pulse.BLOCK),
+    ("input register", parts.BODY_ADDRESS, parts.BLOCK),
     ("holding register", holding.COMMAND_ADDRESS, holding.COMMAND),
     ("holding register", holding.ODOMETRY_ADDRESS, holding.ODOMETRY),
 )

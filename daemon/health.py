@@ -55,6 +55,7 @@ class Fault(IntEnum):
     MAP_REFUSED = 404
     POSE_NOT_KEPT = 405
     FLIGHT_RECORDER_FAILED = 406
+    THREAD_HANGS = 407
 
 
 FAULTS: Final[dict[Fault, tuple[str, str]]] = {
@@ -155,6 +156,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.FLIGHT_RECORDER_FAILED: (
         "the flight recorder cannot keep a state or a dump",
         "free disk space where it records, see the log for what is in the way",
+    ),
+    Fault.THREAD_HANGS: (
+        "a thread of the daemon does not come back",
+        "the log names it: look for a disk or a bus that hangs; a computation that hangs ends in a restart",
     ),
     Fault.MAP_REFUSED: (
         "a stored map cannot be used",
@@ -309,8 +314,9 @@ STORE: Final = {
     "stored map": Fault.MAP_REFUSED,
     "last pose": Fault.POSE_NOT_KEPT,
     "flight recorder": Fault.FLIGHT_RECORDER_FAILED,
+    "thread": Fault.THREAD_HANGS,
 }
-"""Parts that keep things, by name, and what it means that they are down."""
+"""Parts that keep things, and threads, by name, and what it means that they are down."""
 
 
 def _outputs(now: Vitals) -> Iterable[Fault]:

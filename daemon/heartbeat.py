@@ -30,12 +30,19 @@ class Heartbeat:
     Args:
         vitals: takes a sample, given the loop's lateness in seconds.
         statistics: a line for the log, now and then.
+        alive: whether the threads answer; else the watchdog is not fed.
     """
 
-    def __init__(self, vitals: Callable[[float], Vitals], statistics: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        vitals: Callable[[float], Vitals],
+        statistics: Callable[[], str],
+        alive: Callable[[], bool] = lambda: True,
+    ) -> None:
         self.faults: tuple[Fault, ...] = ()
         self._vitals = vitals
         self._statistics = statistics
+        self._alive = alive
         self._samples: deque[Vitals] = deque()
         self._beats = 0
 
@@ -62,7 +69,7 @@ class Heartbeat:
             self._samples.popleft()
         worst = max(sample.lateness for sample in self._samples)
         self._tell(assess(replace(now, lateness=worst), self._samples[0]))
-        if len(self._samples) < 2 or now.cycles > self._samples[-2].cycles:
+        if (len(self._samples) < 2 or now.cycles > self._samples[-2].cycles) and self._alive():
             notify("WATCHDOG=1")
         self._beats += 1
         if self._beats % STATISTICS_BEATS == 0:

@@ -21,8 +21,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from daemon import configfile
+from daemon.answers import COMPUTING_S, DISK_S, Answers
 from daemon.bridge import SampleBridge, ScanBridge
 from daemon.cli import FAILED, OK, USAGE
+from daemon.condition import Reporter
 from daemon.config import Config
 from daemon.cycle import Cycle, Pacemaker, Parts, Step
 from daemon.health import Vitals
@@ -34,7 +36,7 @@ from daemon.mapswitch import Maps, MapSwitch, Switch, take_over
 from daemon.network import Feeds, Network
 from daemon.notify import notify
 from daemon.photodiode import BlockWatch
-from daemon.publish.snapshot import Snapshot, State
+from daemon.publish.snapshot import Snapshot, State, Thread
 from daemon.realtime import claim
 from daemon.sampleclock import SampleClock, runtime_folder
 from daemon.store import NoMap, Start, folder_of, judge_for, started
@@ -43,12 +45,15 @@ from daemon.store_tables import digest_of
 from daemon.supervise import Supervisor
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.warmup import CannotLoad, Warmth, warm_up
+from daemon.worker import ThreadWorker
 from daemon.world import NoLidar, World
 from estimator.records import Command, Limits, Order, Record
 from estimator.result import StepResult
+from hal.adc import BusStuck
 from hal.clock import SystemClock
 from hal.errors import HalError
 from hal.lidar import Lidar, RawScan
+from hal.photodiode.silence import HANG_S
 
 if TYPE_CHECKING:
     from daemon.record import Recorder
@@ -112,8 +117,12 @@ class Daemon:
         self.network = Network(settings, world.clock, self._feeds(), world.stream)
         kept = [] if self.last_pose is None else [self.last_pose.take]
         self.cycle.parts.sinks += [*self.network.sinks, *kept, *world.sinks, _FirstPose()]
-        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle))
+        self.answers = self._answers()
+        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle), lambda: self.answers.alive)
         self.cycle.parts.fault = self.heartbeat.fault
+        drivers = self.lidar.status, None if self.adc is None else self.adc.status
+        reporter = Reporter(world.clock, self.supervisor, self.answers, lambda: self.heartbeat.faults, drivers)
+        self.cycle.parts.condition = reporter
         if recorder is not None:
             recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults)
 
@@ -201,6 +210,21 @@ class Daemon:
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
+    def _answers(self) -> Answers:
+        """The threads that are watched."""
+        answers, keeper, worker = Answers(), self.keeper, self.cycle.parts.worker
+        answers.watch(Thread.MAP, lambda: keeper.busy_since, DISK_S)
+        if isinstance(worker, ThreadWorker):
+            answers.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
+            answers.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
+        if (last := self.last_pose) is not None:
+            answers.watch(Thread.POSE, lambda: last.busy_since, DISK_S)
+        if (recorder := self._recorder) is not None:
+            answers.watch(Thread.RECORDING, lambda: recorder.disk.busy_since, DISK_S)
+        if (adc := self.adc) is not None:
+            answers.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
+        return answers
+
     def _take_scan(self, scan: RawScan) -> None:
         self._on_scan(scan)
         if self.network.stream is not None:
@@ -234,6 +258,8 @@ class Daemon:
             failed.add("last pose")
         if self.keeper.refused:
             failed.add("stored map")
+        if self.answers.look() - {Thread.I2C}:  # a bus has faults of its own
+            failed.add("thread")
         return vitals(self.cycle, failed, lateness)
 
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from daemon.publish.lights import ROWS
-from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
+from daemon.publish.snapshot import Condition, LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
 from daemon.state_memory import Memory
 from estimator import se2
 from estimator.records import Array
@@ -45,6 +45,7 @@ class Facts:
     odometry_ok: bool | None = None
     fault: int = 0
     trust: Trust = NO_TRUST
+    condition: Condition | None = None
 
 
 @dataclass(slots=True)
@@ -101,6 +102,7 @@ class Painter:
             odometry_ok=facts.odometry_ok,
             fault=facts.fault,
             trust=facts.trust,
+            condition=facts.condition,
         )
 
     def _shown(self, result: StepResult | None) -> tuple[LightLink, ...]:

@@ -69,6 +69,7 @@ class Keeper:
 
     Attributes:
         error: why the latest save came to nothing, empty while all is well. saves: so far.
+        busy_since: when the save began that is under way (`time.monotonic`), None: there is none.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Keeper:
         """Nothing happens before :meth:`run`. ``state``: None while the estimator is loaded."""
         self.error = ""
         self.saves = 0
+        self.busy_since: float | None = None
         self._store, self._start, self._state, self._map_id = store, start, state, map_id
         self._about, self._clock = about, clock
         self._saved: Revision | None = None  # the revision that is on the disk
@@ -184,6 +186,7 @@ class Keeper:
             target=self._work, args=(store, image, asyncio.get_running_loop(), end), name="lumiloop-map", daemon=True
         )
         self._thread.start()
+        self.busy_since = time.monotonic()
         self._over.clear()  # after what may fail: else nothing would ever be saved again
 
     def _revision(self, state: State) -> Revision:
@@ -232,6 +235,7 @@ class Keeper:
     def _end(self, revision: Revision, waiting: list[Told], path: Path | None, error: str) -> None:
         """Back in the loop's thread."""
         self._over.set()
+        self.busy_since = None
         self._due = self._clock.now() + (RETRY_S if error else EVERY_S)
         if path is not None:
             self._saved = revision

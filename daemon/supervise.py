@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from random import Random
@@ -24,12 +25,12 @@ class Supervisor:
     """Runs parts; knows which are down.
 
     Attributes:
-        failed: names of the parts that are down right now. restarts: failures so far.
+        failed: names of the parts that are down right now. restarts: failures so far, by name.
         random: of the jitter, which keeps several parts from knocking in step.
     """
 
     failed: set[str] = field(default_factory=set)
-    restarts: int = 0
+    restarts: Counter[str] = field(default_factory=Counter)
     random: Random = field(default_factory=Random)
 
     async def keep(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
@@ -66,7 +67,7 @@ class Supervisor:
             returned.cancel()
 
     def _lost(self, name: str, line: str) -> None:
-        self.restarts += 1
+        self.restarts[name] += 1
         if line and name not in self.failed:
             log.warning("%s; trying again until it works", line)
         self.failed.add(name)

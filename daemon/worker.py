@@ -58,10 +58,14 @@ class ThreadWorker:
 
     One is for what the pose waits for (settling, solving the graph): a search that runs for long never delays it.
     Where both work in Python, the cycle gets its turn at the next switch of threads: see :data:`SWITCH_S`.
+
+    Attributes:
+        since: when each thread began the job that it is at (`time.monotonic`), None while it waits.
     """
 
     def __init__(self) -> None:
         self.failed = 0
+        self.since: list[float | None] = [None, None]
         self._waiting = [_Waiting(), _Waiting()]
         self._done: queue.SimpleQueue[tuple[int, object] | None] = queue.SimpleQueue()
         self._submitted = 0
@@ -69,8 +73,8 @@ class ThreadWorker:
         sys.setswitchinterval(SWITCH_S)
         names = "lumiloop-solver", "lumiloop-search"
         self._threads = [
-            threading.Thread(target=self._work, args=(waiting,), name=name, daemon=True)
-            for name, waiting in zip(names, self._waiting, strict=True)
+            threading.Thread(target=self._work, args=(number,), name=name, daemon=True)
+            for number, name in enumerate(names)
         ]
         for thread in self._threads:
             thread.start()
@@ -101,11 +105,13 @@ class ThreadWorker:
         for thread in self._threads:
             thread.join(timeout=max(0.0, until - time.monotonic()))
 
-    def _work(self, waiting: _Waiting) -> None:
+    def _work(self, number: int) -> None:
         while not self._closed.is_set():
-            _, _, job = waiting.get()
+            _, _, job = self._waiting[number].get()
             if job is not None:
+                self.since[number] = time.monotonic()
                 self._done.put(_run(job))
+                self.since[number] = None
 
 
 class CycleWorker:

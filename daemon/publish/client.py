@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from daemon.publish import integrity, lights, pulse, registers
+from daemon.publish import integrity, lights, parts, pulse, registers
 from daemon.publish.points import U16, Value
 from daemon.publish.snapshot import LightFix, LinkUse, Stage, State
 
@@ -90,6 +90,7 @@ class Reader:
             reading = self._reading(answer)
             reading |= self._block(integrity.ADDRESS, integrity.BLOCK_WORDS, integrity.decode_integrity)
             reading |= self._block(pulse.ADDRESS, pulse.BLOCK_WORDS, pulse.decode_pulse)
+            reading |= self._block(parts.ADDRESS, parts.BLOCK_WORDS, parts.decode_parts)
             if reading["links"] is not None:
                 reading |= self._block(lights.ADDRESS, lights.BLOCK_WORDS, lights.decode_lights)
             return reading
@@ -229,6 +230,7 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("state", _state(reading["state"]) + ("  (STANDS STILL: no new snapshot)" if stalled else "")),
         ("reason", _meaning("reason", reading["reason"])),
         ("fault", _meaning("fault", reading["fault"])),
+        *_more_faults(reading),
         ("map pose", _pose(reading, "map") + _reserve(reading["state"], flags)),
         ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
         *_trust(reading),
@@ -241,9 +243,29 @@ def as_table(reading: Reading, stalled: bool) -> str:
         ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
         ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget{_left_out(reading)}"),
         ("devices", _devices(reading["devices"])),
+        *_parts(reading),
         ("snapshot", f"{reading['seq']}, {_date(reading['t_utc'])}"),
     ]
     return "\n".join(f"{label:<10} {text}".rstrip() for label, text in rows)
+
+
+def _more_faults(reading: Reading) -> list[tuple[str, str]]:
+    """Faults beside the gravest."""
+    numbers = [reading.get(f"fault_{k}") for k in range(2, parts.FAULTS + 1)]
+    return [("", _meaning("fault", number)) for number in numbers if number]
+
+
+def _parts(reading: Reading) -> list[tuple[str, str]]:
+    """For how long it runs, what had to be restarted, what is down or hangs."""
+    if "uptime" not in reading:
+        return []
+    counts = {part.name: reading[f"restarts_{part.name.lower()}"] for part in parts.PARTS}
+    restarted = ", ".join(f"{name} {count:g}" for name, count in counts.items() if count)
+    said = f"{reading['uptime']:g} s" + (f"; restarted: {restarted}" if restarted else "")
+    for word, table in (("down", parts.PARTS), ("hanging", parts.THREADS)):
+        names = [member.name for member in table if int(reading[word] or 0) >> member & 1]
+        said += f"; {word}: {', '.join(names)}" if names else ""
+    return [("running", said)]
 
 
 def _state(number: Value) -> str:

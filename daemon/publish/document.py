@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.health import FAULTS
-from daemon.publish import holding, integrity, lights, modbus, pulse, registers, requests
+from daemon.publish import holding, integrity, lights, modbus, parts, pulse, registers, requests
 from daemon.publish.document_udp import udp_page
 from daemon.publish.holding import CommandCode
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
@@ -102,6 +102,7 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 {_lights()}
 {_integrity()}
 {_pulse()}
+{_parts()}
 {_writing()}
 ## Serial line (RTU)
 
@@ -185,6 +186,31 @@ Medians and the like are those of the last half minute to minute. Read **{pulse.
 
 {table(("address", "name", "type", "step", "not known", "meaning"), block)}
 """
+
+
+def _parts() -> str:
+    first = parts.ADDRESS
+    last = first + parts.BLOCK_WORDS - 1
+    block = [
+        (str(first), "`magic`", "uint16", "", "", f"0x{parts.MAGIC:04X} (\"LP\")."),
+        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {parts.VERSION}."),
+        *layout_rows(parts.BLOCK, parts.BODY_ADDRESS, 1),
+        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
+    ]  # fmt: skip
+    return f"""## The parts: input registers {first} to {last}
+
+Every fault that is present, not the gravest alone, what had to be restarted since the start, and for how long the
+daemon runs: an uptime that begins anew tells of a restart. Read **{parts.BLOCK_WORDS} registers from address {first}
+in one request**. Faults are looked for once a second.
+
+{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+
+{table(("bit of `hanging`", "name", "what hangs, and what then"), _thread_rows())}
+"""
+
+
+def _thread_rows() -> list[tuple[str, ...]]:
+    return [(str(thread.value), thread.name, f"{text}.") for thread, text in parts.THREADS.items()]
 
 
 def _capital(text: str) -> str:

@@ -24,6 +24,7 @@ from daemon.publish import registers
 from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
 from daemon.publish.integrity import encode_integrity
 from daemon.publish.lights import encode_lights
+from daemon.publish.parts import encode_parts
 from daemon.publish.pulse import encode_pulse
 from daemon.publish.requests import MAX_FRAME, Responder, frame_size
 from daemon.publish.snapshot import Snapshot, State
@@ -363,7 +364,7 @@ class ModbusPublisher:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; never waits."""
-        encoders = (registers.encode_mirror, encode_lights, encode_integrity, encode_pulse)
+        encoders = (registers.encode_mirror, encode_lights, encode_integrity, encode_pulse, encode_parts)
         self._responder.show(registers.encode_block(snapshot), *[partial(encode, snapshot) for encode in encoders])
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:

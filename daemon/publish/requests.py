@@ -29,7 +29,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterResponse,
 )
 
-from daemon.publish import integrity, lights, pulse
+from daemon.publish import integrity, lights, parts, pulse
 from daemon.publish.holding import Holding, Refused
 from daemon.publish.registers import MIRROR_ADDRESS, MIRROR_WORDS
 
@@ -52,6 +52,7 @@ _BESIDE: Final = (
     (lights.ADDRESS, lights.BLOCK_WORDS),
     (integrity.ADDRESS, integrity.BLOCK_WORDS),
     (pulse.ADDRESS, pulse.BLOCK_WORDS),
+    (parts.ADDRESS, parts.BLOCK_WORDS),
 )
 """First address and size of the blocks beside the first one, in the order in which they are shown."""
 

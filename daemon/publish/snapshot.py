@@ -101,6 +101,52 @@ class Pulse:
     stages: tuple[Spread | None, ...] = ()
 
 
+class Part(IntEnum):
+    """Parts of the daemon that are restarted when they fail. Numbers are part of the contract: never renumber."""
+
+    LIDAR = 0
+    PHOTODIODE = 1
+    ODOMETRY = 2
+    IMU = 3
+    MODBUS = 4
+    RTU = 5
+    POSE = 6
+    SUBSCRIPTIONS = 7
+    STREAM = 8
+    MAP = 9
+    OTHER = 10
+
+
+class Thread(IntEnum):
+    """Threads of the daemon that are watched. Numbers are part of the contract: never renumber."""
+
+    SOLVER = 0
+    SEARCH = 1
+    MAP = 2
+    POSE = 3
+    RECORDING = 4
+    I2C = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """How the daemon's parts are.
+
+    Attributes:
+        uptime_s: seconds since the start. faults: numbers of all that are present, gravest first.
+        restarts: of each of :class:`Part`, in order. down: those that are down. hanging: threads that do not come back.
+    """
+
+    uptime_s: int = 0
+    faults: tuple[int, ...] = ()
+    restarts: tuple[int, ...] = (0,) * len(Part)
+    down: frozenset[Part] = frozenset()
+    hanging: frozenset[Thread] = frozenset()
+
+
+NO_CONDITION: Final = Condition()
+
+
 @dataclass(frozen=True, slots=True)
 class LightLink:
     """One lamp in view.
@@ -184,7 +230,7 @@ class Snapshot:
         scan_rate: scans per second. missed: scans lost. overruns: cycles over budget. cycle_us: last cycle's duration.
         lidar_ok, adc_ok, odometry_ok: None where not configured.
         fault: number of the gravest present fault, 0: none. trust: how far the pose can be trusted.
-        pulse: how the cycle itself is doing.
+        pulse: how the cycle itself is doing. condition: how the daemon's parts are doing.
     """
 
     seq: int
@@ -219,3 +265,4 @@ class Snapshot:
     loop_reason: int | None = None
     loop_residual: float | None = None
     pulse: Pulse | None = None
+    condition: Condition | None = None
