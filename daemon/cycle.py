@@ -208,6 +208,10 @@ class Cycle:
         """Before the next step, have the estimator go on in another map: ``take_over`` does it, tells ID and digest."""
         self._switch = take_over
 
+    def loops_seen(self, counter: int) -> None:
+        """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
+        self._painter.loop_seen = counter
+
     def announce(self) -> None:
         """Publish where we stand without running a cycle: while the estimator is still being loaded."""
         self._publish(self._painter.paint(None, self.verdict, self._facts(self.parts.clock.now())))

@@ -52,6 +52,7 @@ from estimator.result import StepResult
 from hal.adc import BusStuck
 from hal.clock import SystemClock
 from hal.errors import HalError
+from hal.inputs import OnImu, OnOdometry
 from hal.lidar import Lidar, RawScan
 from hal.photodiode.silence import HANG_S
 
@@ -231,12 +232,19 @@ class Daemon:
             self.network.stream.on_scan(scan)
 
     def _feeds(self) -> Feeds:
-        inbox, recorder = self.cycle.inbox, self._recorder
-        if recorder is None:
-            return Feeds(inbox.put_odometry, inbox.put_imu, inbox.put_command, self.keeper.ask, on_switch=self.maps.ask)
-        on_odometry, on_imu = recorder.on_odometry(inbox.put_odometry), recorder.on_imu(inbox.put_imu)
+        cycle, recorder = self.cycle, self._recorder
+        on_odometry: OnOdometry = cycle.inbox.put_odometry
+        on_imu: OnImu = cycle.inbox.put_imu
+        if recorder is not None:
+            on_odometry, on_imu = recorder.on_odometry(on_odometry), recorder.on_imu(on_imu)
         return Feeds(
-            on_odometry, on_imu, inbox.put_command, self.keeper.ask, recorder.box.dump, on_switch=self.maps.ask
+            on_odometry,
+            on_imu,
+            on_command=cycle.inbox.put_command,
+            on_save=self.keeper.ask,
+            on_dump=None if recorder is None else recorder.box.dump,
+            on_switch=self.maps.ask,
+            on_loop_seen=cycle.loops_seen,
         )
 
     def _keep_sample_clock(self) -> None:
@@ -372,7 +380,9 @@ def _world(settings: Config) -> World:
 def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> str:
     """One line for the person at the terminal: where the pose can be read, what is kept, how to stop."""
     modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
-    said = [modbus if settings.modbus.port else "no Modbus"]
+    said = [modbus if settings.modbus.port else "no Modbus on the network"]
+    said += [f"Modbus RTU on {settings.modbus.serial}"] if settings.modbus.serial else []
+    said += [f"answering {', '.join(settings.allow)} only"] if settings.allow else []
     said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
     said += [f"stream {stream}"] if stream is not None else []
     used = "map from" if settings.map.localise else "maps in"

@@ -41,8 +41,8 @@ class Feeds:
     """Who takes what comes in.
 
     ``on_save`` is asked to save the map, ``on_dump`` to write the flight recorder, ``on_switch`` to go on in another
-    map; each tells the end of it: empty, or why it came to nothing. What
-    is None is refused.
+    map; each tells the end of it: empty, or why it came to nothing. What is None is refused. ``on_loop_seen``: how many
+    loops a client has seen.
     """
 
     on_odometry: OnOdometry
@@ -51,6 +51,7 @@ class Feeds:
     on_save: Callable[[Told], None]
     on_dump: Callable[[Told], None] | None = None
     on_switch: Callable[[int, Told], None] | None = None
+    on_loop_seen: Callable[[int], None] = lambda _: None
 
 
 class OneSender:
@@ -109,6 +110,7 @@ class Network:
             allowed=self._access,
             on_command=lambda request: orders.take(request),
             on_odometry=self._from("Modbus"),
+            on_loop_seen=self._feeds.on_loop_seen,
         )
         orders = Orders(self._clock, self._feeds, modbus.acknowledge)
         self.modbus = modbus

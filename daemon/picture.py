@@ -53,10 +53,11 @@ class Painter:
     """Numbers the snapshots and remembers the latest loop.
 
     Attributes:
-        map_id: identity of the map frame, 0: not known.
+        map_id: identity of the map frame, 0: not known. loop_seen: how many loops somebody has seen, modulo 65536.
     """
 
     map_id: int = 0
+    loop_seen: int = 0
     _seq: int = 0
     _loop: Loop | None = None
     _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
@@ -86,6 +87,7 @@ class Painter:
             jumps=0 if estimate is None else estimate.jumps,
             map_id=self.map_id,
             loop_counter=0 if loop is None else loop.counter,
+            loop_latched=loop is not None and loop.counter % 2**16 != self.loop_seen,
             loop_new=None if loop is None else loop.keyframe_new,
             loop_old=None if loop is None else loop.keyframe_old,
             loop_reason=None if loop is None else LOOPS[loop.reason],

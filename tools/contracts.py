@@ -101,7 +101,8 @@ def _mirror() -> Items:
 
 def _holding_registers() -> Items:
     command = _points("holding", holding.COMMAND, holding.COMMAND_ADDRESS)
-    return command | _points("holding", holding.ODOMETRY, holding.ODOMETRY_ADDRESS)
+    loop = _points("holding", holding.LOOP, holding.LOOP_ADDRESS)
+    return command | loop | _points("holding", holding.ODOMETRY, holding.ODOMETRY_ADDRESS)
 
 
 def _datagram() -> Items:

@@ -239,6 +239,14 @@ is `tools/clients/send_command.py`.
 
 {table(head, holding_rows(holding.COMMAND, holding.COMMAND_ADDRESS))}
 
+### Loop acknowledge, {holding.LOOP_ADDRESS}
+
+The bit `loop_latched` of `flags` is set from a loop closure until somebody writes the `loop_counter` of it here, so
+that a program that reads seldom misses none. There is one latch for all; several programs compare `loop_counter` each
+for itself.
+
+{table(head, holding_rows(holding.LOOP, holding.LOOP_ADDRESS))}
+
 ### Odometry input, {holding.ODOMETRY_ADDRESS} to {holding.ODOMETRY_ADDRESS + holding.ODOMETRY.words - 1}
 
 All {holding.ODOMETRY.words} registers in one request (function 16), at a steady rate of 10 per second or more.

@@ -15,6 +15,7 @@ from typing import Final
 from daemon.publish.points import I32, U16, U32, Layout, Point, from_client
 
 COMMAND_ADDRESS: Final = 1000
+LOOP_ADDRESS: Final = 1050
 ODOMETRY_ADDRESS: Final = 1100
 MAX_READING_AGE_S: Final = 1.0
 
@@ -94,6 +95,13 @@ COMMAND: Final = Layout(
 _ANSWER_AT: Final = 8  # acknowledge, result: told by us
 _WRITABLE: Final = ((0, _ANSWER_AT), (_ANSWER_AT + 2, COMMAND.words))
 
+LOOP: Final = Layout(
+    (
+        _point("loop_seen", "loop closures seen", "Write the `loop_counter` that was read: the bit `loop_latched` of "
+               "`flags` is clear until the next loop."),
+    )
+)  # fmt: skip
+
 ODOMETRY: Final = Layout(
     (
         _point("number", "reading number", "Must change with each reading; 0 says that the odometry was restarted and "
@@ -114,9 +122,17 @@ class Holding:
     Args:
         on_command: called with each new known command; its end is told by :meth:`acknowledge`.
         on_odometry: called with each new reading.
+        on_loop_seen: called with the count of loops that a client has seen.
     """
 
-    def __init__(self, on_command: Callable[[Request], None], on_odometry: Callable[[WrittenOdometry], None]) -> None:
+    def __init__(
+        self,
+        on_command: Callable[[Request], None],
+        on_odometry: Callable[[WrittenOdometry], None],
+        on_loop_seen: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        self._on_loop_seen = on_loop_seen
+        self._loop = bytearray(LOOP.big.size)
         self._on_command = on_command
         self._on_odometry = on_odometry
         self._command = bytearray(COMMAND.big.size)
@@ -126,7 +142,8 @@ class Holding:
 
     def read(self, address: int, count: int) -> bytes:
         """Registers as bytes. Raises Refused where there are none."""
-        for start, memory in ((COMMAND_ADDRESS, self._command), (ODOMETRY_ADDRESS, self._odometry)):
+        blocks = ((COMMAND_ADDRESS, self._command), (ODOMETRY_ADDRESS, self._odometry), (LOOP_ADDRESS, self._loop))
+        for start, memory in blocks:
             if start <= address and 2 * (address - start + count) <= len(memory):
                 return bytes(memory[2 * (address - start) : 2 * (address - start + count)])
         raise Refused
@@ -140,6 +157,9 @@ class Holding:
         elif address == ODOMETRY_ADDRESS and len(data) == len(self._odometry):
             self._odometry[:] = data
             self._take_reading()
+        elif address == LOOP_ADDRESS and len(data) == len(self._loop):
+            self._loop[:] = data
+            self._on_loop_seen(int.from_bytes(data, "big"))
         else:
             raise Refused
 

@@ -300,7 +300,7 @@ class ModbusPublisher:
         clock: time of arrival of written odometry.
         write: whether commands and odometry may be written. allowed: whether a host may be answered.
         on_command: takes each command; tell its end by :meth:`acknowledge`.
-        on_odometry: takes each written odometry reading.
+        on_odometry: takes each written odometry reading. on_loop_seen: how many loops a client has seen.
     """
 
     def __init__(
@@ -311,12 +311,13 @@ class ModbusPublisher:
         allowed: Allowed = everyone,
         on_command: Callable[[Request], None] = _ignore,
         on_odometry: Callable[[RawOdometry], None] = _ignore,
+        on_loop_seen: Callable[[int], None] = _ignore,
     ) -> None:
         self._clock = clock
         self._on_odometry = on_odometry
         self._allowed = allowed
         self._continuity = Continuity()
-        self._holding = Holding(on_command, self._take_odometry) if write else None
+        self._holding = Holding(on_command, self._take_odometry, on_loop_seen) if write else None
         self._responder = Responder(self._holding)
         self._share = Share()
         self._udp: list[UdpEndpoint] = []

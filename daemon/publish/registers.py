@@ -116,6 +116,11 @@ FLAGS: Final[tuple[Bit, ...]] = (
         lambda s: s.trust.horizontal_m is not None,
     ),
     ("alert", "the bound is above the limit that is set, or there is none", lambda s: s.trust.alert),
+    (
+        "loop_latched",
+        "a loop was closed since the last was acknowledged (Modbus, `loop_seen`)",
+        lambda s: s.loop_latched,
+    ),
 )
 DEVICES: Final[tuple[Bit, ...]] = (
     ("lidar_fitted", "a lidar is configured", lambda s: s.lidar_ok is not None),

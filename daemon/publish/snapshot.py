@@ -224,7 +224,8 @@ class Snapshot:
         reason: index into the table of reasons (daemon/reasons.py), 0: none.
         jumps: how often T_map_odom jumped. map_id: identity of the map frame, 0: not known.
         loop_counter: accepted loop closures; loop_new, loop_old: keyframe IDs of the latest, None before the first;
-            loop_reason (:class:`LoopReason`), loop_residual (m): likewise.
+            loop_reason (:class:`LoopReason`), loop_residual (m): likewise. loop_latched: a loop was closed that
+            nobody has said to have seen.
         links: lights in view; None where no photodiode is configured. light_id: the strongest's lamp ID.
         light: what lights alone say; None where no photodiode is configured.
         scan_rate: scans per second. missed: scans lost. overruns: cycles over budget. cycle_us: last cycle's duration.
@@ -264,5 +265,6 @@ class Snapshot:
     trust: Trust = Trust()
     loop_reason: int | None = None
     loop_residual: float | None = None
+    loop_latched: bool = False
     pulse: Pulse | None = None
     condition: Condition | None = None

@@ -21,7 +21,7 @@ from daemon.state_memory import Memory
 from daemon.worker import CycleWorker, ScheduledWorker, Worker
 from estimator import pipeline
 from estimator.records import Command, Job, Limits, Order, Record
-from estimator.result import StepResult
+from estimator.result import Loop, StepResult
 from hal.clock import LoopClock, run_virtual
 from hal.lidar import LidarStatus, Link, RawScan
 from tests.daemon.room import error, raw_odometry, raw_scan, rest
@@ -386,3 +386,22 @@ def test_how_sure_a_guess_is_is_not_said() -> None:
     assert guess.pose is not None
     assert guess.covariance is None
     assert guess.known == (False, False, False)
+
+
+def test_a_loop_is_latched_until_somebody_has_seen_it() -> None:
+    told = StepResult(
+        1.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.ones(3), None, -1, None, 0, np.zeros(3), 0
+    )
+    painter, verdict = Painter(), Memory()
+
+    def latched(counter: int | None) -> bool:
+        loop = None if counter is None else Loop(counter, 9, 2, 0.01)
+        return painter.paint(replace(told, loop=loop), verdict, Facts()).loop_latched
+
+    assert [latched(None), latched(1), latched(None)] == [False, True, True]
+    painter.loop_seen = 1
+    assert [latched(None), latched(2)] == [False, True]
+    painter.loop_seen = 1
+    assert latched(None), "an acknowledgement that comes late loses no loop"
+    painter.loop_seen = 0
+    assert not latched(2**16), "the counter wraps"

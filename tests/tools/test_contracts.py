@@ -11,6 +11,7 @@ import pytest
 from tools import contracts
 from tools.contracts import FROZEN, differences
 
+NUMBER = "uint16, 1/1 , saturates, always known"
 MAP_X = "map_x: int32, 1/10000 m, saturates, may be not known"
 
 
@@ -35,7 +36,7 @@ def test_the_release_before_is_kept_to() -> None:
         ("pose datagram", "byte 40", None, f"byte 40 ({MAP_X}) is gone"),
         ("numbers", "State 3", "LOST", "State 3 was 'TRACKING' and is 'LOST'"),
         ("numbers", "command 3", None, "command 3 (SAVE_MAP) is gone"),
-        ("modbus holding", "holding 1000", None, "holding 1000 (request: uint16, 1/1 , saturates, always known) is gone"),
+        ("modbus holding", "holding 1100", "x", f"holding 1100 was 'number: {NUMBER}' and is 'x'"),
         ("configuration", "key modbus.port", "default 502", "key modbus.port was 'default 1502' and is 'default 502'"),
         ("stream", "topic scan", None, "topic scan is gone"),
     ],

@@ -20,7 +20,8 @@ class Bench:
     def __init__(self, write: bool = True) -> None:
         self.commands: list[Request] = []
         self.odometry: list[WrittenOdometry] = []
-        self.holding = Holding(self.commands.append, self.odometry.append)
+        self.loops: list[int] = []
+        self.holding = Holding(self.commands.append, self.odometry.append, self.loops.append)
         self.responder = Responder(self.holding if write else None)
         taken = snapshot()
         self.block, self.mirror = registers.encode_block(taken), registers.encode_mirror(taken)
@@ -177,6 +178,16 @@ def test_a_map_to_switch_to_is_written_before_the_request() -> None:
     bench.ask(write(1000, 5, CommandCode.SWITCH_MAP))
     assert [(r.code, r.map_id) for r in bench.commands] == [(CommandCode.SWITCH_MAP, 0xDEADBEEF)]
     assert bench.ask(read(3, 1010, 2)) == b"\x03\x04\xde\xad\xbe\xef"
+
+
+def test_a_loop_is_acknowledged_by_its_count() -> None:
+    bench = Bench()
+    bench.ask(write(1050, 65535))
+    assert bench.ask(b"\x06\x04\x1a\x00\x07") == b"\x06\x04\x1a\x00\x07"
+    assert bench.loops == [65535, 7]
+    assert bench.ask(read(3, 1050, 1)) == b"\x03\x02\x00\x07"
+    assert bench.ask(write(1050, 1, 2)) == b"\x90\x02"
+    assert bench.ask(read(3, 1049, 2)) == b"\x83\x02"
 
 
 def test_a_pose_that_is_not_known_is_refused() -> None:
