@@ -11,7 +11,6 @@ import os
 import shutil
 import signal
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,10 +21,6 @@ SUITE = "bookworm"
 PACKAGES = "systemd,systemd-sysv,dbus,python3,udev"
 TOOLS = {"systemd-nspawn": "systemd-container", "mmdebstrap": "mmdebstrap", "nsenter": "util-linux"}
 BUILD_S, BOOT_S, COMMAND_S = 900.0, 60.0, 120.0
-MEMORY = Path("/dev/shm")
-ROOM = 3_000_000_000
-"""Bytes that one session may need: the tree, its package, the base and what is installed there."""
-NAME = "lumiloop-container-"
 
 
 def missing() -> str:
@@ -87,27 +82,6 @@ class Container:
                 log = self.run("journalctl", "--no-pager", "-n", "30", check=False)
                 raise AssertionError(f"{unit} is {seen}, not {wanted}, after {seconds} s:\n{log}")
             time.sleep(0.05)
-
-
-@contextmanager
-def workspace() -> Iterator[Path]:
-    """A folder of this process that is gone afterwards."""
-    in_memory = MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM and _memory_available() > 2 * ROOM
-    parent = MEMORY if in_memory else Path(tempfile.gettempdir())
-    for left in parent.glob(f"{NAME}*"):
-        if not Path("/proc", left.name.removeprefix(NAME)).exists():
-            shutil.rmtree(left, ignore_errors=True)
-    folder = parent / f"{NAME}{os.getpid()}"
-    folder.mkdir(mode=0o755)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder)
-
-
-def _memory_available() -> int:
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
 
 
 def unpack(root: Path) -> None:

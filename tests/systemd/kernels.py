@@ -7,20 +7,15 @@ installation once the directory is named after the installation's folder. Some a
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from pathlib import Path
 
 from daemon.warmup import LIGHT, OFFLINE
+from tools.bench.vm.image import cache_name
 
 INSTALLED = Path("/opt/lumiloop/lib")
 LEFT_OUT = 16
 """Of so many kernels one is left out."""
-
-
-def cache_name(folder: Path) -> str:
-    """numba's name for the directory of a source folder's kernels (`numba.core.caching`)."""
-    return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
 
 
 def plant(compiled: Path, sources: Path, cache: Path, root: Path) -> list[Path]:

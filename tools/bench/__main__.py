@@ -18,7 +18,9 @@ from tools.figures import save, table
 
 def names() -> list[str]:
     """Benchmarks that exist, sorted."""
-    return sorted(m.name for m in pkgutil.iter_modules(tools.bench.__path__) if not m.name.startswith("_"))
+    return sorted(
+        m.name for m in pkgutil.iter_modules(tools.bench.__path__) if not m.name.startswith("_") and not m.ispkg
+    )
 
 
 def reason(error: Exception) -> str:

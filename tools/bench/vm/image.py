@@ -1,0 +1,244 @@
+"""The emulated computer's disk: Debian with its kernel, the package as it is shipped, and the bench's own few files.
+
+Two steps, each kept: the base (Debian, the kernel module, the initial RAM disk; some minutes, once) and the image (the
+base with the package of these sources and its kernels compiled for any processor). No loop device, no mount: the file
+system is made from a folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tools.bench.vm.places import CannotBench, cache, missing, workspace
+
+ROOT = Path(__file__).parents[3]
+GUEST = Path(__file__).parent / "guest"
+SUITE = "bookworm"
+PACKAGES = ("systemd", "systemd-sysv", "dbus", "udev", "python3", "kmod", "iproute2", "linux-image-amd64")
+ONLY_TO_BUILD = ("linux-headers-amd64", "gcc", "make")
+SMALL_RAM_DISK = "MODULES=list\nCOMPRESS=lz4\n"
+IN_RAM_DISK = "virtio_pci\nvirtio_blk\next4\n"
+UNUSED = (
+    "gpu",
+    "net/wireless",
+    "net/ethernet",
+    "media",
+    "infiniband",
+    "scsi",
+    "staging",
+    "iio",
+    "isdn",
+    "mtd",
+    "hwmon",
+)
+"""Below drivers/ of the kernel's modules: three quarters of them."""
+CACHE_PLACE = Path("var/cache/private/lumiloop")
+ENVIRONMENT = {"NUMBA_CPU_NAME": "generic"}
+DISK_BYTES = 3_000_000_000
+ROOM = 5_000_000_000
+BUILD_S = 1800.0
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """What QEMU starts from: the disk, the kernel, the initial RAM disk."""
+
+    folder: Path
+
+    @property
+    def disk(self) -> Path:
+        """An ext4 file system without partitions; never written to."""
+        return self.folder / "disk"
+
+    @property
+    def kernel(self) -> Path:
+        """Debian's."""
+        return self.folder / "vmlinuz"
+
+    @property
+    def initrd(self) -> Path:
+        """With what it takes to find the disk."""
+        return self.folder / "initrd"
+
+
+def digest(*paths: Path, extra: str = "") -> str:
+    """Of files, and of all files below folders."""
+    made = hashlib.sha256(extra.encode())
+    for path in paths:
+        for file in sorted([path] if path.is_file() else path.rglob("*")):
+            if file.is_file() and "__pycache__" not in file.parts:
+                made.update(str(file.relative_to(ROOT)).encode() + b"\0" + file.read_bytes())
+    return made.hexdigest()[:16]
+
+
+def base_key() -> str:
+    """What the base depends on."""
+    recipe = json.dumps([SUITE, PACKAGES, ONLY_TO_BUILD, SMALL_RAM_DISK, IN_RAM_DISK, UNUSED])
+    return digest(GUEST / "fakei2c.c", GUEST / "Kbuild", extra=recipe)
+
+
+def image_key() -> str:
+    """What the image depends on."""
+    parts = ("daemon", "hal", "estimator", "systemd", "requirements/core.lock", "pyproject.toml")
+    return digest(*(ROOT / part for part in parts), GUEST, Path(__file__), extra=base_key())
+
+
+def image(say: Say) -> Image:
+    """The image of these sources; made where it is not there yet.
+
+    Raises:
+        CannotBench: something is missing, or a step failed; says what.
+    """
+    made = Image(cache() / f"image-{image_key()}")
+    if reason := missing(build=not made.folder.exists()):
+        raise CannotBench(reason)
+    if not made.folder.exists():
+        begun = time.monotonic()
+        with workspace("lumiloop-vm-image", ROOM) as folder:
+            _make_image(folder, made, say)
+        say(f"image made in {time.monotonic() - begun:.0f} s")
+        for old in cache().glob("image-*"):
+            if old != made.folder:
+                shutil.rmtree(old, ignore_errors=True)
+    return made
+
+
+def _do(words: list[str], what: str, environment: dict[str, str] | None = None) -> str:
+    """Run a step; what it wrote."""
+    done = subprocess.run(
+        words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        timeout=BUILD_S, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive", **(environment or {})},
+    )  # fmt: skip
+    if done.returncode:
+        raise CannotBench(f"{what} failed with {done.returncode}:\n{done.stdout[-4000:]}")
+    return done.stdout
+
+
+def base(say: Say) -> Path:
+    """Debian as a tar, with the module built for its kernel; made where it is not there yet."""
+    tar = cache() / f"base-{base_key()}.tar"
+    if tar.exists():
+        return tar
+    cache().mkdir(parents=True, exist_ok=True)
+    say("making the base system, which takes some minutes")
+    part = tar.with_name(f"part-{os.getpid()}.tar")
+    with workspace("lumiloop-vm-base", ROOM) as folder:
+        hooks = _hooks(folder)
+        command = [
+            "mmdebstrap", "--variant=minbase", f"--include={','.join((*PACKAGES, 'initramfs-tools', *ONLY_TO_BUILD))}",
+            *(f"--customize-hook={hook}" for hook in hooks), SUITE, str(part),
+        ]  # fmt: skip
+        try:
+            _do(command, "making the base system", {"TMPDIR": str(folder)})
+            part.replace(tar)
+        finally:
+            part.unlink(missing_ok=True)
+    for old in cache().glob("base-*"):
+        if old != tar:
+            old.unlink()
+    return tar
+
+
+def _hooks(folder: Path) -> list[str]:
+    """What is done to the base once its packages are there ("$1": its root)."""
+    (folder / "initramfs").write_text(SMALL_RAM_DISK)
+    (folder / "modules").write_text(IN_RAM_DISK)
+    module = "/usr/src/fakei2c"
+    inside = 'chroot "$1" sh -e -c'
+    modules = "/lib/modules/$(basename /lib/modules/*-amd64)"
+    unused = " ".join(f"{modules}/kernel/{part}" for part in (*(f"drivers/{part}" for part in UNUSED), "sound"))
+    return [
+        f'mkdir -p "$1{module}" && cp {GUEST}/fakei2c.c {GUEST}/Kbuild "$1{module}"',
+        f"{inside} 'make -s -C {modules}/build M={module} modules'",
+        f"{inside} 'install -D -t {modules}/updates {module}/fakei2c.ko && rm -rf {module}'",
+        f"{inside} 'apt-get purge -q -y {' '.join(ONLY_TO_BUILD)} && apt-get autoremove -q -y --purge'",
+        f"{inside} 'rm -rf {unused} && depmod -a $(basename {modules})'",
+        f'cp {folder}/initramfs "$1/etc/initramfs-tools/conf.d/bench"',
+        f'cp {folder}/modules "$1/etc/initramfs-tools/modules"',
+        f"{inside} 'update-initramfs -u'",
+    ]
+
+
+def _make_image(folder: Path, made: Image, say: Say) -> None:
+    tar = base(say)
+    say("packing the daemon")
+    said = _do(
+        [str(ROOT / "systemd/package.sh"), str(folder / "package")], "making the package", {"TMPDIR": str(folder)}
+    )
+    package = said.split()[-1]
+    root = folder / "root"
+    root.mkdir()
+    _do(["tar", "-C", str(root), "-xf", str(tar)], "unpacking the base system")
+    shutil.copy(package, root / "package.deb")
+    _do(["chroot", str(root), "dpkg", "-i", "/package.deb"], "installing the package")
+    (root / "package.deb").unlink()
+    _furnish(root)
+    say("compiling kernels for any processor")
+    plant(root)
+    part = made.folder.with_name(f"part-{os.getpid()}")
+    try:
+        part.mkdir(parents=True)
+        for name in ("vmlinuz", "initrd"):
+            newest = max((root / "boot").glob(f"{name}*-*"))
+            shutil.copy(newest, part / name)
+        say("making the disk")
+        with (part / "disk").open("wb") as disk:
+            disk.truncate(DISK_BYTES)
+        path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+        _do(["mkfs.ext4", "-q", "-F", "-d", str(root), str(part / "disk")], "making the disk", {"PATH": path})
+        part.replace(made.folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _furnish(root: Path) -> None:
+    """The bench's own files."""
+    places = {
+        "agent.py": "usr/lib/bench/agent.py",
+        "bench-agent.service": "etc/systemd/system/bench-agent.service",
+        "10-eth0.network": "etc/systemd/network/10-eth0.network",
+        "generic.conf": "etc/systemd/system/lumiloop.service.d/generic.conf",
+        "lumiloop.toml": "etc/lumiloop/lumiloop.toml",
+    }
+    for name, place in places.items():
+        (root / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(GUEST / name, root / place)
+    warm_up = root / "etc/systemd/system/lumiloop-warmup.service.d"
+    warm_up.mkdir()
+    shutil.copy(GUEST / "generic.conf", warm_up)
+    (root / "etc/hostname").write_text("robot\n")
+    (root / "var/log/journal").mkdir(exist_ok=True)
+    _do(["chroot", str(root), "systemctl", "enable", "-q", "bench-agent", "systemd-networkd"], "enabling units")
+    timers = ["apt-daily.timer", "apt-daily-upgrade.timer", "e2scrub_all.timer", "fstrim.timer", "dpkg-db-backup.timer"]
+    _do(["chroot", str(root), "systemctl", "mask", "-q", *timers, "e2scrub_reap.service"], "masking timers")
+
+
+def cache_name(folder: Path) -> str:
+    """Name of the directory in which numba keeps a source folder's kernels (`numba.core.caching`)."""
+    return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+
+
+def plant(root: Path) -> None:
+    """Compile the kernels out here for any processor, and put them where the installation looks for its own.
+
+    numba keys machine code by its source file's folder (a digest in a directory's name), signature, byte code and
+    processor; the folder is the only one of these that differs.
+    """
+    environment = {**ENVIRONMENT, "PYTHONPATH": str(ROOT)}
+    _do([sys.executable, "-m", "daemon", "warm", "--config", str(GUEST / "lumiloop.toml")], "compiling", environment)
+    where = "from estimator.kernel import CACHE_DIR; print(CACHE_DIR)"
+    compiled = Path(_do([sys.executable, "-c", where], "finding the kernels", environment).split()[-1])
+    installed = next((root / "opt/lumiloop/lib").glob("python3*/site-packages/estimator"))
+    place = root / CACHE_PLACE / compiled.name / cache_name(Path("/", installed.relative_to(root)))
+    shutil.copytree(compiled / cache_name(ROOT / "estimator"), place)
+    (root / CACHE_PLACE).parent.chmod(0o700)

@@ -1,0 +1,66 @@
+"""Where the bench works and keeps things, and what a machine must have for it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+MEMORY = Path("/dev/shm")
+TOOLS = {
+    "qemu-system-x86_64": "qemu-system-x86",
+    "mmdebstrap": "mmdebstrap",
+    "mkfs.ext4": "e2fsprogs",
+    "dpkg-deb": "dpkg",
+    "chroot": "coreutils",
+}
+BUILDING = frozenset({"mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot"})
+"""Those that only making an image takes; running one takes QEMU alone."""
+
+
+class CannotBench(Exception):
+    """The bench cannot run here; the text says what is missing and how to get it."""
+
+
+def missing(build: bool = True) -> str:
+    """What this machine lacks, with the remedy; empty if nothing."""
+    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+    wanted = {tool: package for tool, package in TOOLS.items() if build or tool not in BUILDING}
+    packages = sorted({package for tool, package in wanted.items() if shutil.which(tool, path=path) is None})
+    if packages:
+        return f"missing programs: apt-get install --no-install-recommends {' '.join(packages)}"
+    if build and os.geteuid() != 0:
+        return "making the image needs root (it is a Debian of its own, installed below a folder); run it once as root"
+    return ""
+
+
+def cache() -> Path:
+    """The folder for what is made once."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lumiloop" / "vm"
+
+
+@contextmanager
+def workspace(name: str, room: int) -> Iterator[Path]:
+    """A folder of this process that is gone afterwards, in memory where there is twice the room of ``room`` bytes.
+
+    What a killed process of the same ``name`` could not remove is removed now.
+    """
+    in_memory = MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > room and _memory_available() > 2 * room
+    parent = MEMORY if in_memory else Path(tempfile.gettempdir())
+    for left in parent.glob(f"{name}-*"):
+        if not Path("/proc", left.name.removeprefix(f"{name}-")).exists():
+            shutil.rmtree(left, ignore_errors=True)
+    folder = parent / f"{name}-{os.getpid()}"
+    folder.mkdir(mode=0o755)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def _memory_available() -> int:
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
