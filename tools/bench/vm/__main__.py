@@ -1,0 +1,110 @@
+"""``python -m tools.bench.vm``: the shipped package in an emulated computer, tried from outside.
+
+Ends with 0 if every scenario passed, 1 if one did not, 2 if this machine cannot run it (the text says what is missing).
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tools.bench.vm.bench import Bench, bench
+from tools.bench.vm.image import ROOT, Image, image
+from tools.bench.vm.machine import Order
+from tools.bench.vm.places import CannotBench, cache, workspace
+from tools.bench.vm.report import Result, write
+from tools.bench.vm.scenarios import SCENARIOS, Scenario
+
+ROOM = 2_000_000_000
+CANNOT = 2
+
+
+def say(text: str) -> None:
+    """To the terminal."""
+    print(text, flush=True)
+
+
+def tried(scenario: Scenario, bench: Bench) -> Result:
+    """One scenario's result."""
+    title = (scenario.__doc__ or scenario.__name__).splitlines()[0].rstrip(".")
+    begun = time.monotonic()
+    try:
+        said, passed = scenario(bench), True
+    except (Order, OSError, ValueError, StopIteration) as error:
+        said, passed = f"{error}" or repr(error), False
+    result = Result(scenario.__name__, title, passed, time.monotonic() - begun, said)
+    say(f"{'passed' if passed else 'FAILED'} {result.seconds:6.1f} s  {title}\n{' ' * 17}{said}")
+    return result
+
+
+def chosen(names: list[str]) -> list[Scenario]:
+    """All scenarios, or those up to the last that is named: each builds on the ones before."""
+    if not names:
+        return SCENARIOS
+    known = [one.__name__ for one in SCENARIOS]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise CannotBench(f"no such scenario: {', '.join(unknown)}; there are {', '.join(known)}")
+    return SCENARIOS[: max(known.index(name) for name in names) + 1]
+
+
+def run(made: Image, scenarios: list[Scenario], out: Path) -> list[Result]:
+    """Try them; the console and the daemon's log stay in ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    with workspace("lumiloop-vm", ROOM) as folder:
+        try:
+            with bench(made, folder) as whole:
+                return [tried(scenario, whole) for scenario in scenarios]
+        finally:
+            for name in ("console", "qemu", "world"):
+                if (folder / name).exists():
+                    (out / f"{name}.log").write_bytes((folder / name).read_bytes())
+
+
+def version() -> str:
+    """What was tried."""
+    said = subprocess.run(["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True)
+    return said.stdout.strip() or "unknown"
+
+
+def main() -> int:
+    """Make what is missing, run, report."""
+    parser = argparse.ArgumentParser(prog="python -m tools.bench.vm", description=__doc__)
+    parser.add_argument("scenario", nargs="*", help="up to which (default: all)")
+    parser.add_argument("--out", type=Path, default=Path("out/bench-vm"), help="where results go (default %(default)s)")
+    parser.add_argument("--against", type=Path, help="results.json of another run, to compare with")
+    parser.add_argument("--image-only", action="store_true", help="make the image and stop")
+    parser.add_argument("--list", action="store_true", help="say what is tried")
+    options = parser.parse_args()
+    if options.list:
+        for one in SCENARIOS:
+            say(f"{one.__name__}: {(one.__doc__ or '').splitlines()[0]}")
+        return 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    begun = time.monotonic()
+    try:
+        made = image(say)
+        if options.image_only:
+            return 0
+        results = run(made, chosen(options.scenario), options.out)
+    except CannotBench as reason:
+        say(f"the virtual bench cannot run: {reason}")
+        return CANNOT
+    about = {"version": version(), "image": made.folder.name, "cache": str(cache()),
+             "seconds in all": f"{time.monotonic() - begun:.0f}"}  # fmt: skip
+    worse = write(options.out, results, about, options.against)
+    failed = [one.name for one in results if not one.passed]
+    for text in worse:
+        say(f"worse than before: {text}")
+    say(
+        f"{len(results) - len(failed)} of {len(results)} passed in {about['seconds in all']} s; {options.out}/report.html"
+    )
+    return int(bool(failed or worse))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

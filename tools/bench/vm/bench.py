@@ -1,0 +1,256 @@
+"""What a scenario has at hand: the emulated computer, the world around it, and the daemon as others see it."""
+
+from __future__ import annotations
+
+import json
+import math
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from tools.bench.vm.image import ROOT, Image
+from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
+from tools.bench.vm.places import CannotBench
+from tools.clients.read_modbus import Reader
+
+UNIT: Final = "lumiloop.service"
+CONFIG: Final = "/etc/lumiloop/lumiloop.toml"
+COME_ID: Final = "0f26ad5c5f9d4f6fa1a3c8a7e7c1d9b4"
+OVER_ID: Final = "5c0cb1d0b8a64f27a0a5f5a4b0b9d3e1"
+PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
+KEPT: Final = 30_000
+WORLD_S: Final = 240.0
+Pose = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A pose datagram: when it came, when its pose was true (both this computer's clock), what it says."""
+
+    t_came: float
+    t_pose: float
+    state: int
+    pose: Pose | None
+    sigma_m: float
+
+
+@dataclass(slots=True)
+class Ears:
+    """Everything that has come by UDP, collected by a thread of its own."""
+
+    truth: deque[tuple[float, Pose]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    poses: deque[Heard] = field(default_factory=lambda: deque(maxlen=KEPT))
+
+    def listen(self, truth: socket.socket, poses: socket.socket, stop: threading.Event) -> None:
+        """Until told to stop."""
+        while not stop.is_set():
+            for ready in select.select([truth, poses], [], [], 0.2)[0]:
+                data = ready.recv(2048)
+                if ready is truth:
+                    told = json.loads(data)
+                    self.truth.append((told["t_mono"], (told["x"], told["y"], told["yaw"])))
+                elif data[:4] == b"LUMI":
+                    self.poses.append(heard(data, time.monotonic()))
+
+    def true_pose(self, t: float) -> Pose | None:
+        """Where the robot really was."""
+        told = list(self.truth)
+        at = bisect_left(told, (t,))
+        if at == 0 or at == len(told):
+            return told[-1][1] if told and at else None
+        (t0, a), (t1, b) = told[at - 1], told[at]
+        share = (t - t0) / (t1 - t0)
+        turn = math.remainder(b[2] - a[2], math.tau)
+        return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * turn)
+
+
+def heard(data: bytes, now: float) -> Heard:
+    """A pose datagram's values."""
+    (state,) = struct.unpack_from("<H", data, 12)
+    (age,) = struct.unpack_from("<H", data, 22)
+    x, y, yaw = struct.unpack_from("<iii", data, 40)
+    sigma = max(struct.unpack_from("<HH", data, 76)) / 1e4
+    pose = None if x == -(2**31) else (x / 1e4, y / 1e4, yaw / 1e6)
+    return Heard(now, now - age / 1e4, state, pose, sigma)
+
+
+def inverse_then(frame: Pose, pose: Pose) -> Pose:
+    """``pose`` seen from ``frame``."""
+    dx, dy = pose[0] - frame[0], pose[1] - frame[1]
+    c, s = math.cos(frame[2]), math.sin(frame[2])
+    return (c * dx + s * dy, -s * dx + c * dy, math.remainder(pose[2] - frame[2], math.tau))
+
+
+class Bench:
+    """The whole of it. Made by :func:`bench`."""
+
+    def __init__(self, machine: Machine, world: subprocess.Popen[str], folder: Path, there: dict[str, Any]) -> None:
+        self.machine, self.world, self.folder, self.there = machine, world, folder, there
+        self.ears = Ears()
+        self.start: Pose | None = None
+        self.memory: dict[str, Any] = {}
+
+    def orders(self, text: str) -> str:
+        """An order to the world's devices (`python -m hal.fake`'s control socket): ``order silence for=2``."""
+        with socket.socket(socket.AF_UNIX) as link:
+            link.settimeout(5.0)
+            link.connect(str(self.folder / "control"))
+            link.sendall(text.encode() + b"\n")
+            answer = b""
+            while not answer.endswith(b"ok\n") and b"refused" not in answer:
+                answer += link.recv(4096)
+        if b"refused" in answer:
+            raise Order(f"{text}: {answer.decode()}")
+        return answer.decode()
+
+    def drive(self) -> None:
+        """The robot sets off."""
+        self.world.send_signal(signal.SIGUSR1)
+
+    def read(self, tcp: bool = False) -> dict[str, Any]:
+        """The daemon's block over Modbus; empty where nobody answers."""
+        with suppress(OSError, ValueError):
+            reader = Reader("127.0.0.1", self.machine.ports.modbus, tcp)
+            try:
+                return dict(reader.read())
+            finally:
+                reader.close()
+        return {}
+
+    def ask(self, request: bytes) -> bytes:
+        """Any Modbus request over UDP (function and data), and its answer."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+            link.settimeout(2.0)
+            link.connect(("127.0.0.1", self.machine.ports.modbus))
+            link.send(struct.pack(">HHHB", 7, 0, len(request) + 1, 1) + request)
+            return link.recv(512)[7:]
+
+    def registers(self, address: int, count: int, function: int = 4) -> bytes:
+        """Registers as bytes."""
+        answer = self.ask(struct.pack(">BHH", function, address, count))
+        if answer[0] != function:
+            raise Order(f"Modbus exception {answer[1]} for {count} registers from {address}")
+        return answer[2:]
+
+    def command(self, number: int, seconds: float = 20.0) -> int:
+        """Give a command; its result (2: done, 3: refused)."""
+        request = int(time.monotonic() * 10) % 60000 + 1
+        self.ask(struct.pack(">BHHBHH", 16, 1000, 2, 4, request, number))
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            acknowledge, result = struct.unpack_from(">HH", self.registers(1008, 2, 3))
+            if acknowledge == request:
+                return int(result)
+            time.sleep(0.1)
+        raise Order(f"command {number} was not acknowledged within {seconds:.0f} s")
+
+    def until(self, what: str, seconds: float, happens: Callable[[], object]) -> float:
+        """Wait until it happens; returns how long it took. Raises `Order` with the daemon's log."""
+        begun = time.monotonic()
+        while not happens():
+            if time.monotonic() - begun > seconds:
+                raise Order(f"not within {seconds:.0f} s: {what}; Modbus says {self.read()}\n{self.log(12)}")
+            self.machine.check()
+            time.sleep(0.1)
+        return time.monotonic() - begun
+
+    def placed(self, seconds: float, states: tuple[str, ...] = ("TRACKING",)) -> float:
+        """Wait until the pose may be used."""
+        return self.until(f"state {' or '.join(states)}", seconds, lambda: self.read().get("state") in states)
+
+    def faults(self, code: int) -> tuple[int, int]:
+        """How often a fault has come and gone, by this boot's journal."""
+        words = ["journalctl", "-q", "-b", "--no-pager", "-o", "json", "--output-fields=MESSAGE_ID"]
+        said = self.machine.run(*words, "-u", UNIT, f"LUMILOOP_FAULT={code}", check=False)
+        ids = [json.loads(line).get("MESSAGE_ID") for line in said.splitlines() if line.startswith("{")]
+        return ids.count(COME_ID), ids.count(OVER_ID)
+
+    def fault(self, *codes: int) -> None:
+        """Wait until Modbus shows one of these faults as the gravest."""
+        self.until(f"fault {codes}", 30.0, lambda: self.read().get("fault") in codes)
+
+    def main_pid(self) -> int:
+        """The daemon's process inside."""
+        return int(self.machine.show(UNIT, "MainPID")["MainPID"])
+
+    def log(self, lines: int) -> str:
+        """The end of the daemon's log."""
+        with suppress(Order, OSError):
+            return self.machine.run("journalctl", "--no-pager", "-u", UNIT, "-n", str(lines), check=False)
+        return ""
+
+    def configure(self, *more: str) -> None:
+        """Write the configuration, with where the datagrams go and ``more`` tables, and check it with the daemon."""
+        text = (ROOT / "tools/bench/vm/guest/lumiloop.toml").read_text()
+        port = self.there["poses"]
+        self.machine.write(CONFIG, "\n".join([text, "[pose]", f'receivers = ["{OUTSIDE}:{port}"]', "", *more, ""]))
+        self.machine.run("lumiloop", "check", CONFIG)
+
+    def error_m(self, one: Heard) -> float | None:
+        """How far a pose is from the truth, in the map's frame, which begins where the robot stood first."""
+        true = self.ears.true_pose(one.t_pose)
+        if one.pose is None or true is None or self.start is None:
+            return None
+        x, y, _ = inverse_then(self.start, true)
+        return math.hypot(one.pose[0] - x, one.pose[1] - y)
+
+    def collect(self, seconds: float) -> list[Heard]:
+        """The pose datagrams of the next seconds."""
+        begun = time.monotonic()
+        time.sleep(seconds)
+        return [one for one in list(self.ears.poses) if one.t_came >= begun]
+
+
+def _start_world(folder: Path, odometry: int, truth: int, stack: ExitStack) -> tuple[subprocess.Popen[str], Any]:
+    command = [sys.executable, "-m", "tools.bench.vm.world", str(odometry), str(truth), str(folder / "control")]
+    with (folder / "world").open("w") as said:
+        world = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=said, text=True)
+    stack.callback(_end, world)
+    assert world.stdout is not None
+    if not select.select([world.stdout], [], [], WORLD_S)[0] or not (line := world.stdout.readline()):
+        raise CannotBench(f"the simulated world does not start:\n{(folder / 'world').read_text()}")
+    return world, json.loads(line)
+
+
+def _end(child: subprocess.Popen[str]) -> None:
+    child.send_signal(signal.SIGINT)
+    try:
+        child.wait(10.0)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
+    if child.stdout is not None:
+        child.stdout.close()
+
+
+@contextmanager
+def bench(image: Image, folder: Path) -> Iterator[Bench]:
+    """Everything running, the emulated computer switched on; nothing of it is left at the end."""
+    with ExitStack() as stack:
+        truth, poses = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        for one in (truth, poses):
+            one.bind(("127.0.0.1", 0))
+        odometry = free_port(socket.SOCK_DGRAM)
+        world, there = _start_world(folder, odometry, truth.getsockname()[1], stack)
+        there["poses"] = poses.getsockname()[1]
+        ports = Ports(free_for_both(), odometry, int(there["lidar"]))
+        machine = stack.enter_context(started(image, folder, ports))
+        made = Bench(machine, world, folder, there)
+        stop = threading.Event()
+        ears = threading.Thread(target=made.ears.listen, args=(truth, poses, stop))
+        ears.start()
+        stack.callback(ears.join)
+        stack.callback(stop.set)
+        yield made

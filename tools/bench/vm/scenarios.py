@@ -1,0 +1,14 @@
+"""What is tried, in this order, each building on the ones before: a function that raises where something is not so.
+
+A scenario's first line is its title in the report; what it returns is what was seen. Times are the emulated computer's:
+some twenty times slower than the machine around it, so they are reported and bounded only as far as they must be.
+"""
+
+from __future__ import annotations
+
+from tools.bench.vm import trying_devices, trying_process, trying_system
+from tools.bench.vm.common import SCENARIOS, Scenario
+
+__all__ = ["ORDER", "SCENARIOS", "Scenario"]
+ORDER = (trying_system, trying_devices, trying_process)
+"""Importing them fills the list; the order matters, so it is said here and tested."""

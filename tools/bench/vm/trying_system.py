@@ -1,0 +1,151 @@
+"""Scenarios: the system comes up with the service in it, and others see its pose."""
+
+from __future__ import annotations
+
+import re
+import statistics
+import time
+from typing import Final
+
+from tools.bench.vm.bench import PLACED, UNIT, Bench
+from tools.bench.vm.common import TRACKING_S, WORST_M, errors, map_id, need, scenario
+
+FIFO: Final = 1
+RESTING_M: Final = 0.05
+
+
+# the system as it comes up
+
+
+@scenario
+def boots(bench: Bench) -> str:
+    """Debian boots with the package installed, and no unit has failed."""
+    seconds = bench.machine.wait_until_up()
+    state = bench.machine.run("systemctl", "is-system-running", "--wait", check=False, seconds=120).strip()
+    failed = bench.machine.run("systemctl", "list-units", "--failed", "--no-legend", "--plain")
+    need(state == "running", f"the system is {state}: {failed}")
+    return f"up after {seconds:.0f} s; kernel {bench.machine.run('uname', '-r').strip()}"
+
+
+@scenario
+def names_the_lidar(bench: Bench) -> str:
+    """Udev gives the lidar its name and its group, and keeps ModemManager away."""
+    link = bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar").strip()
+    group = bench.machine.run("stat", "-c", "%G %a", link).strip()
+    told = bench.machine.run("udevadm", "info", "--query=property", "--name", link)
+    need(link == "/dev/ttyACM0" and group == "dialout 660", f"{link}: {group}")
+    need("ID_MM_DEVICE_IGNORE=1" in told, told)
+    need("lumiloop/lidar-H0000001" in told, told)
+    return f"/dev/lumiloop/lidar is {link}, {group}"
+
+
+@scenario
+def probes(bench: Bench) -> str:
+    """`lumiloop probe` finds the lidar before anything is configured."""
+    said = bench.machine.run("lumiloop", "probe", check=False, seconds=120)
+    need("ttyACM0" in said and "H0000001" in said, said)
+    return next(line.strip() for line in said.splitlines() if "ttyACM0" in line)
+
+
+@scenario
+def starts(bench: Bench) -> str:
+    """`systemctl enable --now lumiloop`: warmed up, READY, nothing compiled."""
+    bench.configure()
+    bench.ears.poses.clear()
+    begun = time.monotonic()
+    bench.machine.run("systemctl", "enable", "--now", UNIT, seconds=300)
+    seconds = time.monotonic() - begun
+    need(bench.machine.show(UNIT, "ActiveState")["ActiveState"] == "active", bench.log(30))
+    warm = bench.machine.run("journalctl", "-q", "--no-pager", "-o", "cat", "-u", "lumiloop-warmup.service")
+    bench.memory["ready"] = seconds
+    return f"READY after {seconds:.1f} s, the warm-up before it included; {warm.strip().splitlines()[-1]}"
+
+
+@scenario
+def is_restricted(bench: Bench) -> str:
+    """It runs as nobody in particular, without any capability, in its two groups, with its system calls filtered."""
+    status = bench.machine.run("cat", f"/proc/{bench.main_pid()}/status")
+    fields = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
+    need(61184 <= int(fields["Uid"].split()[0]) <= 65519, fields["Uid"])
+    need(int(fields["CapEff"], 16) == 0 and fields["Seccomp"].strip() == "2", f"{fields['CapEff']} {fields['Seccomp']}")
+    groups = bench.machine.run("getent", "group", "dialout", "i2c")
+    need({line.split(":")[2] for line in groups.splitlines()} <= set(fields["Groups"].split()), fields["Groups"])
+    exposure = bench.machine.run("systemd-analyze", "security", "--no-pager", UNIT)
+    level = re.search(r"exposure level for \S+: ([\d.]+)", exposure)
+    need(level and float(level.group(1)) <= 2.0, exposure[-200:])
+    return f"user {fields['Uid'].split()[0]}, exposure {level.group(1) if level else '?'}"
+
+
+@scenario
+def takes_real_time(bench: Bench) -> str:
+    """The loop's thread has SCHED_FIFO and memory is locked, as the unit's limits allow."""
+    pid = bench.main_pid()
+    bench.until("SCHED_FIFO", 30.0, lambda: _policy(bench, pid) == FIFO)
+    status = bench.machine.run("cat", f"/proc/{pid}/status")
+    locked = int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmLck")))
+    threads = bench.machine.run("sh", "-c", f"cat /proc/{pid}/task/*/stat")
+    fifo = sum(int(line.rsplit(")", 1)[1].split()[38]) == FIFO for line in threads.splitlines())
+    need(locked > 0, "no memory is locked")
+    return f"{fifo} of {len(threads.splitlines())} threads under SCHED_FIFO, {locked // 1024} MB locked"
+
+
+def _policy(bench: Bench, pid: int) -> int:
+    return int(bench.machine.run("cat", f"/proc/{pid}/task/{pid}/stat").rsplit(")", 1)[1].split()[38])
+
+
+# the pose, from outside
+
+
+@scenario
+def answers_modbus(bench: Bench) -> str:
+    """The same block over Modbus UDP and TCP, from another computer."""
+    bench.placed(TRACKING_S, PLACED)
+    udp, tcp = bench.read(), bench.read(tcp=True)
+    need(udp and tcp, f"UDP {udp}, TCP {tcp}")
+    need(tcp["seq"] >= udp["seq"], f"UDP {udp['seq']}, TCP {tcp['seq']}")
+    begun, count = time.monotonic(), 50
+    for _ in range(count):
+        need(bench.read(), "a read was lost")
+    return f"{count} of {count} reads answered, {1e3 * (time.monotonic() - begun) / count:.1f} ms each"
+
+
+@scenario
+def sends_datagrams(bench: Bench) -> str:
+    """A pose datagram for every scan."""
+    heard = bench.collect(5.0)
+    rate = len(heard) / 5.0
+    need(rate >= 8.0, f"{rate} datagrams a second of 10")
+    delay = statistics.median(one.t_came - one.t_pose for one in heard)
+    return f"{rate:.1f} a second; the pose is {1e3 * delay:.0f} ms old when it is sent (median)"
+
+
+@scenario
+def begins_where_it_stands(bench: Bench) -> str:
+    """A robot that stands still at its first start is where the map begins."""
+    true = bench.ears.true_pose(time.monotonic() - 0.5)
+    need(true is not None, "the world does not tell where the robot is")
+    bench.start = true
+    worst = max(errors(bench, bench.collect(2.0)), default=1.0)
+    need(worst <= RESTING_M, f"{worst:.3f} m from where it stands")
+    bench.memory["map"] = map_id(bench)
+    return f"{1e3 * worst:.0f} mm at most"
+
+
+@scenario
+def drives(bench: Bench) -> str:
+    """A lap of 17 m at 0.6 m/s: TRACKING, and never further from the truth than 10 cm."""
+    bench.drive()
+    bench.until("the robot sets off", 30.0, lambda: abs(_true_speed(bench)) > 0.1)
+    heard = bench.collect(30.0)
+    found = errors(bench, heard)
+    need(found and max(found) <= WORST_M, f"{max(found, default=9.0):.3f} m")
+    bench.placed(TRACKING_S)
+    tracked = sum(one.state == 3 for one in heard) / max(len(heard), 1)
+    middle = statistics.median(found)
+    return f"error {1e3 * middle:.0f} mm median, {1e3 * max(found):.0f} mm worst; TRACKING {100 * tracked:.0f} % of it"
+
+
+def _true_speed(bench: Bench) -> float:
+    told = list(bench.ears.truth)[-30:]
+    (t0, a), (t1, b) = told[0], told[-1]
+    return ((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2) ** 0.5 / max(t1 - t0, 1e-3)
