@@ -11,7 +11,7 @@ RUN    := $(BIN)/python -W default
 .DEFAULT_GOAL := help
 
 
-.PHONY: help venv demo test test-system test-all check bench experiments install uninstall deb lock docs clean
+.PHONY: help venv demo test test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -68,6 +68,9 @@ $(PEERS): $(STAMP) requirements/bench.lock
 
 bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against peers in the same run
 	$(RUN) -m tools.bench $(ARGS)
+
+bench-vm: venv  ## the package in an emulated Debian with real kernel interfaces (root for the first run; docs/bench.md)
+	$(RUN) -m tools.bench.vm $(ARGS)
 
 experiments: venv  ## what positions from light reach, in simulated rooms and on recordings (LUMILOOP_DATA)
 	$(RUN) -m tools.experiments lights $(ARGS)

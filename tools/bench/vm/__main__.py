@@ -13,11 +13,12 @@ import time
 from pathlib import Path
 
 from tools.bench.vm.bench import Bench, bench
+from tools.bench.vm.common import Scenario
 from tools.bench.vm.image import ROOT, Image, image
 from tools.bench.vm.machine import Order
-from tools.bench.vm.places import CannotBench, cache, workspace
+from tools.bench.vm.places import CannotBench, workspace
 from tools.bench.vm.report import Result, write
-from tools.bench.vm.scenarios import SCENARIOS, Scenario
+from tools.bench.vm.scenarios import SCENARIOS
 
 ROOM = 2_000_000_000
 CANNOT = 2
@@ -75,7 +76,7 @@ def main() -> int:
     """Make what is missing, run, report."""
     parser = argparse.ArgumentParser(prog="python -m tools.bench.vm", description=__doc__)
     parser.add_argument("scenario", nargs="*", help="up to which (default: all)")
-    parser.add_argument("--out", type=Path, default=Path("out/bench-vm"), help="where results go (default %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("out/bench-vm"), help="for results (default %(default)s)")
     parser.add_argument("--against", type=Path, help="results.json of another run, to compare with")
     parser.add_argument("--image-only", action="store_true", help="make the image and stop")
     parser.add_argument("--list", action="store_true", help="say what is tried")
@@ -94,15 +95,13 @@ def main() -> int:
     except CannotBench as reason:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT
-    about = {"version": version(), "image": made.folder.name, "cache": str(cache()),
-             "seconds in all": f"{time.monotonic() - begun:.0f}"}  # fmt: skip
+    seconds = f"{time.monotonic() - begun:.0f}"
+    about = {"version": version(), "image": made.folder.name, "seconds in all": seconds}
     worse = write(options.out, results, about, options.against)
     failed = [one.name for one in results if not one.passed]
     for text in worse:
         say(f"worse than before: {text}")
-    say(
-        f"{len(results) - len(failed)} of {len(results)} passed in {about['seconds in all']} s; {options.out}/report.html"
-    )
+    say(f"{len(results) - len(failed)} of {len(results)} passed in {seconds} s; {options.out}/report.html")
     return int(bool(failed or worse))
 
 

@@ -10,14 +10,15 @@ from tools.bench.vm.bench import Bench, Heard
 from tools.bench.vm.machine import Order
 
 Scenario = Callable[[Bench], str]
-SCENARIOS: Final[list[Scenario]] = []
+WRITTEN: Final[list[Scenario]] = []
+"""All scenarios, module by module in the order of their lines."""
 TRACKING_S: Final = 60.0
 WORST_M: Final = 0.10
 
 
 def scenario(function: Scenario) -> Scenario:
-    """One of the list."""
-    SCENARIOS.append(function)
+    """A decorator: it is one of the list."""
+    WRITTEN.append(function)
     return function
 
 

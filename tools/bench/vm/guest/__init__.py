@@ -1,0 +1,1 @@
+"""What goes into the emulated computer, besides the package."""
