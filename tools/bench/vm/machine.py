@@ -17,9 +17,13 @@ from typing import IO, Any
 from tools.bench.vm.image import Image
 from tools.bench.vm.places import CannotBench
 
-BOOT_S, QUIT_S = 180.0, 10.0
+BOOT_S, QUIT_S = 400.0, 10.0
 MODBUS, ODOMETRY = 1502, 5601
-COMMAND_LINE = "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 systemd.mask=serial-getty@ttyS0.service"
+UNUSED = ("serial-getty@ttyS0", "getty@tty1", "systemd-logind", "systemd-update-utmp", "systemd-update-utmp-runlevel")
+COMMAND_LINE = " ".join([
+    "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off systemd.show_status=false",
+    *(f"systemd.mask={unit}.service" for unit in UNUSED),
+])  # fmt: skip
 OUTSIDE = "10.0.2.2"
 """This computer, as the emulated one sees it."""
 
@@ -94,16 +98,16 @@ class Machine:
             self._agent.close()
         self._agent = self._lines = None
 
-    def order(self, seconds: float, **order: Any) -> dict[str, Any]:
+    def order(self, patience: float, **order: Any) -> dict[str, Any]:
         """Have the agent do something; its answer."""
         assert self._agent is not None
         assert self._lines is not None
-        self._agent.settimeout(seconds)
+        self._agent.settimeout(patience)
         self._agent.sendall(json.dumps(order).encode() + b"\n")
         try:
             answer: dict[str, Any] = json.loads(self._lines.readline())
         except (TimeoutError, ValueError) as error:
-            raise Order(f"no answer to {order} within {seconds:.0f} s") from error
+            raise Order(f"no answer to {order} within {patience:.0f} s") from error
         return answer
 
     def run(self, *words: str, check: bool = True, seconds: float = 60.0) -> str:

@@ -43,8 +43,9 @@ def names_the_lidar(bench: Bench) -> str:
 def probes(bench: Bench) -> str:
     """`lumiloop probe` finds the lidar before anything is configured."""
     said = bench.machine.run("lumiloop", "probe", check=False, seconds=120)
-    need("ttyACM0" in said and "H0000001" in said, said)
-    return next(line.strip() for line in said.splitlines() if "ttyACM0" in line)
+    found = next((line.strip() for line in said.splitlines() if "serial H0000001" in line), "")
+    need(found and "/dev/i2c-1: bench" in said, said)
+    return found
 
 
 @scenario
