@@ -6,6 +6,7 @@ Ends with 0 if every scenario passed, 1 if one did not, 2 if this machine cannot
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import subprocess
 import sys
@@ -59,7 +60,11 @@ def run(made: Image, scenarios: list[Scenario], out: Path) -> list[Result]:
     with workspace("lumiloop-vm", ROOM) as folder:
         try:
             with bench(made, folder) as whole:
-                return [tried(scenario, whole) for scenario in scenarios]
+                results = [tried(scenario, whole) for scenario in scenarios]
+                with contextlib.suppress(Order, OSError):
+                    words = ["journalctl", "--no-pager", "-o", "short-monotonic"]
+                    (out / "journal.log").write_text(whole.machine.run(*words, seconds=120))
+                return results
         finally:
             for name in ("console", "qemu", "world"):
                 if (folder / name).exists():

@@ -32,6 +32,7 @@ OVER_ID: Final = "5c0cb1d0b8a64f27a0a5f5a4b0b9d3e1"
 PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
 KEPT: Final = 30_000
 WORLD_S: Final = 240.0
+READS: Final = 4
 Pose = tuple[float, float, float]
 
 
@@ -120,13 +121,14 @@ class Bench:
         self.world.send_signal(signal.SIGUSR1)
 
     def read(self, tcp: bool = False) -> dict[str, Any]:
-        """The daemon's block over Modbus; empty where nobody answers."""
-        with suppress(OSError, ValueError):
-            reader = Reader("127.0.0.1", self.machine.ports.modbus, tcp)
-            try:
-                return dict(reader.read())
-            finally:
-                reader.close()
+        """The daemon's block over Modbus; empty where nobody answers, asked several times."""
+        for _ in range(READS):
+            with suppress(OSError, ValueError):
+                reader = Reader("127.0.0.1", self.machine.ports.modbus, tcp)
+                try:
+                    return dict(reader.read())
+                finally:
+                    reader.close()
         return {}
 
     def ask(self, request: bytes) -> bytes:
@@ -134,8 +136,11 @@ class Bench:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
             link.settimeout(2.0)
             link.connect(("127.0.0.1", self.machine.ports.modbus))
-            link.send(struct.pack(">HHHB", 7, 0, len(request) + 1, 1) + request)
-            return link.recv(512)[7:]
+            for left in reversed(range(READS)):  # a datagram may be lost; repeated, it does no harm
+                link.send(struct.pack(">HHHB", 7, 0, len(request) + 1, 1) + request)
+                with suppress(*(() if left == 0 else (TimeoutError,))):
+                    return link.recv(512)[7:]
+        raise TimeoutError("Modbus does not answer")
 
     def registers(self, address: int, count: int, function: int = 4) -> bytes:
         """Registers as bytes."""

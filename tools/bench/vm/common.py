@@ -34,6 +34,15 @@ def errors(bench: Bench, heard: Iterable[Heard]) -> list[float]:
     return [error for error in found if error is not None]
 
 
+def right(bench: Bench, heard: Iterable[Heard], bound: float = WORST_M) -> list[float]:
+    """As :func:`errors`; raises `Order` where one is beyond the bound and three of its own sigma, or there is none."""
+    kept = [(error, one.sigma_m) for one in heard if (error := bench.error_m(one)) is not None]
+    need(kept, "no pose has come")
+    worst = max(kept, key=lambda pair: pair[0] - 3.0 * pair[1])
+    need(worst[0] <= bound + 3.0 * worst[1], f"{worst[0]:.3f} m from the truth, sigma said {worst[1]:.3f} m")
+    return [error for error, _ in kept]
+
+
 def map_id(bench: Bench) -> int:
     """Identity of the map frame."""
     return int(struct.unpack(">I", bench.registers(46, 2))[0])
@@ -48,6 +57,5 @@ def back(bench: Bench, pid: int) -> str:
     """Usable again without a person, the same process, and right."""
     seconds = bench.placed(TRACKING_S)
     same_process(bench, pid)
-    found = errors(bench, bench.collect(3.0))
-    need(found and max(found) <= WORST_M, f"{max(found, default=9.0):.3f} m from the truth")
+    found = right(bench, bench.collect(3.0))
     return f"TRACKING after {seconds:.1f} s, {1e3 * max(found):.0f} mm from the truth"

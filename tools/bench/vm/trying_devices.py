@@ -53,7 +53,7 @@ def comes_back_under_another_name(bench: Bench) -> str:
 @scenario
 def falls_silent(bench: Bench) -> str:
     """The lidar says nothing for six seconds, its cable in place."""
-    bench.orders("order lidar silence for=6")
+    bench.orders("order silence where=lidar for=6")
     seconds = bench.until("silence shown", 5.0, lambda: bench.read().get("state") in ("NO_LIDAR", "DEGRADED"))
     bench.fault(104, 101)
     return f"shown after {seconds:.1f} s; {back(bench, bench.memory['pid'])}"
@@ -62,7 +62,7 @@ def falls_silent(bench: Bench) -> str:
 @scenario
 def is_switched_off(bench: Bench) -> str:
     """The lidar loses its power for four seconds and starts up again."""
-    bench.orders("order lidar off for=4")
+    bench.orders("order off where=lidar for=4")
     bench.fault(104, 101)
     return back(bench, bench.memory["pid"])
 
@@ -70,7 +70,7 @@ def is_switched_off(bench: Bench) -> str:
 @scenario
 def talks_garbage(bench: Bench) -> str:
     """Every second scan is random bytes for five seconds."""
-    bench.orders("order lidar garbage on=scans rate=0.5 for=5")
+    bench.orders("order garbage where=lidar on=scans share=0.5 for=5")
     time.sleep(5.0)
     return back(bench, bench.memory["pid"])
 
@@ -116,10 +116,10 @@ def _ordered(bench: Bench, order: str, codes: tuple[int, ...]) -> str:
 @scenario
 def is_not_acknowledged(bench: Bench) -> str:
     """The converter acknowledges nothing for eight seconds (ENXIO of the kernel's)."""
-    return _ordered(bench, "order adc off for=8", (153, 156, 157))
+    return _ordered(bench, "order off where=adc for=8", (153, 156, 157))
 
 
 @scenario
 def hangs(bench: Bench) -> str:
     """SDA is held low for eight seconds: every transfer times out in the kernel."""
-    return _ordered(bench, "order adc hang for=8", (155, 156, 157))
+    return _ordered(bench, "order hang where=adc for=8", (155, 156, 157))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from tools.bench.vm.bench import CONFIG, UNIT, Bench
-from tools.bench.vm.common import TRACKING_S, WORST_M, back, errors, map_id, need, scenario
+from tools.bench.vm.common import TRACKING_S, back, map_id, need, right, scenario
 
 READY_S: Final = 60.0
 SAVE_MAP, DONE, REFUSED = 3, 2, 3
@@ -25,8 +25,7 @@ def _restarted(bench: Bench, before: int, seconds: float) -> str:
     ready = time.monotonic() - begun
     tracking = bench.placed(TRACKING_S)
     bench.memory["pid"] = bench.main_pid()
-    found = errors(bench, bench.collect(3.0))
-    need(found and max(found) <= WORST_M, f"{max(found, default=9.0):.3f} m from the truth")
+    found = right(bench, bench.collect(3.0))
     return f"READY {ready:.1f} s later, TRACKING {tracking:.1f} s after that, {1e3 * max(found):.0f} mm from the truth"
 
 
@@ -103,8 +102,7 @@ def _up_again(bench: Bench) -> str:
     tracking = bench.placed(240.0)
     need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
     bench.memory["pid"] = bench.main_pid()
-    found = errors(bench, bench.collect(3.0))
-    need(found and max(found) <= WORST_M, f"{max(found, default=9.0):.3f} m from the truth")
+    found = right(bench, bench.collect(3.0))
     return f"up {boot:.0f} s later, TRACKING in the same map {tracking:.1f} s after that, {1e3 * max(found):.0f} mm off"
 
 
