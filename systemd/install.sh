@@ -71,6 +71,9 @@ files() {
     put 644 README.md /usr/share/doc/lumiloop/README.md
     put 644 LICENSE /usr/share/doc/lumiloop/copyright
     put 644 systemd/drop-ins/port-502.conf /usr/share/doc/lumiloop/examples/port-502.conf
+    recorder=$DESTDIR/usr/share/doc/lumiloop/examples/flight-recorder.conf
+    sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/drop-ins/flight-recorder.conf" > "$recorder"
+    chmod 644 "$recorder"
     (cd "$SOURCE/systemd" && find . -name '*.toml') | while read -r example; do
         put 644 "systemd/$example" "/usr/share/doc/lumiloop/examples/$example"
     done

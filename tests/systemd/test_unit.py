@@ -37,6 +37,29 @@ def test_the_service_manager_accepts_it(name: str, tmp_path: Path) -> None:
 
 
 @needs_analyze
+@pytest.mark.parametrize("drop_in", sorted((SYSTEMD / "drop-ins").glob("*.conf")), ids=lambda path: path.stem)
+def test_the_service_manager_accepts_it_with_a_drop_in(drop_in: Path, tmp_path: Path) -> None:
+    for path in (*SYSTEMD.glob("*.service"), drop_in):
+        place = tmp_path / ("lumiloop.service.d" if path == drop_in else "") / path.name
+        place.parent.mkdir(exist_ok=True)
+        place.write_text(path.read_text().replace("/opt/lumiloop/bin/lumiloop", "/bin/true"))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", str(tmp_path / "lumiloop.service")],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_drop_in_starts_the_unit_s_own_program() -> None:
+    """With the words of the unit's, and more: the two must not part."""
+    own = dict(settings(UNIT))["ExecStart"]
+    starts = [
+        line for path in (SYSTEMD / "drop-ins").glob("*.conf") for line in settings(path) if line[0] == "ExecStart"
+    ]
+    assert [value.startswith(own) for name, value in starts if value] == [True]
+
+
+@needs_analyze
 def test_it_is_hardened() -> None:
     done = subprocess.run(
         ["systemd-analyze", "security", "--offline=true", "--no-pager", str(UNIT)], capture_output=True, text=True

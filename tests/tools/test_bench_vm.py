@@ -103,8 +103,11 @@ def test_a_line_that_nobody_reads_loses_what_is_sent_and_stops_nobody() -> None:
                 break
         os.write(feed, b"lost")
         agent.hand_over(source, sink)
+        os.close(feed)
+        with pytest.raises(OSError, match="hung up"):
+            agent.hand_over(source, sink)
     finally:
-        for one in (source, feed, end, sink):
+        for one in (source, end, sink):
             os.close(one)
 
 

@@ -8,8 +8,10 @@ from typing import Final
 
 from tools.bench.vm.bench import PLACED, UNIT, Bench
 from tools.bench.vm.common import TRACKING_S, back, errors, need, same_process, scenario
+from tools.bench.vm.machine import OUTSIDE
 
-SOFT_CONNECT: Final = "/sys/class/udc/dummy_udc.0/soft_connect"
+PLUG: Final = "/sys/bus/usb/devices/usb1/1-0:1.0/usb1-port1/disable"
+"""Of the hub that the lidar is plugged into: without power at its port there is nothing there."""
 PHOTODIODE: Final = '[photodiode]\nbus = "adapter:bench"\nconverter = "mcp3221@0x4d"\n'
 
 
@@ -21,7 +23,7 @@ def is_unplugged(bench: Bench) -> str:
     """The USB cable is pulled while it drives: said so at once, carried on wheels, the same process."""
     bench.memory["pid"] = bench.main_pid()
     begun = time.monotonic()
-    bench.machine.run("sh", "-c", f"echo disconnect > {SOFT_CONNECT}")
+    bench.machine.run("sh", "-c", f"echo 1 > {PLUG}")
     bench.until("state without laser", 10.0, lambda: bench.read().get("state") in ("NO_LIDAR", "DEGRADED"))
     seconds = time.monotonic() - begun
     bench.fault(101, 104)
@@ -34,7 +36,7 @@ def is_unplugged(bench: Bench) -> str:
 @scenario
 def is_plugged_in_again(bench: Bench) -> str:
     """The cable is put back: TRACKING by itself."""
-    bench.machine.run("sh", "-c", f"echo connect > {SOFT_CONNECT}")
+    bench.machine.run("sh", "-c", f"echo 0 > {PLUG}")
     return back(bench, bench.memory["pid"])
 
 
@@ -42,11 +44,11 @@ def is_plugged_in_again(bench: Bench) -> str:
 def comes_back_under_another_name(bench: Bench) -> str:
     """Another program holds the old device node, so that the lidar comes back as ttyACM1."""
     bench.machine.run("sh", "-c", "sleep 1000 < /dev/ttyACM0 > /dev/null 2>&1 & echo $! > /run/holder", check=False)
-    bench.machine.run("sh", "-c", f"echo disconnect > {SOFT_CONNECT}; sleep 2; echo connect > {SOFT_CONNECT}")
+    bench.machine.run("sh", "-c", f"echo 1 > {PLUG}; sleep 2; echo 0 > {PLUG}")
     bench.until("/dev/ttyACM1", 20.0, lambda: "ttyACM1" in bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar"))
     said = back(bench, bench.memory["pid"])
-    bench.machine.run("sh", "-c", f"kill $(cat /run/holder); echo disconnect > {SOFT_CONNECT}; sleep 1", check=False)
-    bench.machine.run("sh", "-c", f"echo connect > {SOFT_CONNECT}")
+    bench.machine.run("sh", "-c", f"kill $(cat /run/holder); echo 1 > {PLUG}; sleep 1", check=False)
+    bench.machine.run("sh", "-c", f"echo 0 > {PLUG}")
     return f"found as ttyACM1: {said}; and again as ttyACM0: {back(bench, bench.memory['pid'])}"
 
 
@@ -81,7 +83,7 @@ def talks_garbage(bench: Bench) -> str:
 @scenario
 def reads_the_converter(bench: Bench) -> str:
     """A photodiode on a real /dev/i2c-N: found by its adapter's name, opened by its group, read in blocks."""
-    bench.machine.order(10.0, i2c=bench.there["bus"])
+    bench.machine.order(10.0, i2c=bench.there["bus"].replace("127.0.0.1", OUTSIDE))
     nodes = bench.machine.run("sh", "-c", "stat -c '%n %G %a' /dev/i2c-*").strip()
     need("i2c 660" in nodes, nodes)
     bench.configure(PHOTODIODE)

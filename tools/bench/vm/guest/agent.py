@@ -42,14 +42,17 @@ def opened(path: str) -> int:
 
 
 def hand_over(source: int, sink: int) -> None:
-    """What is there, from one to the other; what the other does not take is lost, as on a line that nobody reads."""
+    """What is there, from one to the other; what the other does not take is lost, as on a line that nobody reads.
+
+    Raises:
+        OSError: the line has been hung up, or its far end is not there.
+    """
     try:
         data = os.read(source, PIECE)
     except BlockingIOError:
         return
     if not data:
-        time.sleep(0.02)  # the far end of a virtio port is not connected
-        return
+        raise OSError(errno.EIO, "hung up")
     with contextlib.suppress(BlockingIOError):
         os.write(sink, data)
 
@@ -64,7 +67,7 @@ def carry_lidar() -> None:
                 for ready in select.select([sensor, gadget], [], [])[0]:
                     hand_over(ready, gadget if ready == sensor else sensor)
         except OSError:
-            time.sleep(0.05)  # the gadget is being taken away
+            time.sleep(0.05)  # the cable is being pulled
         finally:
             os.close(sensor)
             os.close(gadget)
