@@ -1,33 +1,38 @@
 """Turns a cycle's time budget into caps, from measured time per iteration; nothing below the cycle reads a clock.
 
-Order of degradation when time is short: first map work waits, then the scan is thinned, last the iterations are cut.
-Map work is never put off for good.
+Order of degradation when time is short (`estimator.records.Rung`): first the scan is thinned and iterations are cut,
+then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off for good.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
-from estimator.records import UNLIMITED, Limits
+from daemon.ladder import Ladder
+from estimator.records import UNLIMITED, Limits, Rung
 from estimator.result import StepResult
 
 ENOUGH_ITERATIONS: Final = 12
 """Iterations that a match hardly ever exceeds; thinning the scan starts where these do not fit any more."""
 FEWEST_ITERATIONS: Final = 3
 FEWEST_POINTS: Final = 120
-LONGEST_MAP_WAIT: Final = 5
-"""Cycles in a row that may put off map work."""
+LONGEST_MAP_WAIT: Final = 20
+"""Cycles in a row that may put off map work: a quarter of a metre, a keyframe, at 40 Hz and half a metre a second."""
+PROBE_EVERY: Final = 40
+PROBES: Final = 3
+"""Of so many cycles that pass the scan over, so many do not: they tell whether there is time again."""
+WORTH_IT: Final = 0.1
+"""Share of the budget that a rung must save to be taken because of overruns: what other programs take is no reason."""
 MEDIAN_OF: Final = 5
 """Measurements whose median counts: one step during which another process ran says nothing about the cost."""
+KNOWN_AFTER: Final = 3
+"""Measurements until something is said to be known: the first cycles are slow, for nothing is in the caches yet."""
 FORGETTING: Final = 0.1
 """Weight of a measurement when costs fall; a rise counts at once."""
-
-PLAIN_AGO: Final = 20
-"""Steps with light in a row after which they teach what an iteration costs: with a slow laser there are no others."""
 
 SEARCH_US: Final = 1000.0
 SEARCH_SHARE: Final = 0.1
@@ -35,15 +40,31 @@ SEARCH_SHARE: Final = 0.1
 FEWEST_CODES: Final = 4
 
 
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What a cycle has cost.
+
+    Attributes:
+        us: microseconds by stage. budget_us: what it was allowed. light: a block of light samples was among it.
+    """
+
+    us: Mapping[str, float]
+    budget_us: float
+    light: bool = False
+
+
 class Budget(Protocol):
     """Says before each step what it may do, and learns afterwards what it cost."""
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
-        """Caps for a step that may take ``budget_us`` microseconds. ``light``: a block of light samples is among it."""
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
+        """Caps for a step of a cycle that may take ``budget_us`` microseconds.
+
+        ``light``: a block of light samples is among it. ``carrier``: light or odometry can carry the pose.
+        """
         ...
 
-    def learn(self, step_us: float, limits: Limits, result: StepResult, light: bool = False) -> None:
-        """Take in what the step under these caps has cost."""
+    def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
+        """Take in what the cycle under these caps has cost."""
         ...
 
     def learn_code(self, code_us: float) -> None:
@@ -57,11 +78,11 @@ class FixedBudget:
     def __init__(self, limits: Limits = UNLIMITED) -> None:
         self._limits = limits
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         """The caps given at construction."""
         return self._limits
 
-    def learn(self, step_us: float, limits: Limits, result: StepResult, light: bool = False) -> None:
+    def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
         """Nothing to learn."""
 
     def learn_code(self, code_us: float) -> None:
@@ -74,7 +95,7 @@ class RecordedBudget:
     def __init__(self, recorded: Iterable[Limits]) -> None:
         self._recorded: Iterator[Limits] = iter(recorded)
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         """The next cycle's caps.
 
         Raises:
@@ -85,7 +106,7 @@ class RecordedBudget:
             raise LookupError("the replay makes more steps than were recorded")
         return limits
 
-    def learn(self, step_us: float, limits: Limits, result: StepResult, light: bool = False) -> None:
+    def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
         """Nothing to learn."""
 
     def learn_code(self, code_us: float) -> None:
@@ -93,39 +114,63 @@ class RecordedBudget:
 
 
 class MeasuredBudget:
-    """Real time: cost per iteration and point, of map work, and of light, tracked from cycle to cycle.
+    """Real time: what an iteration, map work, light, and all the rest cost, tracked from cycle to cycle by stage.
 
-    To decode a block of light samples takes longer than to match a scan. It is taken from the budget of the steps that
-    have one, and is no part of an iteration's cost: else scans would be thinned for the light's sake.
+    What is left of the budget after light and the rest is for matching and the map. Cycles with light and those without
+    have a ladder each, so that scans are not thinned, nor map work put off, in the ones for the sake of the others.
     """
 
     def __init__(self) -> None:
-        self._iteration_us = 0.0
-        self._map_us = 0.0
+        self._iteration, self._map, self._light, self._rest = _Cost(), _Cost(), _Cost(), _Cost()
         self._code_us = 0.0
-        self._iteration_costs: deque[float] = deque(maxlen=MEDIAN_OF)
-        self._map_costs: deque[float] = deque(maxlen=MEDIAN_OF)
         self._queries = 0
         self._waited = 0
-        self._light_us = 0.0
-        self._light_costs: deque[float] = deque(maxlen=MEDIAN_OF)
-        self._plain_ago = 0
+        self._passed = 0
+        self._plain, self._lit = Ladder(), Ladder()
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
-        """Caps for a step that may take ``budget_us`` microseconds; uncapped matching until something was measured."""
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
+        """Caps for a step of a cycle that may take ``budget_us``; none for matching until something was measured."""
         codes = self._codes(budget_us)
-        if self._iteration_us <= 0.0:
+        if self._iteration.us <= 0.0:
             return replace(UNLIMITED, codes=codes)
-        if self._apart(light):
-            budget_us -= self._light_us
-        matching_us = ENOUGH_ITERATIONS * self._iteration_us
-        update_map = matching_us + self._map_us <= budget_us or self._waited >= LONGEST_MAP_WAIT
+        left_us = budget_us - self._rest.us - (self._light.us if light else 0.0)
+        rung = self._ladder(light).take(self._fits(left_us))
+        if rung is Rung.CARRIED and not (carrier and self._pass_over()):
+            rung = Rung.NO_MAP
+        update_map = rung < Rung.NO_MAP or (rung is Rung.NO_MAP and self._waited >= LONGEST_MAP_WAIT)
+        if update_map:
+            rung = min(rung, Rung.THINNED)
+        iterations, points = self._matching(left_us, update_map and self._fits(left_us) < Rung.NO_MAP)
+        return Limits(iterations, points, update_map, codes, rung)
+
+    def _ladder(self, light: bool) -> Ladder:
+        return self._lit if light else self._plain
+
+    def _fits(self, left_us: float) -> Rung:
+        """The best rung that so many microseconds allow."""
+        least_us = FEWEST_ITERATIONS * self._iteration.us * min(1.0, FEWEST_POINTS / max(1, self._queries))
+        if left_us >= ENOUGH_ITERATIONS * self._iteration.us + self._map.us:
+            return Rung.FULL
+        if left_us >= least_us + self._map.us:
+            return Rung.THINNED
+        return Rung.NO_MAP if left_us >= least_us else Rung.CARRIED
+
+    def _pass_over(self) -> bool:
+        """Whether a scan is passed over: now and then a few are not, or it would never be known that there is time."""
+        self._passed += 1
+        return self._passed % PROBE_EVERY >= PROBES
+
+    def _matching(self, left_us: float, with_map: bool) -> tuple[int, int]:
+        """Iterations and points that fit: first the scan is thinned, then iterations are cut."""
+        matching_us = ENOUGH_ITERATIONS * self._iteration.us
+        if with_map:
+            left_us = max(left_us - self._map.us, 0.0)
         points = UNLIMITED.points
-        if matching_us > budget_us:
-            points = max(FEWEST_POINTS, int(self._queries * budget_us / matching_us))
-        per_iteration = self._iteration_us * min(1.0, points / max(1, self._queries))
-        iterations = math.floor(budget_us / per_iteration)
-        return Limits(min(UNLIMITED.icp_iterations, max(FEWEST_ITERATIONS, iterations)), points, update_map, codes)
+        if matching_us > left_us:
+            points = max(FEWEST_POINTS, int(self._queries * left_us / matching_us))
+        per_iteration = self._iteration.us * min(1.0, points / max(1, self._queries))
+        iterations = math.floor(max(left_us, 0.0) / per_iteration)
+        return min(UNLIMITED.icp_iterations, max(FEWEST_ITERATIONS, iterations)), points
 
     def _codes(self, budget_us: float) -> int:
         if self._code_us <= 0.0:
@@ -137,41 +182,43 @@ class MeasuredBudget:
         """Take in what the search for one light code costs."""
         self._code_us = code_us
 
-    def learn(self, step_us: float, limits: Limits, result: StepResult, light: bool = False) -> None:
-        """Take in one step. Steps without a match teach nothing about iterations."""
+    def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
+        """Take in one cycle. Steps without a match teach nothing about iterations."""
         self._waited = 0 if limits.update_map else self._waited + 1
+        us = spent.us if "match" in spent.us else {**spent.us, "match": spent.us.get("step", 0.0), "step": 0.0}
+        if spent.light and "lights" in us:
+            self._light.learn(us["lights"])
+        self._rest.learn(sum(took for stage, took in us.items() if stage not in _APART))
         match = result.match
-        if match is None or match.iterations == 0 or match.queries == 0:
+        if match is not None and match.iterations > 0 and match.queries > 0:
+            # cost grows with the points; it is kept for the fullest scan seen lately, so that a thinned one teaches too
+            self._queries = max(match.queries, int(0.999 * self._queries))
+            self._iteration.learn(us.get("match", 0) / match.iterations * (self._queries / match.queries))
+        if result.keyframe >= 0 and "map" in us:
+            self._map.learn(us["map"])
+        saving = {Rung.FULL: us.get("match", 0), Rung.THINNED: us.get("map", 0), Rung.NO_MAP: us.get("match", 0)}
+        helps = saving.get(Rung(limits.rung), 0) > WORTH_IT * spent.budget_us
+        self._ladder(spent.light).ended(sum(us.values()) > spent.budget_us, helps)
+
+
+_APART: Final = ("lights", "match", "map")
+"""Stages whose costs are known each for itself."""
+
+
+class _Cost:
+    """What something costs, by the median of the latest few: up at once, down slowly.
+
+    A cap that is too tight costs less than an overrun; one step during which another process ran says nothing.
+    """
+
+    def __init__(self) -> None:
+        self.us = 0.0
+        self._latest: deque[float] = deque(maxlen=MEDIAN_OF)
+
+    def learn(self, us: float) -> None:
+        self._latest.append(us)
+        if len(self._latest) < KNOWN_AFTER:
             return
-        self._plain_ago = self._plain_ago + 1 if light else 0
-        apart = self._apart(light)
-        if apart and self._iteration_us <= 0.0:
-            return
-        part = match.queries / max(match.queries, self._queries)
-        beside_us = max(0.0, step_us - match.iterations * self._iteration_us * part)
-        if result.keyframe >= 0:
-            self._map_costs.append(max(0.0, beside_us - (self._light_us if apart else 0.0)))
-            self._map_us = _follow(self._map_us, _median(self._map_costs))
-            return
-        if apart:
-            self._light_costs.append(beside_us)
-            self._light_us = _follow(self._light_us, _median(self._light_costs))
-            return
-        # cost grows with the points; it is kept for the fullest scan seen lately, so that a thinned one teaches too
-        self._queries = max(match.queries, int(0.999 * self._queries))
-        self._iteration_costs.append(step_us / match.iterations * (self._queries / match.queries))
-        self._iteration_us = _follow(self._iteration_us, _median(self._iteration_costs))
-
-    def _apart(self, light: bool) -> bool:
-        """Whether this step's light can be told from its iterations: by steps without."""
-        return light and self._plain_ago <= PLAIN_AGO
-
-
-def _median(values: Iterable[float]) -> float:
-    ordered = sorted(values)
-    return ordered[len(ordered) // 2]
-
-
-def _follow(known: float, measured: float) -> float:
-    """Up at once, down slowly: a cap that is too tight costs less than an overrun."""
-    return measured if measured >= known else known + FORGETTING * (measured - known)
+        ordered = sorted(self._latest)
+        measured = ordered[len(ordered) // 2]
+        self.us = measured if measured >= self.us else self.us + FORGETTING * (measured - self.us)

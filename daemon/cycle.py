@@ -2,14 +2,13 @@
 
 There is one per scan; without scans, one per block of light samples; and at 1.5 periods at the latest.
 
-:class:`Cycle` is synchronous and knows no timer, so that replay can drive it as well; :class:`Pacemaker` runs it when
+:class:`Cycle` is synchronous and knows no timer, so that replay can drive it as well; `daemon.pacemaker` runs it when
 it is due, in real or in virtual time. What a cycle consumed and decided goes to a tap as a :class:`CycleRecord`: with
 the raw streams that is all it takes to repeat the run exactly.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,32 +16,34 @@ from typing import Final
 
 from daemon.alarm import Alarm, bounded
 from daemon.bridge import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
-from daemon.budget import Budget
+from daemon.budget import Budget, Spent
 from daemon.evidence import EARLY, Observer
 from daemon.inbox import Inbox, Taken
 from daemon.lampwatch import LampWatch
+from daemon.laps import Laps, PulseTaker
 from daemon.logs import of_state
 from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
 from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Condition, Snapshot, Trust
 from daemon.reasons import REASONS
+from daemon.reasons import Reason as Cause
 from daemon.state import judge
 from daemon.state_evidence import SILENT_PERIODS, Evidence
 from daemon.state_memory import Memory
 from daemon.worker import Worker
 from estimator.records import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
-from estimator.result import StepResult
+from estimator.result import Fix, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
-from hal.lidar import LidarStatus, RawScan
+from hal.lidar import LidarStatus
 
 log = logging.getLogger(__name__)
 
-IDLE_PERIODS: Final = 1.5
-"""Scan periods after which a cycle starts without a scan."""
 OWN_SHARE: Final = 0.5
 """Part of the scan period that is the budget where none is configured."""
+TAKEN_UP: Final = 5
+"""Steps in a row that take the laser in again until it is no longer said to be left out: a few are trials."""
 
 Sink = Callable[[Snapshot], None]
 """Takes every snapshot; called from the loop thread, never waited for: it must return at once."""
@@ -127,6 +128,7 @@ class Cycle:
         blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
         alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
         paused: by a command: map and laser are left alone, light and odometry carry the pose.
+        laps: stages of the latest cycle. taker: makes the published picture of how the cycle is doing.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -151,10 +153,14 @@ class Cycle:
         self._switch: Callable[[], tuple[int, str]] | None = None
         self._switched = ""
         self._held: list[Answer] = []
+        self._used = 0
+        self.laps = Laps(parts.stopwatch)
+        self.taker = PulseTaker()
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
-        stages = _Stages(self.parts.stopwatch)
+        laps = self.laps
+        laps.begin()
         self.cycles += 1
         t_mono = self.parts.clock.now()
         taken = self.inbox.take()
@@ -162,15 +168,15 @@ class Cycle:
         answers = self._answers(t_mono)
         orders = [command for command in taken.commands if command.order not in (Order.PAUSE, Order.RESUME)]
         records = (*answers, *orders, *self._bridge(taken))
-        stages.lap("bridge")
-        limits = self._step(records, stages)
+        laps.lap("bridge")
+        limits = self._step(records)
         self._watch_lamps(t_mono, records, limits)
         verdict = self._judge(t_mono, records, None if limits is None else self.result)
         snapshot = self._painter.paint(self.result, verdict, self._facts(self.parts.clock.now()))
-        stages.lap("judge")
+        laps.lap("judge")
         self._publish(snapshot)
-        stages.lap("publish")
-        self._account(stages)
+        laps.lap("publish")
+        self._account(t_mono, records, limits)
         if self.parts.tap is not None:
             record = CycleRecord(
                 cycle=self.cycles,
@@ -184,7 +190,7 @@ class Cycle:
                 limits=limits,
                 result=self.result,
                 snapshot=snapshot,
-                stage_us=stages.us,
+                stage_us=laps.us,
                 samples=taken.samples_total,
                 switched=self._switched,
             )
@@ -274,7 +280,7 @@ class Cycle:
         silence = self.lidar_silence(t_mono)
         return (silence is not None and silence < (1.0 - EARLY) * SILENT_PERIODS) if self.parts.lidar else None
 
-    def _step(self, records: tuple[Record, ...], stages: _Stages) -> Limits | None:
+    def _step(self, records: tuple[Record, ...]) -> Limits | None:
         """Step the estimator under the budget's caps and return them; None where there was nothing to step over."""
         self._switched = ""
         if not records:
@@ -284,17 +290,32 @@ class Cycle:
             self._painter.map_id, self._switched = switch()
         parts = self.parts
         light = any(isinstance(record, SampleBlock) for record in records)
-        limits = parts.budget.limits(self.budget_us, light)
+        limits = parts.budget.limits(self.budget_us, light, self._carrier())
         if self.paused:
             limits = replace(limits, update_map=False, rung=Rung.CARRIED)
         self.result = parts.step(records, limits)
-        step_us = stages.lap("step")
-        if parts.stopwatch is not None:
-            parts.budget.learn(step_us, limits, self.result, light)
+        self.laps.lap("step")
+        self._tell_unused(limits)
         parts.worker.submit(self.result.jobs)
         if any(isinstance(record, Command) and record.order is Order.RESET for record in records):
             self._painter.map_id = (self._painter.map_id + 1) % 2**32
         return limits
+
+    def _carrier(self) -> bool:
+        """Whether light or odometry can carry the pose for a while."""
+        if self.observer.odometry_ok(self.parts.clock.now()):
+            return True
+        lights = None if self.result is None else self.result.lights
+        return lights is not None and lights.fix is Fix.GOOD and self.result is not None and self.result.placed
+
+    def _tell_unused(self, limits: Limits) -> None:
+        """Tell the judge that the laser is left out; that it is not any more only after some steps that use it."""
+        self._used = 0 if limits.rung >= Rung.CARRIED else self._used + 1
+        if self._used == 0:
+            self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED
+        elif self._used >= TAKEN_UP or self.observer.unused is Cause.PAUSED:
+            self.observer.unused = None
+        self.taker.on_rung(limits.rung)
 
     def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
         if limits is not None and self.result is not None:
@@ -351,6 +372,7 @@ class Cycle:
             fault=parts.fault(),
             condition=parts.condition(),
             trust=self.trust,
+            pulse=self.taker.pulse,
         )
 
     def _publish(self, snapshot: Snapshot) -> None:
@@ -365,64 +387,13 @@ class Cycle:
             else:
                 self.failing.discard(number)
 
-    def _account(self, stages: _Stages) -> None:
-        if self.parts.stopwatch is not None:
-            self.cycle_us = sum(stages.us.values())
-            self.overruns += self.cycle_us > self.budget_us
-
-
-class _Stages:
-    """Microseconds per stage, in order; empty without a stopwatch."""
-
-    def __init__(self, stopwatch: Callable[[], float] | None) -> None:
-        self.us: dict[str, int] = {}
-        self._stopwatch = stopwatch
-        self._last = stopwatch() if stopwatch is not None else 0.0
-
-    def lap(self, stage: str) -> float:
-        """End a stage; microseconds it took, 0 without a stopwatch."""
-        if self._stopwatch is None:
-            return 0.0
-        now = self._stopwatch()
-        took_us = (now - self._last) * 1e6
-        self._last = now
-        self.us[stage] = round(took_us)
-        return took_us
-
-
-class Pacemaker:
-    """Starts a cycle when a scan is complete; without scans, when a block of light samples is, or after a while."""
-
-    def __init__(self, cycle: Cycle) -> None:
-        self._cycle = cycle
-        self._due: asyncio.Future[None] | None = None
-
-    def on_scan(self, scan: RawScan) -> None:
-        """Take a scan from the driver; the cycle starts in the next turn of the loop, with the latest by then."""
-        self._cycle.inbox.put_scan(scan)
-        self._wake()
-
-    def on_samples(self, block: RawSamples) -> None:
-        """Take a block from the converter's driver; the next scan's cycle takes it along, if there are scans."""
-        cycle = self._cycle
-        cycle.inbox.put_samples(block)
-        silence = cycle.lidar_silence(cycle.parts.clock.now())
-        if silence is None or silence > IDLE_PERIODS:
-            self._wake()
-
-    async def run(self) -> None:
-        """Run cycles until cancelled."""
-        loop = asyncio.get_running_loop()
-        self._cycle.inbox.begin()
-        while True:
-            self._due = loop.create_future()
-            timer = loop.call_at(loop.time() + IDLE_PERIODS * self._cycle.period.seconds, self._wake)
-            try:
-                await self._due
-            finally:
-                timer.cancel()
-            self._cycle.run()
-
-    def _wake(self) -> None:
-        if self._due is not None and not self._due.done():
-            self._due.set_result(None)
+    def _account(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
+        if self.parts.stopwatch is None:
+            return
+        us, budget_us = self.laps.us, self.budget_us
+        self.cycle_us = sum(us.values())
+        self.overruns += self.cycle_us > budget_us
+        self.taker.on_cycle(t_mono, us)
+        if limits is not None and self.result is not None and not self.paused:
+            light = any(isinstance(record, SampleBlock) for record in records)
+            self.parts.budget.learn(Spent(us, budget_us, light), limits, self.result)

@@ -162,6 +162,8 @@ class Observer:
         if result is None or result.match is None:
             return None
         found = result.match
+        if found.reason is Reason.PASSED_OVER:
+            return None
         self._mapped = found.reason is not Reason.NO_MAP
         if not self._mapped:
             return None

@@ -26,7 +26,7 @@ from daemon.bridge import SampleBridge, ScanBridge
 from daemon.cli import FAILED, OK, USAGE
 from daemon.condition import Reporter
 from daemon.config import Config
-from daemon.cycle import Cycle, Pacemaker, Parts, Step
+from daemon.cycle import Cycle, Parts, Step
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.lastpose import LastPose
@@ -35,10 +35,12 @@ from daemon.logs import start_log
 from daemon.mapswitch import Maps, MapSwitch, Switch, take_over
 from daemon.network import Feeds, Network
 from daemon.notify import notify
+from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
 from daemon.realtime import claim
 from daemon.sampleclock import SampleClock, runtime_folder
+from daemon.stallwatch import StallWatch
 from daemon.store import NoMap, Start, folder_of, judge_for, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
@@ -47,7 +49,7 @@ from daemon.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.warmup import CannotLoad, Warmth, warm_up
 from daemon.worker import ThreadWorker
 from daemon.world import NoLidar, World
-from estimator.records import Command, Limits, Order, Record
+from estimator.records import Command, Limits, Order, Record, no_lap
 from estimator.result import StepResult
 from hal.adc import BusStuck
 from hal.clock import SystemClock
@@ -108,6 +110,7 @@ class Daemon:
                 alert_m=settings.integrity.alert_m,
             )
         )
+        self._estimator.lap = self.cycle.laps.lap
         self.keeper = self._keeper(settings, lights)
         self.last_pose = None if world.store is None else LastPose(world.store.folder)
         self.maps = self._map_switch(lights)
@@ -275,7 +278,7 @@ class _Estimator:
     """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
 
     Attributes:
-        state: None until then.
+        state: None until then. lap: told the name of each part of a step that has ended.
     """
 
     def __init__(self, lights: Lights | None, start: Start | None, localise: bool = False) -> None:
@@ -284,6 +287,7 @@ class _Estimator:
         self._lights = lights
         self._start = start
         self._step: Step | None = None
+        self.lap: Callable[[str], object] = no_lap
 
     def made(self, start: Start) -> Estimate:
         """A state as at a start in a stored map; may be called in another thread."""
@@ -301,7 +305,7 @@ class _Estimator:
         from estimator import pipeline
 
         self.state = new_state(self._lights, pipeline.Settings(localise=self._localise), self._start)
-        self._step = partial(pipeline.step, self.state)
+        self._step = partial(pipeline.step, self.state, lap=self.lap)
         return self._step
 
     def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
@@ -396,4 +400,6 @@ async def _run_until_signal(settings: Config, world: World, recorder: Recorder |
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    await Daemon(settings, world, recorder).run(stop)
+    daemon = Daemon(settings, world, recorder)
+    daemon.pacemaker.watch = StallWatch()
+    await daemon.run(stop)

@@ -9,7 +9,17 @@ from typing import Final
 import numpy as np
 
 from daemon.publish.lights import ROWS
-from daemon.publish.snapshot import Condition, LightFix, LightLink, LightPicture, LinkUse, LoopReason, Snapshot, Trust
+from daemon.publish.snapshot import (
+    Condition,
+    LightFix,
+    LightLink,
+    LightPicture,
+    LinkUse,
+    LoopReason,
+    Pulse,
+    Snapshot,
+    Trust,
+)
 from daemon.state_memory import Memory
 from estimator import se2
 from estimator.records import Array
@@ -46,6 +56,7 @@ class Facts:
     fault: int = 0
     trust: Trust = NO_TRUST
     condition: Condition | None = None
+    pulse: Pulse | None = None
 
 
 @dataclass(slots=True)
@@ -105,6 +116,7 @@ class Painter:
             fault=facts.fault,
             trust=facts.trust,
             condition=facts.condition,
+            pulse=facts.pulse,
         )
 
     def _shown(self, result: StepResult | None) -> tuple[LightLink, ...]:

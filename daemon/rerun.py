@@ -62,7 +62,7 @@ class ReplayBudget(FixedBudget):
         super().__init__()
         self.now = UNLIMITED
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         """The caps in force."""
         return self.now
 

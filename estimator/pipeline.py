@@ -22,6 +22,7 @@ from estimator.records import (
     Array,
     Command,
     Imu,
+    Lap,
     LightEpoch,
     Limits,
     Odometry,
@@ -29,6 +30,7 @@ from estimator.records import (
     Rung,
     SampleBlock,
     Scan,
+    no_lap,
 )
 from estimator.refusal import in_time, nothing_of, refused
 from estimator.result import MatchResult, Reason, StepResult
@@ -42,7 +44,7 @@ FLOOR = np.diag((0.005**2, 0.005**2, 0.003**2))
 """Variance of what no filter knows of: stamps, sweep and mount of a moving robot."""
 
 
-def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
+def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
     """Take the records since the last step, in the order in which they were true, and return the pose after them.
 
     Never raises for what a sensor delivers: a scan that cannot be matched leaves the prediction and says why.
@@ -56,20 +58,26 @@ def step(state: State, records: Iterable[Record], limits: Limits) -> StepResult:
         if isinstance(record, SampleBlock | LightEpoch):
             see_lights(state, record)
             lay_anchor(state)
+            lap("lights")
         if isinstance(record, Answer):
             close_loops(state, record)
+            lap("map")
         if isinstance(record, Scan):
             why = why or passed_over(limits)
             points = nothing_of(record) if why else virtual_frame(state, record)
             walk(state)
             match = match_scan(state, record, points, limits, why)
             fuse(state, match)
+            lap("match")
             if limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match):
                 if match.ok:
                     learn_alike(state, oriented(points, limits.points))
                 keyframe = lay_keyframe(state, record, points)
                 update_map(state, record, points)
+                lap("map")
+    lap("step")
     look_for_lamps(state, limits)
+    lap("search")
     adrift.step_done(state)
     return report(state, match, keyframe, limits)
 

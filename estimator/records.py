@@ -118,6 +118,15 @@ Record = Scan | SampleBlock | LightEpoch | Odometry | Imu | Command | Answer
 """What `step` takes. Light comes as a photodiode's samples, or decoded already (a foreign log, a link-level run)."""
 
 
+Lap = Callable[[str], object]
+"""Told the name of each part of a step when it has ended: ``lights``, ``match``, ``map``, ``search``. It may look at a
+clock; nothing in this room does, and nothing comes back from it."""
+
+
+def no_lap(part: str) -> None:
+    """A :data:`Lap` that nobody looks at."""
+
+
 class Rung(IntEnum):
     """How far a step does without: each leaves out what the ones before it leave out, and more."""
 

@@ -10,14 +10,16 @@ from daemon.budget import (
     FEWEST_ITERATIONS,
     FEWEST_POINTS,
     LONGEST_MAP_WAIT,
-    PLAIN_AGO,
+    PROBE_EVERY,
+    PROBES,
     SEARCH_SHARE,
     SEARCH_US,
     FixedBudget,
     MeasuredBudget,
     RecordedBudget,
+    Spent,
 )
-from estimator.records import UNLIMITED, Limits
+from estimator.records import UNLIMITED, Limits, Rung
 from estimator.result import MatchResult, Reason, StepResult
 
 
@@ -40,12 +42,20 @@ def step(iterations: int = 8, queries: int = 1000, keyframe: int = -1, matched: 
     )
 
 
-def learned(per_iteration_us: float, map_us: float = 0.0) -> MeasuredBudget:
+BUDGET_US = 12_500.0
+
+
+def spent(match_us: float, light: bool = False, **more: float) -> Spent:
+    return Spent({"match": match_us} | more, 1e9, light)
+
+
+def learned(per_iteration_us: float, map_us: float = 0.0, light_us: float = 0.0) -> MeasuredBudget:
     budget = MeasuredBudget()
     for _ in range(20):
-        budget.learn(8 * per_iteration_us, UNLIMITED, step())
+        budget.learn(spent(8 * per_iteration_us), UNLIMITED, step())
+        budget.learn(spent(8 * per_iteration_us, lights=light_us, light=True), UNLIMITED, step())
     for _ in range(20):
-        budget.learn(8 * per_iteration_us + map_us, UNLIMITED, step(keyframe=1))
+        budget.learn(spent(8 * per_iteration_us, map=map_us), UNLIMITED, step(keyframe=1))
     return budget
 
 
@@ -54,92 +64,117 @@ def test_before_anything_is_measured_nothing_is_capped() -> None:
 
 
 def test_a_quick_machine_is_not_capped() -> None:
-    assert learned(100.0, map_us=1000.0).limits(12_500.0) == UNLIMITED
+    assert learned(100.0, map_us=1000.0).limits(BUDGET_US) == UNLIMITED
 
 
-def test_first_map_work_waits() -> None:
-    limits = learned(500.0, map_us=9000.0).limits(12_500.0)
-    assert (limits.update_map, limits.points) == (False, UNLIMITED.points)
-    assert limits.icp_iterations == 25
-
-
-def test_then_the_scan_is_thinned() -> None:
-    limits = learned(4000.0).limits(12_500.0)
-    assert limits.points == pytest.approx(1000 * 12_500 / (12 * 4000), abs=2)
+def test_first_the_scan_is_thinned_and_map_work_goes_on() -> None:
+    limits = learned(800.0, map_us=5000.0).limits(BUDGET_US)
+    assert (limits.rung, limits.update_map) == (Rung.THINNED, True)
+    assert limits.points == pytest.approx(1000 * 7500 / (12 * 800), abs=2)
     assert limits.icp_iterations >= 12 - 1
 
 
-def test_the_floor_is_kept_on_a_hopeless_machine() -> None:
-    assert learned(1e6, map_us=1e6).limits(1000.0) == Limits(FEWEST_ITERATIONS, FEWEST_POINTS, False)
+def test_then_map_work_waits() -> None:
+    limits = learned(500.0, map_us=12_400.0).limits(BUDGET_US)
+    assert (limits.rung, limits.update_map) == (Rung.NO_MAP, False)
+    assert (limits.icp_iterations, limits.points) == (25, UNLIMITED.points), "all that is left is for matching"
+
+
+def test_last_the_laser_is_left_out_where_something_else_carries_the_pose() -> None:
+    limits = learned(1e6, map_us=1e6).limits(1000.0, carrier=True)
+    assert (limits.rung, limits.update_map) == (Rung.NO_MAP, False), "a trial"
+    budget = learned(1e6, map_us=1e6)
+    rungs = [budget.limits(1000.0, carrier=True).rung for _ in range(2 * PROBE_EVERY)]
+    assert rungs.count(Rung.CARRIED) == 2 * (PROBE_EVERY - PROBES)
+    assert rungs.count(Rung.NO_MAP) == 2 * PROBES, "now and then a scan is matched, to learn whether there is time"
+
+
+def test_the_floor_is_kept_on_a_hopeless_machine_where_nothing_else_carries_the_pose() -> None:
+    limits = learned(1e6, map_us=1e6).limits(1000.0)
+    assert limits == Limits(FEWEST_ITERATIONS, FEWEST_POINTS, False, rung=Rung.NO_MAP)
 
 
 def test_map_work_never_starves() -> None:
-    budget = learned(500.0, map_us=9000.0)
+    budget = learned(500.0, map_us=12_400.0)
     granted = []
     for _ in range(3 * (LONGEST_MAP_WAIT + 1)):
-        limits = budget.limits(12_500.0)
+        limits = budget.limits(BUDGET_US)
         granted.append(limits.update_map)
-        budget.learn(4000.0, limits, step())
+        budget.learn(spent(4000.0), limits, step())
     assert granted.count(True) == 3
     assert granted[: LONGEST_MAP_WAIT + 1] == [False] * LONGEST_MAP_WAIT + [True]
 
 
 def test_one_step_during_which_something_else_ran_changes_nothing() -> None:
     budget = learned(500.0)
-    budget.learn(50_000.0, UNLIMITED, step())
-    assert budget.limits(12_500.0).icp_iterations == 25
+    budget.learn(spent(50_000.0), UNLIMITED, step())
+    assert budget.limits(BUDGET_US).icp_iterations == 25
 
 
 def test_a_machine_that_becomes_slow_is_noticed_within_a_few_cycles_and_a_quick_one_too() -> None:
     budget = learned(500.0)
     for _ in range(3):
-        budget.learn(8 * 4000.0, UNLIMITED, step())
-    assert budget.limits(12_500.0).points < 400
+        budget.learn(spent(8 * 4000.0), UNLIMITED, step())
+    assert budget.limits(BUDGET_US).points < 400
     for _ in range(60):
-        budget.learn(8 * 500.0, UNLIMITED, step())
-    assert budget.limits(12_500.0).points == UNLIMITED.points
+        budget.learn(spent(8 * 500.0), UNLIMITED, step())
+    assert budget.limits(BUDGET_US).points == UNLIMITED.points
 
 
 def test_thinned_scans_still_teach_the_cost_of_full_ones() -> None:
     """Otherwise the caps would swing: thin, quick, full, slow, thin."""
     budget = learned(4000.0)
     for _ in range(50):
-        limits = budget.limits(12_500.0)
+        limits = budget.limits(BUDGET_US)
         part = limits.points / 1000
-        budget.learn(8 * 4000.0 * part, limits, step(queries=limits.points))
-    assert budget.limits(12_500.0).points == pytest.approx(260, rel=0.1)
+        budget.learn(spent(8 * 4000.0 * part), limits, step(queries=limits.points))
+    assert budget.limits(BUDGET_US).points == pytest.approx(260, rel=0.1)
 
 
 def test_steps_without_a_match_teach_nothing() -> None:
     budget = MeasuredBudget()
-    budget.learn(1e6, UNLIMITED, step(matched=False))
-    budget.learn(1e6, UNLIMITED, step(iterations=0))
+    budget.learn(spent(1e6), UNLIMITED, step(matched=False))
+    budget.learn(spent(1e6), UNLIMITED, step(iterations=0))
     assert budget.limits(10.0) == UNLIMITED
 
 
-def test_light_is_taken_from_the_budget_and_thins_no_scan_before_its_time() -> None:
+def test_light_is_taken_from_the_budget_of_the_cycles_that_have_it() -> None:
     """What a block costs to decode, 4 ms here, is not the iterations' doing."""
-    budget = MeasuredBudget()
-    for _ in range(40):
-        budget.learn(8 * 300.0, UNLIMITED, step())
-        budget.learn(8 * 300.0 + 4000.0, UNLIMITED, step(), light=True)
-    assert budget.limits(12_500.0).icp_iterations == 41, "300 us each"
-    assert budget.limits(12_500.0).points == budget.limits(12_500.0, light=True).points == UNLIMITED.points
-    assert budget.limits(12_500.0, light=True).icp_iterations == 28, "8.5 ms are left"
+    budget = learned(300.0, light_us=4000.0)
+    assert budget.limits(BUDGET_US).icp_iterations == 41, "300 us each"
+    assert budget.limits(BUDGET_US).points == budget.limits(BUDGET_US, light=True).points == UNLIMITED.points
+    assert budget.limits(BUDGET_US, light=True).icp_iterations == 28, "8.5 ms are left"
     assert budget.limits(7_000.0, light=True).points < 1000 < budget.limits(7_000.0).points
-    budget.learn(8 * 300.0 + 9000.0, UNLIMITED, step(keyframe=1), light=True)
-    assert budget.limits(9_000.0).update_map, "map work without light: 5 ms"
-    assert not budget.limits(9_000.0, light=True).update_map
 
 
-def test_where_every_step_has_light_it_is_counted_with_the_iterations() -> None:
+def test_all_the_rest_of_a_cycle_is_taken_from_the_budget_too() -> None:
     budget = MeasuredBudget()
-    for _ in range(PLAIN_AGO + 60):
-        budget.learn(8 * 300.0 + 4000.0, UNLIMITED, step(), light=True)
-    assert budget.limits(9_600.0, light=True).icp_iterations == 12
-    assert budget.limits(8_000.0, light=True).points < 1000, "a machine too slow for both is not left uncapped"
-    budget.learn(8 * 300.0, UNLIMITED, step())
-    assert budget.limits(9_600.0, light=True).points >= 1000
+    for _ in range(20):
+        budget.learn(spent(8 * 300.0, bridge=500, judge=2000, publish=1000, search=500), UNLIMITED, step())
+    assert budget.limits(BUDGET_US).icp_iterations == 28
+
+
+def test_what_is_left_out_is_taken_up_again_only_once_it_has_long_fitted() -> None:
+    budget = learned(500.0, map_us=12_400.0)
+    assert budget.limits(BUDGET_US).rung is Rung.NO_MAP
+    rungs = [budget.limits(BUDGET_US if k % 10 == 0 else 40_000.0).rung for k in range(60)]
+    assert set(rungs) == {Rung.NO_MAP}, "one cycle in ten that does not fit"
+    rungs = [budget.limits(40_000.0).rung for _ in range(60)]
+    assert sorted(set(rungs), reverse=True) == [Rung.NO_MAP, Rung.THINNED, Rung.FULL]
+    assert rungs == sorted(rungs, reverse=True), "one rung at a time"
+
+
+def test_overruns_that_no_cost_explains_lead_down_where_that_helps() -> None:
+    def after(match_us: float) -> Rung:
+        budget = MeasuredBudget()
+        for k in range(40):
+            limits = budget.limits(BUDGET_US)
+            judge_us = 20_000.0 if k % 3 == 2 else 10.0
+            budget.learn(Spent({"match": match_us, "judge": judge_us}, BUDGET_US), limits, step())
+        return Rung(budget.limits(BUDGET_US).rung)
+
+    assert after(3_000.0) > Rung.FULL
+    assert after(100.0) is Rung.FULL, "there is nothing to be had by matching less"
 
 
 def test_replay_uses_the_recorded_caps_in_order() -> None:
@@ -152,7 +187,7 @@ def test_replay_uses_the_recorded_caps_in_order() -> None:
 
 def test_fixed_caps_never_change() -> None:
     budget = FixedBudget(Limits(5, 6, False))
-    budget.learn(1e9, UNLIMITED, step())
+    budget.learn(spent(1e9), UNLIMITED, step())
     assert budget.limits(1.0) == Limits(5, 6, False)
 
 
@@ -166,6 +201,6 @@ def test_the_search_for_lamps_gets_a_millisecond_and_no_more_than_its_share() ->
     budget.learn_code(5.0)
     assert budget.limits(12_500.0).codes == UNLIMITED.codes
     for _ in range(20):
-        budget.learn(8 * 500.0, UNLIMITED, step())
+        budget.learn(spent(8 * 500.0), UNLIMITED, step())
     budget.learn_code(20.0)
     assert budget.limits(12_500.0).codes == SEARCH_US / 20.0

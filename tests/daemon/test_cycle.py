@@ -13,7 +13,8 @@ import pytest
 from daemon.bridge import ScanBridge
 from daemon.budget import Budget, FixedBudget, MeasuredBudget, RecordedBudget
 from daemon.config import LidarConfig
-from daemon.cycle import Cycle, CycleRecord, Pacemaker, Parts
+from daemon.cycle import Cycle, CycleRecord, Parts
+from daemon.pacemaker import Pacemaker
 from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Snapshot, State
 from daemon.reasons import Reason

@@ -391,7 +391,7 @@ def test_overruns_are_counted_published_and_named() -> None:
     async def scenario(bench: Bench) -> None:
         await bench.until(State.MAPPING, 3.0)
         await asyncio.sleep(3.0)
-        assert bench.last.cycle_us == 80_000
+        assert bench.last.cycle_us in (140_000, 160_000), "20 ms a stage, with or without map work"
         assert bench.last.overruns > 20
         assert bench.last.fault == Fault.OVERRUNS
 

@@ -46,7 +46,7 @@ class UnevenBudget(FixedBudget):
             [Limits(50, 100_000, True, 129), Limits(3, 120, False, 4), Limits(7, 333, True, 40)]
         )
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         return next(self._caps)
 
 

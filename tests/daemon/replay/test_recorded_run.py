@@ -45,7 +45,7 @@ class UnevenBudget(FixedBudget):
         super().__init__()
         self._caps = itertools.cycle([Limits(50, 100_000, True), Limits(3, 120, False), Limits(7, 333, True)])
 
-    def limits(self, budget_us: float, light: bool = False) -> Limits:
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         return next(self._caps)
 
 
