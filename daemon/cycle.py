@@ -315,7 +315,7 @@ class Cycle:
             self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED
         elif self._used >= TAKEN_UP or self.observer.unused is Cause.PAUSED:
             self.observer.unused = None
-        self.taker.on_rung(limits.rung)
+        self.taker.on_rung(limits.rung, self.paused)
 
     def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
         if limits is not None and self.result is not None:

@@ -49,6 +49,7 @@ class Fault(IntEnum):
     LOOP_STALLED = 301
     OVERRUNS = 302
     WORKER_FAILED = 303
+    OVERLOADED = 304
     PUBLISHER_FAILED = 401
     RECORDER_FAILED = 402
     MAP_NOT_SAVED = 403
@@ -143,6 +144,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.LOOP_STALLED: ("the process did not get to run for two scan periods", "take load off the computer"),
     Fault.OVERRUNS: ("more than 5 % of the cycles exceed their budget", "take load off the computer"),
+    Fault.OVERLOADED: (
+        "map work, or the laser itself, is left out for lack of time",
+        "take load off the computer, or raise `cycle.budget_ms`; the stages' times are published",
+    ),
     Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
@@ -191,7 +196,8 @@ class Vitals:
         adc: whether blocks of samples arrive, None where there is no photodiode. adc_link, adc_error: of its driver.
         blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked beyond the decoder's reach.
         lamps: what is wrong with lamps and survey.
-        cycles, overruns, jobs_failed: counters. lateness: worst lateness of the loop lately, seconds.
+        cycles, overruns, jobs_failed: counters; short: of cycles without map work or laser for lack of time.
+        lateness: worst lateness of the loop lately, seconds.
         alert: the bound on the position error is above the limit that is set, and was not before.
         failed: names of parts that are down at the moment.
     """
@@ -218,6 +224,7 @@ class Vitals:
     lamps: frozenset[Fault] = frozenset()
     cycles: int = 0
     overruns: int = 0
+    short: int = 0
     jobs_failed: int = 0
     lateness: float = 0.0
     alert: bool = False
@@ -305,6 +312,8 @@ def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.LOOP_STALLED
     if now.overruns - before.overruns > FEW + 0.05 * (now.cycles - before.cycles):
         yield Fault.OVERRUNS
+    if now.short - before.short > FEW + 0.05 * (now.cycles - before.cycles):
+        yield Fault.OVERLOADED
     if now.jobs_failed > before.jobs_failed:
         yield Fault.WORKER_FAILED
 

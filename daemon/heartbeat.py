@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 BEAT_S: Final = 1.0
 STATISTICS_BEATS: Final = 300
-"""Beats between two lines of statistics in the log."""
+"""Beats between two lines of statistics in the log; `systemctl status` shows the latest beat's."""
 SAID_BY_DRIVER: Final = frozenset(
     [Fault.LIDAR_MISSING, Fault.LIDAR_REFUSED, Fault.LIDAR_BROKEN, *(fault for _, fault in ADC_NOUNS)]
 ) - {Fault.ADC_GARBLED}
@@ -29,7 +29,7 @@ class Heartbeat:
 
     Args:
         vitals: takes a sample, given the loop's lateness in seconds.
-        statistics: a line for the log, now and then.
+        statistics: one line, for the service manager with every beat and for the log now and then.
         alive: whether the threads answer; else the watchdog is not fed.
     """
 
@@ -72,8 +72,11 @@ class Heartbeat:
         if (len(self._samples) < 2 or now.cycles > self._samples[-2].cycles) and self._alive():
             notify("WATCHDOG=1")
         self._beats += 1
-        if self._beats % STATISTICS_BEATS == 0:
-            log.info("%s", self._statistics())
+        statistics = self._statistics() if now.cycles else ""
+        if statistics:
+            notify(f"STATUS={statistics}")
+        if statistics and self._beats % STATISTICS_BEATS == 0:
+            log.info("%s", statistics)
 
     def _tell(self, faults: tuple[Fault, ...]) -> None:
         """Each fault is said once when it comes and once when it has gone."""

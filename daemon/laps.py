@@ -43,9 +43,14 @@ class Laps:
 
 
 class PulseTaker:
-    """Counts rungs, stalls and microseconds, and tells them as a :class:`Pulse`."""
+    """Counts rungs, stalls and microseconds, and tells them as a :class:`Pulse`.
+
+    Attributes:
+        short: cycles that left out map work or the laser for lack of time.
+    """
 
     def __init__(self) -> None:
+        self.short = 0
         self.pulse = Pulse()
         self._cycle, self._late = Histogram(), Histogram()
         self._stages = {name: Histogram() for name, stage in NAMES.items() if stage is not Stage.OUTSIDE}
@@ -55,9 +60,10 @@ class PulseTaker:
         """A cycle begins so long after it was due."""
         self._late.add(max(0, round(seconds * 1e6)))
 
-    def on_rung(self, rung: int) -> None:
+    def on_rung(self, rung: int, paused: bool = False) -> None:
         """A step was made on this rung."""
         pulse = self.pulse
+        self.short += rung >= Rung.NO_MAP and not paused
         if rung == Rung.FULL and pulse.rung == Rung.FULL:
             return
         self.pulse = replace(

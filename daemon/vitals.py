@@ -30,6 +30,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         **_photodiode(cycle, t_mono),
         cycles=cycle.cycles,
         overruns=cycle.overruns,
+        short=cycle.taker.short,
         jobs_failed=parts.worker.failed,
         lateness=lateness,
         alert=cycle.alarm.said,
@@ -62,8 +63,18 @@ def statistics(cycle: Cycle) -> str:
         f"state {cycle.verdict.state.name} cycles {cycle.cycles} overruns {cycle.overruns} scans {status.scans} "
         f"missed {status.missed} dropped {cycle.inbox.dropped} invalid {status.invalid} resyncs {status.resyncs} "
         f"reconnects {status.reconnects}{_light_statistics(cycle)} scan period {1e3 * cycle.period.seconds:.2f} ms "
-        f"cycle {cycle.cycle_us or 0} us memory {resident_mb():.0f} MB"
+        f"{_cycle_statistics(cycle)} memory {resident_mb():.0f} MB"
     )
+
+
+def _cycle_statistics(cycle: Cycle) -> str:
+    """How long cycles take and how late they begin, over the last minute, and what they leave out."""
+    pulse = cycle.taker.pulse
+    said = [f"rung {pulse.rung} stalls {pulse.stalls}"]
+    for name, spread in (("cycle", pulse.cycle), ("late", pulse.late)):
+        if spread is not None:
+            said.append(f"{name} p50 {spread[0]} p99 {spread[1]} max {spread[2]} us")
+    return " ".join(said)
 
 
 def _light_statistics(cycle: Cycle) -> str:

@@ -186,3 +186,10 @@ def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
     run_virtual(go())
     assert len(seen) == 10
     assert max(seen) < 1e-6
+
+
+def test_cycles_that_leave_out_map_work_or_laser_are_a_fault_while_they_are_many() -> None:
+    before = Vitals(0.0, cycles=400, short=10)
+    many, few = replace(before, t_mono=10.0, cycles=800, short=60), replace(before, t_mono=10.0, cycles=800, short=20)
+    assert assess(replace(many, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == (Fault.OVERLOADED,)
+    assert assess(replace(few, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == ()
