@@ -38,7 +38,7 @@ from daemon.notify import notify
 from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
-from daemon.realtime import claim
+from daemon.realtime import claim, line_up
 from daemon.sampleclock import SampleClock, runtime_folder
 from daemon.stallwatch import StallWatch
 from daemon.store import NoMap, Start, folder_of, judge_for, started
@@ -257,6 +257,7 @@ class Daemon:
 
     def _vitals(self, lateness: float) -> Vitals:
         self._keep_sample_clock()
+        line_up()
         if self.cycle.cycles == 0:
             self.cycle.announce()
             notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")

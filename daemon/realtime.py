@@ -2,6 +2,10 @@
 
 The right is the switch: a unit with ``LimitRTPRIO=`` and ``LimitMEMLOCK=infinity`` says that this computer is there for
 the robot. A person who tries the program in a terminal, even as root, gets neither.
+
+The other threads come right behind the loop, ahead of ordinary programs. They must: while one of them holds the
+interpreter and another program has its processor, the loop waits for that program, whatever its own priority is. With
+both cores busy cycles began up to 130 ms late for this; they are at work for a few hundredths of the time only.
 """
 
 from __future__ import annotations
@@ -9,10 +13,13 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
+import threading
 from typing import Final
 
 PRIORITY: Final = 40
 """Of SCHED_FIFO: above ordinary threaded interrupts' users, below the interrupts themselves (50)."""
+BEHIND: Final = 1
+"""Of SCHED_RR: that of the other threads, the lowest there is above all ordinary programs."""
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 """Flags of mlockall(2). On fault: only what is touched is kept; stacks and arenas are mostly never."""
 
@@ -20,11 +27,30 @@ MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 def claim() -> tuple[str, ...]:
     """Take what the limits allow, for the calling thread and its process; what was taken, or why not, a phrase each.
 
-    Threads made later do not inherit it (SCHED_RESET_ON_FORK): only the loop is in a hurry.
+    Threads made later do not inherit it (SCHED_RESET_ON_FORK): only the loop is in a hurry. They get their place from
+    :func:`line_up`.
     """
-    return _schedule(resource.getrlimit(resource.RLIMIT_RTPRIO)[0]), _lock(
-        resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    )
+    said = _schedule(resource.getrlimit(resource.RLIMIT_RTPRIO)[0])
+    line_up()
+    return said, _lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0])
+
+
+def line_up() -> int:
+    """Put threads made since the last call behind the calling one, where that is ahead of other programs; how many.
+
+    Call it now and then: it costs a few microseconds a thread.
+    """
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
+        return 0
+    moved, ours = 0, threading.get_native_id()
+    for task in map(int, os.listdir("/proc/self/task")):
+        try:
+            if task != ours and os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
+                os.sched_setscheduler(task, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(BEHIND))
+                moved += 1
+        except OSError:
+            continue  # it has ended, or the limit allows no more
+    return moved
 
 
 def _schedule(most: int) -> str:

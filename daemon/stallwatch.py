@@ -25,6 +25,8 @@ AGAIN_S: Final = 10.0
 """Stalls are counted all; a line in the log goes with the first of so long."""
 SHARE: Final = 0.5
 """Part of a stall that one thing has to make up to be called its cause."""
+MUCH_S: Final = 0.01
+"""A loop at rest looks around sooner than this, if it may."""
 OWN: Final = Path(__file__).resolve().parent.parent
 DEEP: Final = 3
 """Functions named, the innermost ones of ours."""
@@ -34,11 +36,17 @@ IDLE: Final = ("select", "wait", "get", "_wait_for_tstate_lock", "sleep", "poll"
 
 @dataclass(frozen=True, slots=True)
 class Caught:
-    """What was found when the timer went off: where the loop's thread was, which task, and what other threads did."""
+    """What was found when the timer went off.
+
+    Attributes:
+        where: in which functions the loop's thread was, empty: at rest. task: which one it was about.
+        others: other threads at work, and where. late: seconds until the loop's thread got to look around.
+    """
 
     where: str
     task: str
     others: str
+    late: float = 0.0
 
 
 class StallWatch:
@@ -54,7 +62,7 @@ class StallWatch:
         self.said = ""
         self._thread = threading.get_ident()
         self._caught: Caught | None = None
-        self._armed = time.monotonic()
+        self._armed = self._due = time.monotonic()
         self._cpu = time.thread_time()
         self._schedstat = _open(f"/proc/self/task/{threading.get_native_id()}/schedstat")
         self._kept = self._stolen()
@@ -71,7 +79,7 @@ class StallWatch:
         if caught is not None:
             lasted = now - self._armed
             self._tell(caught, lasted, cpu - self._cpu)
-        self._armed, self._cpu = now, cpu
+        self._armed, self._due, self._cpu = now, now + seconds, cpu
         self._kept = self._stolen()
         return lasted
 
@@ -86,7 +94,8 @@ class StallWatch:
     def _ring(self, number: int, frame: FrameType | None) -> None:
         """The timer has gone off: look around. Nothing here waits."""
         if self._caught is None:
-            self._caught = Caught(place(frame), _task(), self._others())
+            late = max(0.0, time.monotonic() - self._due)
+            self._caught = Caught(place(frame), _task(), self._others(), late)
 
     def _others(self) -> str:
         """Which of our other threads are at work, and where."""
@@ -124,11 +133,11 @@ def cause(caught: Caught, lasted: float, worked: float, waited: float | None) ->
         return f"{caught.where or 'the loop'}{task} ran for {worked:.3f} s"
     if waited is not None and waited >= SHARE * lasted:
         return f"other programs had the processor for {waited:.3f} s, in {caught.where or 'the loop'}{task}"
-    if not caught.where:
-        return "nothing was due: neither a scan nor the timer came, or the process was stopped"
-    if caught.others:
-        return f"{caught.where}{task} waited while {caught.others}"
-    return f"{caught.where}{task} waited: a call that blocks, or the process was stopped"
+    if caught.others and (caught.where or caught.late >= MUCH_S):
+        return f"{caught.where or 'the loop'}{task} waited while {caught.others}"
+    if not caught.where and caught.late < MUCH_S:
+        return "nothing was due: neither a scan nor the timer came"
+    return f"{caught.where or 'the loop'}{task} waited: a call that blocks, or the process was stopped"
 
 
 def place(frame: FrameType | None) -> str:

@@ -67,3 +67,30 @@ def test_a_kernel_that_refuses_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     assert realtime._schedule(40) == "ordinary scheduling (Operation not permitted)"
+
+
+@needs_root
+def test_other_threads_come_right_behind_the_loop_once_it_is_ahead_and_later_ones_too() -> None:
+    code = f"""
+import os, threading
+from daemon import realtime
+
+def made():
+    asked, told, found = threading.Event(), threading.Event(), []
+    def stay():
+        told.set(); asked.wait()
+        found.append((os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(0).sched_priority))
+    thread = threading.Thread(target=stay)
+    thread.start(); told.wait()
+    def end():
+        asked.set(); thread.join()
+        return found[0] == (os.SCHED_RR, 1)
+    return end
+
+one, nothing = made(), realtime.line_up()
+realtime._schedule({resource.RLIM_INFINITY})
+first = realtime.line_up()
+other, second, third = made(), realtime.line_up(), realtime.line_up()
+print(nothing, first >= 1, second, third, one(), other(), os.sched_getparam(0).sched_priority)
+"""
+    assert said_by(code) == "0 True 1 0 True True 40"

@@ -98,6 +98,9 @@ def test_whose_fault_it_was() -> None:
     assert "a call that blocks" in cause(at, 1.0, 0.1, None)
     assert "waited while x in y" in cause(Caught("cycle.run", "", "x in y"), 1.0, 0.1, 0.1)
     assert "nothing was due" in cause(Caught("", "", ""), 1.0, 0.1, 0.1)
+    assert "nothing was due" in cause(Caught("", "", "x in y"), 1.0, 0.1, 0.1)
+    assert "the loop waited while x in y" in cause(Caught("", "", "x in y", late=0.5), 1.0, 0.1, 0.1)
+    assert "the process was stopped" in cause(Caught("", "", "", late=0.5), 1.0, 0.1, 0.1)
 
 
 def test_closed_it_gives_the_signal_back() -> None:

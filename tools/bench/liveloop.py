@@ -78,7 +78,7 @@ class Idle:
         """See :class:`daemon.worker.Worker`."""
 
 
-def old_map(state: State, count: int, settled: Settled, seed: int = 0) -> None:
+def old_map(state: State, count: int, settled: Settled | None = None, seed: int = 0) -> None:
     """Lay ``count`` submaps up and down a hall, rows joined by loops, that end where the robot starts."""
     rng, atlas, P = np.random.default_rng(seed), state.atlas, np.diag(NOISE**2)
     turn = [np.pi / 2 * (1 if (k // ROW) % 2 == 0 else -1) if k % ROW >= ROW - 2 else 0.0 for k in range(count)]

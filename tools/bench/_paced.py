@@ -1,0 +1,262 @@
+"""A daemon of its own process that is fed 40 times a second by a kernel timer, and says how late its cycles begin.
+
+    python -m tools.bench._paced TELL        one JSON object with what is wanted; the outcome goes to standard output
+
+It is the whole of `daemon.main.Daemon`, publishers and threads included; only the sensors' wires are left out. In turn
+for a while it runs *alone*, and then *loaded*: readers and a stuck client (the parent's), and the graph of 1000 submaps
+being solved without a pause (its own).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import json
+import logging
+import os
+import pickle
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
+from daemon.lights import Lights
+from daemon.main import Daemon, World
+from daemon.realtime import PRIORITY, line_up
+from daemon.stallwatch import StallWatch
+from daemon.warmup import warm_up
+from daemon.worker import ThreadWorker
+from estimator.cdma_profile import PROFILE_A
+from estimator.closing import solve_graph
+from estimator.pipeline import new_state
+from estimator.records import Answer, Job
+from hal.adc import AdcStatus, RawSamples
+from hal.clock import Clock, SystemClock
+from hal.i2c import BusOpener
+from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
+from hal.port import PortOpener
+from hal.timerfd import timer
+from tools.bench._drive import PERIOD_S, Delivery
+from tools.bench.liveloop import SUBMAPS, old_map
+
+SETTLE_S: Final = 8.0
+
+
+@dataclass(slots=True)
+class Wanted:
+    """What the parent asks for. ``turns``: pairs of a stretch alone and one loaded, each of ``stretch_s``."""
+
+    drive: str
+    stream: str
+    modbus: int
+    receiver: str
+    fifo: bool
+    turns: int
+    stretch_s: float
+
+
+@dataclass(slots=True)
+class Told:
+    """What comes back: microseconds, by stretch."""
+
+    late: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
+    cycle: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
+    share: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
+    missed: int = 0
+    scans: int = 0
+    solved: int = 0
+    stalls: int = 0
+    said: str = ""
+
+
+class Solver(ThreadWorker):
+    """The daemon's own threads, which solve a graph over and over beside the daemon's jobs while ``busy``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.busy = False
+        self.solved = 0
+        self._state = new_state()
+        old_map(self._state, SUBMAPS)
+        self._mine: set[int] = set()
+
+    def submit(self, jobs: Iterable[Job]) -> None:
+        super().submit(jobs)
+        atlas = self._state.atlas
+        if self.busy and not self._mine:
+            atlas.stale = True
+            solve_graph(self._state, atlas)
+            mine = [replace(job, job_id=-1 - job.job_id) for job in atlas.take_jobs()]
+            self._mine = {job.job_id for job in mine}
+            super().submit(mine)
+
+    def collect(self, t_mono: float) -> tuple[Answer, ...]:
+        answers = super().collect(t_mono)
+        for answer in answers:
+            if answer.job_id in self._mine:
+                self._mine.discard(answer.job_id)
+                self._state.atlas.asked.clear()
+                self.solved += 1
+        return tuple(answer for answer in answers if answer.job_id >= 0)
+
+
+class Feeder:
+    """Stands for all sensors: what a recorded drive delivered, 40 times a second by the kernel's clock."""
+
+    def __init__(self, wanted: Wanted, geometry: LidarGeometry, deliveries: list[Delivery]) -> None:
+        self.geometry: LidarGeometry | None = geometry
+        self.status = LidarStatus(link=Link.STREAMING)
+        self.adc = AdcStatus(link=Link.STREAMING)
+        self.told = Told()
+        self.stretch = ""
+        self.daemon: Daemon | None = None
+        self.stop = asyncio.Event()
+        self.on_samples: Callable[[RawSamples], None] = lambda block: None
+        self._wanted = wanted
+        self._deliveries = deliveries
+        self._number = 0
+        self._t0 = self._taken = 0.0
+        self._begun = (0.0, 0.0)
+
+    async def run(self, on_scan: Callable[[RawScan], None]) -> None:
+        """See :class:`hal.lidar.Lidar`."""
+        daemon = self.daemon
+        assert daemon is not None
+        while daemon.cycle.cycles == 0:  # noqa: ASYNC110  # nothing tells of the first cycle
+            await asyncio.sleep(0.05)
+        if self._wanted.fifo:
+            _first_in_line()
+        loop, ring = asyncio.get_running_loop(), asyncio.Event()
+        clock = timer(loop, ring.set)
+        run = daemon.cycle.run
+        daemon.cycle.run = lambda: self._timed(run)  # type: ignore[method-assign]  # to see when it begins
+        self._t0 = loop.time() + PERIOD_S
+        while self._number < len(self._deliveries):
+            clock.at(self._t0 + self._number * PERIOD_S)
+            await ring.wait()
+            ring.clear()
+            self._deliver(on_scan, loop.time())
+        clock.close()
+        self._turn("")
+        self.told.missed, self.told.scans = daemon.cycle.inbox.dropped, self._number
+        self.stop.set()
+        await asyncio.Event().wait()
+
+    def _deliver(self, on_scan: Callable[[RawScan], None], now: float) -> None:
+        """All that is due by now; a daemon that is late for more than a scan gets them all at once and loses some."""
+        assert self.daemon is not None
+        self._taken = self._t0 + self._number * PERIOD_S
+        while self._number < len(self._deliveries) and self._t0 + self._number * PERIOD_S <= now:
+            delivery = self._deliveries[self._number]
+            later = self._t0 + self._number * PERIOD_S - delivery.t_mono
+            for reading in delivery.odometry:
+                at = reading.t_mono + later
+                self.daemon.cycle.inbox.put_odometry(replace(reading, t_rx=at, t_mono=at))
+            for block in delivery.samples:
+                t0, t1, t_first = block.t0 + later, block.t1 + later, block.t_first + later
+                self.on_samples(replace(block, t0=t0, t1=t1, t_first=t_first))
+            scan = delivery.scan
+            on_scan(replace(scan, t_rx=scan.t_rx + later, t_mono=scan.t_mono + later))
+            self._number += 1
+        self._turn(self._stretch_now())
+
+    def _stretch_now(self) -> str:
+        at = (self._number * PERIOD_S - SETTLE_S) / self._wanted.stretch_s
+        return "" if at < 0.0 else ("alone", "loaded")[int(at) % 2]
+
+    def _turn(self, stretch: str) -> None:
+        """A stretch begins: tell the parent, and count the processor's time of the one that ends."""
+        if stretch == self.stretch:
+            return
+        now, cpu = time.monotonic(), time.process_time()
+        if self.stretch and now - self._begun[0] > 0.9 * self._wanted.stretch_s:
+            self.told.share[self.stretch].append((cpu - self._begun[1]) / (now - self._begun[0]))
+        self._begun, self.stretch = (now, cpu), stretch
+        assert self.daemon is not None
+        solver = self.daemon.cycle.parts.worker
+        assert isinstance(solver, Solver)
+        solver.busy, self.told.solved = stretch == "loaded", solver.solved
+        os.write(1, f"{stretch or 'alone'}\n".encode())
+
+    def _timed(self, run: Callable[[], object]) -> object:
+        late = time.monotonic() - self._taken
+        snapshot = run()
+        if self.stretch and self.daemon is not None:
+            self.told.late[self.stretch].append(1e6 * late)
+            self.told.cycle[self.stretch].append(float(self.daemon.cycle.cycle_us or 0))
+        return snapshot
+
+
+def _first_in_line() -> None:
+    """As `daemon.realtime.claim` does where a unit allows it; this process is its own and needs no unit."""
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+    ctypes.CDLL(None).mlockall(1 | 2 | 4)
+    line_up()
+
+
+async def go(wanted: Wanted, drive: Any) -> Told:
+    """Run the daemon over the drive."""
+    geometry, survey, mount, deliveries = drive
+    feeder = Feeder(wanted, geometry, deliveries)
+
+    def lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Feeder:
+        return feeder
+
+    class Converter:
+        status = feeder.adc
+
+        async def run(self, on_samples: Callable[[RawSamples], None]) -> None:
+            feeder.on_samples = on_samples
+            await asyncio.Event().wait()
+
+    def adc(config: PhotodiodeConfig, clock: Clock, opener: BusOpener) -> Any:
+        return Converter()
+
+    x, y, yaw = mount
+    lights = Lights(survey, PROFILE_A, 0.0)
+    settings = Config(
+        lidar=LidarConfig(device="/dev/bench", mount=Mount(x, y, float(np.degrees(yaw)))),
+        odometry=OdometryConfig(port=_free_port()),
+        photodiode=PhotodiodeConfig(bus="/dev/bench-bus"),
+        modbus=ModbusConfig(port=wanted.modbus),
+        pose=PoseConfig(receivers=(wanted.receiver,)),
+    )
+
+    async def warm() -> object:
+        return await warm_up(lights=lights)
+
+    world = World(
+        SystemClock(), make_lidar=lidar, make_adc=adc, lights=lights, warm_up=warm, make_worker=Solver,
+        stream=Path(wanted.stream),
+    )  # fmt: skip
+    feeder.daemon = daemon = Daemon(settings, world)
+    daemon.pacemaker.watch = watch = StallWatch()
+    await daemon.run(feeder.stop)
+    feeder.told.stalls, feeder.told.said = daemon.cycle.taker.pulse.stalls, watch.said
+    return feeder.told
+
+
+def _free_port() -> int:
+    import socket
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def main() -> None:
+    """What the parent starts."""
+    logging.basicConfig(level=logging.WARNING)
+    wanted = Wanted(**json.loads(sys.argv[1]))
+    drive = pickle.loads(Path(wanted.drive).read_bytes())  # written by the parent a moment ago
+    told = asyncio.run(go(wanted, drive))
+    os.write(1, ("told " + json.dumps({name: getattr(told, name) for name in Told.__slots__}) + "\n").encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,241 @@
+"""How late cycles begin at 40 Hz while other programs keep both cores busy, against a bare loop in C in the same run.
+
+The daemon (a process of its own, whole but for the sensors' wires: `tools.bench._paced`) is fed 1081 beams, wheels and
+16 lamps by a kernel timer. Two burners walk through memory meanwhile. Stretches of ten seconds take turns: *alone*, and
+*loaded* with 8 Modbus readers at 100 Hz each, a stream client that never reads, and the graph of 1000 submaps solved
+without a pause. Before and after, the C program (`_timerloop.c`) waits for the same timer at the same priority.
+
+``make bench ARGS=latency`` takes a minute with SCHED_FIFO and one without; for figures that are statistically firm
+``python -m tools.bench.latency --turns 30`` (11 minutes each).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pickle
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from daemon.lights import Lights
+from daemon.realtime import PRIORITY
+from daemon.warmup import load
+from estimator.cdma_profile import PROFILE_A
+from tools.bench._drive import PERIOD_S, EndlessDrive
+from tools.bench._paced import SETTLE_S
+from tools.figures import Figure, bounded, save, table
+
+COMMAND: Final = "python -m tools.bench.latency"
+ROOT: Final = Path(__file__).parents[2]
+STRETCH_S: Final = 10.0
+BARE_S: Final = 10.0
+BURNERS: Final = 2
+TELLING: Final = ("pose", "lights", "scan", "state", "loop")
+
+
+class CannotRun(RuntimeError):
+    """What is needed is not there."""
+
+
+def compiled(folder: Path) -> Path:
+    """The C program.
+
+    Raises:
+        CannotRun: no compiler.
+    """
+    compiler, program = shutil.which("cc") or shutil.which("gcc"), folder / "timerloop"
+    if compiler is None:
+        raise CannotRun("no C compiler: apt-get install gcc")
+    subprocess.run([compiler, "-O2", "-o", str(program), str(Path(__file__).with_name("_timerloop.c"))], check=True)
+    return program
+
+
+def bare(program: Path, fifo: bool, seconds: float = BARE_S) -> list[float]:
+    """Microseconds by which each turn of the C program was late."""
+    count, priority = round(seconds / PERIOD_S), PRIORITY if fifo else 0
+    done = subprocess.run(
+        [str(program), "wait", str(round(1e6 * PERIOD_S)), str(count), str(priority)], capture_output=True, text=True
+    )
+    if done.returncode:
+        raise CannotRun(f"the loop in C: {done.stderr.strip()}; SCHED_FIFO needs root or CAP_SYS_NICE")
+    return [float(line) for line in done.stdout.split()]
+
+
+@contextmanager
+def burning(program: Path) -> Iterator[None]:
+    """Both cores busy."""
+    burners = [subprocess.Popen([str(program), "burn"]) for _ in range(BURNERS)]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+def prepared(folder: Path, seconds: float) -> Path:
+    """What the sensors deliver in so many seconds, in a file."""
+    drive, path = EndlessDrive(), folder / "drive"
+    deliveries = [next(drive) for _ in range(round(seconds / PERIOD_S))]
+    with path.open("wb") as file:
+        pickle.dump((drive.geometry, drive.survey, drive.scene.mount, deliveries), file)
+    return path
+
+
+class Load:
+    """The readers and the stuck client, on and off."""
+
+    def __init__(self, modbus: int, stream: str) -> None:
+        self._stream = stream
+        self._stuck: socket.socket | None = None
+        command = [sys.executable, "-m", "tools.bench._readers", str(modbus)]
+        self._readers = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        self._readers.send_signal(signal.SIGSTOP)
+
+    def turn(self, on: bool) -> None:
+        """On or off."""
+        self._readers.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
+        if self._stuck is not None:
+            self._stuck.close()
+            self._stuck = None
+        if on:
+            self._stuck = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            self._stuck.connect(self._stream)
+            want = msgspec.msgpack.encode({"want": list(TELLING)})
+            self._stuck.sendall(len(want).to_bytes(4, "little") + want)
+
+    def end(self) -> tuple[int, int]:
+        """Requests asked and answered."""
+        self.turn(False)
+        self._readers.send_signal(signal.SIGCONT)
+        self._readers.terminate()
+        asked, answered = self._readers.communicate(timeout=30.0)[0].split()
+        return int(asked), int(answered)
+
+
+def paced(folder: Path, drive: Path, fifo: bool, turns: int) -> dict[str, Any]:
+    """One run of the daemon: what it told, with the readers' counts."""
+    with ExitStack() as undo:
+        sink = undo.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        sink.bind(("127.0.0.1", 0))
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            modbus = int(free.getsockname()[1])
+        stream = str(folder / "stream")
+        wanted = {
+            "drive": str(drive), "stream": stream, "modbus": modbus, "fifo": fifo, "turns": turns,
+            "receiver": f"127.0.0.1:{sink.getsockname()[1]}", "stretch_s": STRETCH_S,
+        }  # fmt: skip
+        command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
+        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
+        undo.callback(child.kill)
+        load = Load(modbus, stream)
+        undo.callback(load._readers.kill)
+        assert child.stdout is not None
+        for line in child.stdout:
+            if line.startswith("told "):
+                asked, answered = load.end()
+                child.wait(30.0)
+                return json.loads(line[5:]) | {"asked": asked, "answered": answered}
+            load.turn(line.strip() == "loaded")
+    raise CannotRun("the daemon ended before its time; its log says why")
+
+
+def measure(turns: int, fifos: tuple[bool, ...] = (True, False)) -> dict[str, dict[str, Any]]:
+    """Both runs, by name."""
+    load(Lights(EndlessDrive().survey, PROFILE_A))
+    found = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        program, drive = compiled(folder), prepared(folder, SETTLE_S + 2 * turns * STRETCH_S)
+        for fifo in fifos:
+            with burning(program):
+                before = bare(program, fifo)
+                told = paced(folder, drive, fifo, turns)
+                told["bare"] = before + bare(program, fifo)
+            found["SCHED_FIFO" if fifo else "ordinary"] = told
+    return found
+
+
+def figures(found: dict[str, dict[str, Any]]) -> list[Figure]:
+    """All rows."""
+    rows = []
+    for name, told in found.items():
+        bound = name == "SCHED_FIFO"
+        late = {what: 1e-3 * np.array(told["late"][what]) for what in ("alone", "loaded")}
+        every = np.concatenate(list(late.values()))
+        bare_ms = 1e-3 * np.array(told["bare"])
+        bare_worst = float(np.percentile(bare_ms, 99.9))
+        rows += _late(f"{name}: bare C loop", bare_ms)
+        rows += _late(f"{name}: cycles, alone", late["alone"], 1.5 if bound else None)
+        rows += _late(f"{name}: cycles, loaded", late["loaded"])
+        worst = float(np.percentile(every, 99.9)) - bare_worst
+        more = float(np.percentile(late["loaded"], 99) - np.percentile(late["alone"], 99))
+        share = 100.0 * told["missed"] / told["scans"]
+        limits = (("<= 1", worst), ("<= 1", more), ("<= 0.01", share))
+        names = ("p99.9 of all cycles over the bare loop's", "p99, loaded over alone", "scans missed")
+        for what, (limit, value), unit in zip(names, limits, ("ms", "ms", "%"), strict=True):
+            full = f"{name}: {what}"
+            rows.append(
+                bounded(full, value, unit, limit, COMMAND) if bound else Figure(full, value, unit, command=COMMAND)
+            )
+        rows += _costs(name, told)
+    return rows
+
+
+def _late(name: str, ms: np.ndarray[Any, Any], bound: float | None = None) -> list[Figure]:
+    rows = [Figure(f"{name}: turns", float(len(ms)), "", command=COMMAND)]
+    for q in (50.0, 99.0, 99.9, 100.0):
+        value, what = float(np.percentile(ms, q)), f"{name}: late, p{q:g}"
+        if q == 99.0 and bound is not None:
+            rows.append(bounded(what, value, "ms", f"<= {bound:g}", COMMAND))
+        else:
+            rows.append(Figure(what, value, "ms", command=COMMAND))
+    return rows
+
+
+def _costs(name: str, told: dict[str, Any]) -> list[Figure]:
+    cycle = 1e-3 * np.array(told["cycle"]["alone"])
+    share = 100.0 * float(np.mean(told["share"]["alone"]))
+    return [
+        Figure(f"{name}: a cycle, median", float(np.median(cycle)), "ms", command=COMMAND),
+        Figure(f"{name}: a cycle, p99.9", float(np.percentile(cycle, 99.9)), "ms", command=COMMAND),
+        bounded(f"{name}: all threads, share of one core, alone", share, "%", "<= 15", COMMAND),
+        Figure(f"{name}: the same, loaded", 100.0 * float(np.mean(told["share"]["loaded"])), "%", command=COMMAND),
+        Figure(f"{name}: graphs solved", float(told["solved"]), "", command=COMMAND),
+        Figure(f"{name}: Modbus requests unanswered", float(told["asked"] - told["answered"]), "", command=COMMAND),
+        Figure(f"{name}: stalls", float(told["stalls"]), "", command=COMMAND),
+    ]
+
+
+def run(turns: int = 2) -> list[Figure]:
+    """Some 40 s of cycles with SCHED_FIFO, where it may be had, and as many without."""
+    fifos = (True, False) if os.geteuid() == 0 else (False,)
+    return figures(measure(turns, fifos))
+
+
+def main() -> None:
+    """The long form."""
+    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
+    parser.add_argument("--turns", type=int, default=30, help="pairs of 10 s alone and 10 s loaded")
+    parser.add_argument("--out", type=Path, default=Path("out/bench"))
+    options = parser.parse_args()
+    rows = run(options.turns)
+    print(table(rows))
+    print(f"written: {save('latency', rows, options.out)}")
+
+
+if __name__ == "__main__":
+    main()
