@@ -14,6 +14,7 @@ import ctypes
 import os
 import resource
 import threading
+from pathlib import Path
 from typing import Final
 
 PRIORITY: Final = 40
@@ -43,7 +44,8 @@ def line_up() -> int:
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0
     moved, ours = 0, threading.get_native_id()
-    for task in map(int, os.listdir("/proc/self/task")):
+    for path in Path("/proc/self/task").iterdir():
+        task = int(path.name)
         try:
             if task != ours and os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
                 os.sched_setscheduler(task, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(BEHIND))
