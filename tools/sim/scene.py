@@ -66,14 +66,15 @@ class Scenario:
     """Everything that makes a simulated run repeatable.
 
     Attributes:
-        building: name, see :data:`tools.sim.buildings.BUILDINGS`. lidar: name in :data:`hal.fake.models.MODELS`.
+        building: name, see :data:`tools.sim.buildings.BUILDINGS`.
+        lidar: name in :data:`hal.fake.models.MODELS`, or a model of one's own.
         seed: of noise, people and slip. people: False empties the building.
         dwell_s: standing still before each lap. laps: how many.
         optics: None takes the lidar's own. lights: coded lamps overhead; None: there are none.
     """
 
     building: str = "paper_room"
-    lidar: str = "paper"
+    lidar: str | LidarModel = "paper"
     seed: int = 0
     people: bool = True
     dwell_s: float = 2.0
@@ -103,7 +104,7 @@ class SimulatedScene:
         self.model = lidar_model(scenario.lidar)
         self.building = place or building(scenario.building)
         self.drive = Drive(self.building.route, scenario.body, scenario.dwell_s, scenario.laps)
-        self.optics = scenario.optics or OPTICS.get(scenario.lidar, beams.UTM_30LX)
+        self.optics = scenario.optics or OPTICS.get(str(scenario.lidar), beams.UTM_30LX)
         self.held = held
         self.t_go: float | None = None
         self._way = Way(self.drive)
@@ -198,8 +199,10 @@ class SimulatedScene:
         return self._way.poses(np.asarray(t_mono) - self.t_go)
 
 
-def lidar_model(name: str) -> LidarModel:
+def lidar_model(name: str | LidarModel) -> LidarModel:
     """The model of that name; raises ValueError that lists the names there are."""
+    if isinstance(name, LidarModel):
+        return name
     if name not in MODELS:
         raise ValueError(f"no lidar is called {name!r}; there are: {', '.join(MODELS)}")
     return MODELS[name]

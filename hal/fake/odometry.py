@@ -1,0 +1,155 @@
+"""A robot's motor controller that sends odometry datagrams (docs/udp.md), with orderable faults.
+
+It has its own encoder of the datagram. Readings come from a source of cumulative poses and leave through a function;
+what carries them (a socket, an input port in virtual time) is the caller's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+import zlib
+from collections.abc import Callable
+from random import Random
+from typing import Final
+
+from hal.fake.faults import Fault, Parameter, Vocabulary, Word
+from hal.fake.schedule import Orders
+
+Pose = tuple[float, float, float]
+Source = Callable[[float], tuple[float, Pose] | None]
+"""The first reading after a time: when it is due and the pose the wheels have counted since their start; None: none."""
+
+ODOMETRY: Vocabulary = {
+    # the general words
+    "off": Word("the controller has no power; afterwards it counts from zero, as a new session", "lasts"),
+    "stuck": Word("the same pose again and again under running numbers; afterwards it has caught up", "lasts"),
+    "garbage": Word("random bytes of the same length instead", "strikes"),
+    "wrong": Word("ways and turns it tells are `factor` times as large", "lasts",
+                  {"factor": Parameter(1.5, -10.0, 10.0)}),
+    "slow": Word("it sends `factor` times as seldom", "lasts", {"factor": Parameter(4.0, 1.0, 1000.0)}),
+    "delayed": Word("datagrams arrive `by_s` later", "lasts", {"by_s": Parameter(0.3, 0.0, 60.0)}),
+    "intermittent": Word("datagrams are lost on the way", "strikes", share=0.5),
+    # what a network and a controller do besides
+    "jump": Word("the pose jumps by `by_m`, as after a counter's overflow", "once", {"by_m": Parameter(3.0, -1e3, 1e3)}),
+    "restart": Word("the controller starts anew: another session, counting from zero", "once"),
+    "blocked": Word("the wheels' counters stand still; what was driven meanwhile is never counted", "lasts"),
+}  # fmt: skip
+"""By word. ``off stuck garbage wrong slow delayed intermittent`` mean what they mean for any device."""
+
+_SHARED_CLOCK: Final = 1
+_DATAGRAM: Final = struct.Struct("<4sHHIIIIdddd")
+
+
+def datagram(session: int, seq: int, t_mono: float, pose: Pose) -> bytes:
+    """An odometry datagram, version 1, stamped in the daemon's own clock."""
+    length = _DATAGRAM.size + 4
+    data = _DATAGRAM.pack(b"LUOD", 1, length, session, seq % (1 << 32), _SHARED_CLOCK, 0, t_mono, *pose)
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
+class FakeOdometry:
+    """Sends readings when they are due; a :class:`hal.fake.schedule.Target` of fault orders.
+
+    Args:
+        source: of readings, times in the loop's. send: takes a datagram, at the instant it arrives.
+        seed: of the strikes left to chance.
+    """
+
+    vocabulary = ODOMETRY
+
+    def __init__(self, source: Source, send: Callable[[bytes], None], seed: int = 0) -> None:
+        self._source, self._send = source, send
+        self._chance = Random(seed)
+        self._loop = asyncio.get_running_loop()
+        self.orders = Orders(seed + 1)
+        self.sent = 0
+        self._session, self._seq = 1, 0
+        self._told: Pose = (0.0, 0.0, 0.0)
+        self._counted: Pose | None = None
+        self._origin: Pose | None = None
+        self._skipped = 0
+
+    def check(self, fault: Fault) -> None:
+        """Nothing more to check than the ranges."""
+
+    def in_force(self) -> list[Fault]:
+        """Faults that have not been lifted and have not spent their strikes."""
+        return self.orders.in_force()
+
+    def begin(self, fault: Fault) -> None:
+        """A fault comes into force (one that happens once happens now)."""
+        if fault.what == "jump":
+            x, y, yaw = self._told
+            self._told = (x + fault.number("by_m"), y, yaw)
+        elif fault.what == "restart":
+            self._restart()
+        else:
+            self.orders.add(fault)
+
+    def end(self, fault: Fault) -> None:
+        """A fault is lifted."""
+        self.orders.remove(fault)
+        if fault.what == "off":
+            self._restart()
+
+    async def run(self) -> None:
+        """Send until cancelled, or until there are no more readings."""
+        t = self._loop.time()
+        while (reading := self._source(t)) is not None:
+            t, pose = reading
+            await asyncio.sleep(t - self._loop.time())
+            self._count(pose)
+            if not self.orders.on("off") and self._due():
+                self._tell(t)
+
+    def _restart(self) -> None:
+        self._session, self._seq, self._told = self._session + 1, 0, (0.0, 0.0, 0.0)
+
+    def _count(self, pose: Pose) -> None:
+        """Add what was driven since the last reading to what is told, as the faults in force leave it."""
+        before, self._counted = self._counted or pose, pose
+        if self.orders.on("blocked") or self.orders.on("off"):
+            return
+        wrong = self.orders.on("wrong")
+        ahead, left, turn = _between(before, pose)
+        factor = wrong.number("factor") if wrong else 1.0
+        self._told = _then(self._told, (factor * ahead, factor * left, factor * turn))
+
+    def _due(self) -> bool:
+        slow = self.orders.on("slow")
+        self._skipped += 1
+        if slow is not None and self._skipped < slow.number("factor"):
+            return False
+        self._skipped = 0
+        return True
+
+    def _tell(self, t_mono: float) -> None:
+        if self.orders.on("stuck") is None or self._origin is None:
+            self._origin = self._told
+        data = datagram(self._session, self._seq, t_mono, self._origin)
+        self._seq += 1
+        if self.orders.strike("intermittent"):
+            return
+        if self.orders.strike("garbage"):
+            data = self._chance.randbytes(len(data))
+        late = self.orders.on("delayed")
+        self.sent += 1
+        if late is None:
+            self._send(data)
+        else:
+            self._loop.call_later(late.number("by_s"), self._send, data)
+
+
+def _between(a: Pose, b: Pose) -> Pose:
+    """Pose ``b`` seen from pose ``a``."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    return c * dx + s * dy, -s * dx + c * dy, b[2] - a[2]
+
+
+def _then(a: Pose, step: Pose) -> Pose:
+    """The pose that lies at ``step`` as seen from pose ``a``."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return a[0] + c * step[0] - s * step[1], a[1] + s * step[0] + c * step[1], a[2] + step[2]
