@@ -11,6 +11,7 @@ import logging
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -19,6 +20,10 @@ from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConf
 from daemon.health import Fault
 from daemon.main import Daemon
 from daemon.publish.snapshot import Snapshot, State
+from daemon.store import Start
+from daemon.store_image import meta_of, packed
+from daemon.store_tables import digest_of, read
+from estimator.mapimage import Identity, image_of
 from hal.clock import LoopClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import UTM_30LX, LidarModel, Unit
@@ -27,8 +32,10 @@ from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.inputs import InputPort
 from tools.sim.ceiling import Effects
+from tools.sim.ceiling_effects import IDEAL
 from tools.sim.harness import DEVICE, world
 from tools.sim.harness_light import BUS, light_up, lights_of
+from tools.sim.odometry import Wheels
 from tools.sim.robot import Body
 from tools.sim.scene import Scenario, SimulatedScene
 from tools.sim.scene_light import Lights
@@ -43,6 +50,11 @@ ROBOT: Final = Scenario(
     lights=Lights(effects=Effects(gain_spread=0.0, receiver_gain=0.0, warm_up=0.0)),
 )  # fmt: skip
 """Half a metre a second under lamps whose brightness has been calibrated; everything else as rough as ever."""
+SURVEYOR: Final = replace(
+    ROBOT, people=False, lights=Lights(effects=IDEAL), wheels=Wheels(scale=0.0, base_scale=0.0, slips_per_m=0.0)
+)
+"""Whoever made the map that the robot has: nobody about, lamps as planned, good wheels."""
+SURVEY_S: Final = 100.0
 _PORT: Final = 1
 
 
@@ -105,11 +117,13 @@ class House:
     """World, devices and one daemon after the other.
 
     Attributes:
+        map: that the robot has, as a file; None: none.
         sights: everything published. faults: orders of ``lidar``, ``adc`` and ``odometry``.
         lines: the log. daemon: the present one.
     """
 
     scenario: Scenario = ROBOT
+    map: bytes | None = None
     sights: list[Sight] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -142,6 +156,7 @@ class House:
 
     def start(self) -> None:
         """Start a daemon, as a service manager would."""
+        self.world.start = None if self.map is None else Start(self.map, read(self.map))
         self.daemon = Daemon(self.settings, self.world)
         for part in ("odometry", "imu"):  # their socket would wait in real time
             self.daemon.network.parts.pop(part)
@@ -166,6 +181,15 @@ class House:
             return ""
         error = self._running.exception()
         return "it ended by itself" if error is None else f"it ended with {error!r}"
+
+    def drawn(self) -> bytes:
+        """The map as it is now, as a file."""
+        state, lights = self.daemon.keeper._state(), self.world.lights
+        assert state is not None
+        assert lights is not None
+        who = Identity(map_id=1, name="", surveyed=True, survey=digest_of(lights.survey), session=1)
+        image = image_of(state, who)
+        return packed(image, meta_of(image, 1.7e9, "robot", "0"))
 
     def order(self, toml: str) -> None:
         """Take orders for the devices: TOML with `; ` for a new line and ` + ` between orders."""
@@ -219,11 +243,26 @@ def _seen_from(at: np.ndarray, pose: np.ndarray, site: np.ndarray) -> np.ndarray
     return np.array((pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, site[2] + turn))
 
 
-def live(story: Callable[[House], Awaitable[None]], scenario: Scenario = ROBOT) -> House:
-    """Let a story happen in a house; what it raises is raised."""
+@cache
+def surveyed() -> bytes:
+    """A map of the room, made by driving through it once."""
+    drawn: list[bytes] = []
+
+    async def drive(house: House) -> None:
+        house.start()
+        await asyncio.sleep(SURVEY_S)
+        drawn.append(house.drawn())
+        await house.stop()
+
+    live(drive, SURVEYOR, None)
+    return drawn[0]
+
+
+def live(story: Callable[[House], Awaitable[None]], scenario: Scenario, drawn: bytes | None) -> House:
+    """Let a story happen in a house, with a robot that has a map or none; what it raises is raised."""
 
     async def go() -> House:
-        house = House(scenario)
+        house = House(scenario, drawn)
         root = logging.getLogger()
         before = root.level
         root.addHandler(house.listen())

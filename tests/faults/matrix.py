@@ -1,0 +1,317 @@
+"""The fault matrix: what is done to a device, when, what must be seen of it, and whether it was (cells.toml)."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final
+
+from daemon.health import Fault
+from daemon.publish.snapshot import State
+from tests.faults.house import ROBOT, House, Line, Sight, live, surveyed, tracking
+from tools.sim.scene import Scenario
+
+DEVICES: Final = ("lidar", "adc", "odometry")
+WORDS: Final = ("ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
+TIMES: Final = ("start", "run", "stop")
+
+FAULT_S: Final = 8.0
+"""How long a fault lasts."""
+CALM_S: Final = 3.0
+"""TRACKING before it."""
+STOP_AFTER_S: Final = 4.0
+"""A stop comes this long after the fault; the fault ends a second after the next start."""
+PATIENCE_S: Final = 40.0
+STOP_S: Final = 3.0
+"""Seconds a stop may take."""
+FIRST: Final = {"back": 20.0}
+"""What holds at start and stop unless said otherwise: the place has to be found in the stored map first."""
+ERROR_M: Final = 0.10
+SIGMAS: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell: see cells.toml for what its fields mean."""
+
+    device: str
+    word: str
+    time: str
+    order: str = ""
+    codes: tuple[int, ...] = ()
+    also: tuple[int, ...] = ()
+    noticed: float = 2.2
+    silent: float = 0.0
+    states: tuple[str, ...] = ("TRACKING",)
+    back: float = 0.0
+    gone: float = 12.0
+    defect: str = ""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.device} {self.word} at {self.time}"
+
+    @property
+    def toml(self) -> str:
+        """The order; empty for ``ok``."""
+        more = f"; {self.order}" if self.order else ""
+        return "" if self.word == "ok" else f"where = '{self.device}'; what = '{self.word}'{more}"
+
+
+def cells(path: Path = Path(__file__).with_name("cells.toml")) -> tuple[Cell, ...]:
+    """All of them, in the order of the table; raises ValueError for a key that means nothing and for a gap."""
+    tree = tomllib.loads(path.read_text())
+    known = {one.name for one in fields(Cell)} | set(TIMES)
+    made = []
+    for device in DEVICES:
+        for word in WORDS:
+            table = dict(tree.get(device, {}).pop(word, {})) if word != "ok" else {}
+            if word != "ok" and not table:
+                raise ValueError(f"{path.name}: [{device}.{word}] is missing")
+            special = {time: table.pop(time, {}) for time in TIMES}
+            for time in TIMES:
+                values = {**({} if time == "run" else FIRST), **table, **special[time]}
+                if unknown := set(values) - known:
+                    raise ValueError(f"{path.name}: [{device}.{word}] has unknown {', '.join(sorted(unknown))}")
+                made.append(Cell(device, word, time, **{key: _value(value) for key, value in values.items()}))
+    return tuple(made)
+
+
+def _value(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What happened in a cell. Times in seconds of the loop; ``t_on`` is when the fault came into force.
+
+    Attributes:
+        sights: published from ``t_on`` on. lines: of the log since then. back: TRACKING came back unaided.
+        stop_s: seconds that the stops took. laser: it was on after one, though the sensor could be reached.
+        ended: why the daemon ended by itself. lost: scans, blocks or readings that came to nothing.
+    """
+
+    t_on: float = 0.0
+    t_off: float = 0.0
+    sights: list[Sight] = field(default_factory=list)
+    lines: list[Line] = field(default_factory=list)
+    stop_s: list[float] = field(default_factory=list)
+    laser: bool = False
+    ended: str = ""
+
+    @property
+    def noticed(self) -> dict[int, float]:
+        """Seconds after the fault came at which each fault code was first named."""
+        first: dict[int, float] = {}
+        for sight in self.sights:
+            for fault in sight.faults:
+                first.setdefault(int(fault), sight.t - self.t_on)
+        return first
+
+    @property
+    def shown(self) -> dict[str, float]:
+        """Seconds after the fault came at which each state was first said."""
+        first: dict[str, float] = {}
+        for sight in self.sights:
+            first.setdefault(sight.snapshot.state.name, sight.t - self.t_on)
+        return first
+
+    def silent(self, device: str) -> float | None:
+        """Seconds after the fault came at which the device was first shown as not delivering."""
+        ok = f"{device}_ok"
+        return next((s.t - self.t_on for s in self.sights if getattr(s.snapshot, ok) is False), None)
+
+    @property
+    def back(self) -> float | None:
+        """Seconds after the fault from which TRACKING was said without a break; None: not at the end."""
+        return self._since(tracking)
+
+    @property
+    def gone(self) -> float | None:
+        """Seconds after the fault from which no fault was named; None: one was at the end."""
+        return self._since(lambda sight: not sight.faults)
+
+    def _since(self, so: Any) -> float | None:
+        begun = None
+        for sight in self.sights:
+            if not so(sight):
+                begun = None
+            elif begun is None:
+                begun = max(0.0, sight.t - self.t_off)
+        return begun
+
+    @property
+    def losses(self) -> list[Line]:
+        """Lines that say that something is wrong."""
+        return [line for line in self.lines if line.level >= logging.WARNING]
+
+    @property
+    def returns(self) -> list[Line]:
+        """Lines that say that it is over."""
+        told = ("over: fault", "delivers again", "works again")
+        return [line for line in self.lines if any(words in line.text for words in told)]
+
+    def placed(self, cell: Cell) -> list[Sight]:
+        """Where the pose is judged: all of them; at a start from the first TRACKING on, the place being found before."""
+        if cell.time == "run":
+            return self.sights
+        first = next((k for k, sight in enumerate(self.sights) if tracking(sight)), len(self.sights))
+        return self.sights[first:]
+
+    def error_m(self, cell: Cell) -> float:
+        """The largest error of a pose."""
+        return max((sight.error_m or 0.0 for sight in self.placed(cell)), default=0.0)
+
+    def sigmas(self, cell: Cell) -> float:
+        """The largest error in its one-sigma."""
+        return max((sight.sigmas or 0.0 for sight in self.placed(cell)), default=0.0)
+
+
+def play(cell: Cell, scenario: Scenario = ROBOT) -> Outcome:
+    """Let a cell happen."""
+    out = Outcome()
+
+    async def story(house: House) -> None:
+        await {"start": _start, "run": _run, "stop": _stop}[cell.time](cell, house, out)
+
+    live(story, scenario, surveyed())
+    return out
+
+
+async def _start(cell: Cell, house: House, out: Outcome) -> None:
+    house.order(cell.toml)
+    out.t_on = house.loop.time()
+    house.start()
+    await asyncio.sleep(FAULT_S)
+    house.faults.clear()
+    await _recover(house, out)
+    _take(house, out)
+    await _end(house, out)
+
+
+async def _run(cell: Cell, house: House, out: Outcome) -> None:
+    await _calm(house)
+    house.order(cell.toml)
+    out.t_on = house.loop.time()
+    await asyncio.sleep(FAULT_S)
+    house.faults.clear()
+    await _recover(house, out)
+    _take(house, out)
+    await _end(house, out)
+
+
+async def _stop(cell: Cell, house: House, out: Outcome) -> None:
+    await _calm(house)
+    house.order(cell.toml)
+    out.t_on = house.loop.time()
+    await asyncio.sleep(STOP_AFTER_S)
+    await _end(house, out)
+    await asyncio.sleep(0.5)
+    out.laser = house.lidar.laser and cell.word not in ("off", "garbage") and cell.device == "lidar"
+    house.start()
+    await asyncio.sleep(1.0)
+    house.faults.clear()
+    await _recover(house, out)
+    _take(house, out)
+    await _end(house, out)
+
+
+async def _calm(house: House) -> None:
+    house.start()
+    if not await house.until(lambda: bool(house.sights) and tracking(house.sights[-1]), PATIENCE_S):
+        raise AssertionError(f"not TRACKING within {PATIENCE_S} s before there was any fault; {house.ended}")
+    await asyncio.sleep(CALM_S)
+
+
+async def _recover(house: House, out: Outcome) -> None:
+    """Until all has been well for a while, or patience ends."""
+    out.t_off = house.loop.time()
+    well = 0.0
+
+    def so() -> bool:
+        nonlocal well
+        sight = house.sights[-1]
+        if sight.t <= out.t_off or not tracking(sight) or sight.faults:
+            well = house.loop.time()
+        return house.loop.time() - max(well, out.t_off) > CALM_S
+
+    await house.until(so, PATIENCE_S)
+
+
+async def _end(house: House, out: Outcome) -> None:
+    out.ended = out.ended or house.ended
+    if not house.ended:
+        out.stop_s.append(await house.stop())
+
+
+def _take(house: House, out: Outcome) -> None:
+    out.sights = [sight for sight in house.sights if sight.t >= out.t_on]
+    out.lines = [line for line in house.lines if line.t >= out.t_on]
+
+
+def objections(cell: Cell, out: Outcome) -> list[str]:
+    """Everything that speaks against "survived"."""
+    return [*_alive(cell, out), *_named(cell, out), *_said(cell, out), *_placed(cell, out)]
+
+
+def _alive(cell: Cell, out: Outcome) -> Iterator[str]:
+    if out.ended:
+        yield out.ended
+    if slow := [f"{took:.1f} s" for took in out.stop_s if took > STOP_S]:
+        yield f"a stop took {', '.join(slow)}"
+    if out.laser:
+        yield "the laser was left on"
+    if out.back is None:
+        yield f"no TRACKING {PATIENCE_S:.0f} s after the fault"
+    elif out.back > cell.back:
+        yield f"TRACKING {out.back:.1f} s after the fault, {cell.back} s allowed"
+
+
+def _named(cell: Cell, out: Outcome) -> Iterator[str]:
+    """The fault by its number, in time, and no other; the device as it is."""
+    noticed = out.noticed
+    for code in cell.codes:
+        if code not in noticed:
+            yield f"fault {code} was never named"
+        elif noticed[code] > cell.noticed:
+            yield f"fault {code} was named after {noticed[code]:.2f} s, {cell.noticed} s allowed"
+    if strange := sorted(set(noticed) - {*cell.codes, *cell.also}):
+        yield f"strange faults were named: {', '.join(Fault(code).name for code in strange)}"
+    if cell.silent:
+        silent = out.silent(cell.device)
+        if silent is None or silent > cell.silent:
+            yield f"silence was shown after {silent} s, {cell.silent} s allowed"
+    if out.gone is None:
+        yield "a fault is still named at the end"
+    elif out.gone > cell.gone:
+        yield f"the last fault was named {out.gone:.1f} s after it was over, {cell.gone} s allowed"
+
+
+def _said(cell: Cell, out: Outcome) -> Iterator[str]:
+    """One line each way for every fault named."""
+    expected = len(set(out.noticed))
+    for way, lines in (("come", out.losses), ("gone", out.returns)):
+        if len(lines) != expected:
+            told = "; ".join(f"{line.t - out.t_on:+.1f} s {line.text[:90]}" for line in lines)
+            yield f"{len(lines)} lines say that a fault has {way}, {expected} expected: {told}"
+    if failed := [line.text for line in out.lines if line.level >= logging.ERROR]:
+        yield f"errors: {failed}"
+
+
+def _placed(cell: Cell, out: Outcome) -> Iterator[str]:
+    """The pose, and what is said of it."""
+    during = {s.snapshot.state for s in out.sights if s.t < out.t_off} if cell.time == "run" else set()
+    if wrong := sorted(state.name for state in during if state.name not in cell.states):
+        yield f"said {', '.join(wrong)} while it lasted"
+    if (error := out.error_m(cell)) > ERROR_M:
+        yield f"the pose was {error:.3f} m off"
+    if (sigmas := out.sigmas(cell)) > SIGMAS:
+        yield f"the pose was {sigmas:.1f} sigma off"
+    lies = [s.error_m for s in out.sights if s.snapshot.state is State.TRACKING and (s.error_m or 0.0) > ERROR_M]
+    if lies:
+        yield f"TRACKING was said of a pose {max(e or 0.0 for e in lies):.3f} m off"
