@@ -31,6 +31,7 @@ from daemon.reasons import Reason as Cause
 from daemon.state import judge
 from daemon.state_evidence import SILENT_PERIODS, Evidence
 from daemon.state_memory import Memory
+from daemon.watch import Watch
 from daemon.worker import Worker
 from estimator.records import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
 from estimator.result import Fix, StepResult
@@ -140,6 +141,7 @@ class Cycle:
         self.cycles = 0
         self.overruns = 0
         self.verdict = Memory()
+        self.watch = Watch()
         self.result: StepResult | None = None
         self.observer = Observer(parts.clock.now(), parts.odometry, parts.lidar, parts.samples is not None)
         self._painter = Painter(parts.map_id)
@@ -242,11 +244,13 @@ class Cycle:
             if self.odometry.jumps > jumps:
                 self.observer.witnesses.restart()
             self.observer.on_odometry(reading.t_rx)
+            self.watch.on_odometry(reading)
         records += [turn for reading in taken.imu if (turn := self.imu.turn(reading)) is not None]
         records += self._light(taken.samples)
         if taken.scan is not None:
             self.period.learn(taken.scan)
             self.observer.on_scan(taken.scan.t_rx)
+            self.watch.on_scan(taken.scan, self.period.seconds)
             records.append(self.parts.scans.scan(taken.scan))
         return records
 
@@ -326,6 +330,7 @@ class Cycle:
         """What may be said about the pose; a change goes to the log."""
         evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
         before, self.verdict = self.verdict, judge(self.verdict, evidence)
+        self.watch.on_verdict(t_mono, self.verdict, bool(self.lidar_ok(t_mono)))
         self.trust = self._trust(t_mono, evidence)
         if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
             meaning, remedy = REASONS[self.verdict.reason]

@@ -22,6 +22,8 @@ class Fault(IntEnum):
     LIDAR_SILENT = 104
     LIDAR_GARBLED = 105
     LIDAR_GAPS = 106
+    LIDAR_LATE = 107
+    LIDAR_MISFIT = 108
     ADC_BUS_MISSING = 151
     ADC_BUS_REFUSED = 152
     ADC_MISSING = 153
@@ -45,6 +47,7 @@ class Fault(IntEnum):
     ODOMETRY_SILENT = 201
     ODOMETRY_JUMPS = 202
     ODOMETRY_DISAGREES = 203
+    ODOMETRY_GAPS = 204
     PROTECTION_ALERT = 251
     LOOP_STALLED = 301
     OVERRUNS = 302
@@ -70,6 +73,14 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.LIDAR_SILENT: ("the lidar is connected and sends no valid scan", "power it off and on; check the cable"),
     Fault.LIDAR_GARBLED: ("more than 5 % of the lidar's frames are damaged", "check cable, shielding and USB hub"),
     Fault.LIDAR_GAPS: ("more than 2 % of the lidar's scans are missing", "check the computer's load and the line rate"),
+    Fault.LIDAR_LATE: (
+        "scans arrive more than two periods after they were measured",
+        "take load off the computer; look for a slow line, a USB hub or a network in between",
+    ),
+    Fault.LIDAR_MISFIT: (
+        "what the lidar measures does not fit the map where the robot must be",
+        "was the robot moved by hand? is the lidar covered, shifted on its mount, or does it measure wrongly?",
+    ),
     Fault.ADC_BUS_MISSING: (
         "the photodiode's I2C bus is not there",
         "check `photodiode.bus`; is I2C enabled, is the adapter plugged in, does the bus server run?",
@@ -138,6 +149,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "odometry and laser disagree",
         "wheel slip; if it lasts, check odometry scale and lidar mount",
     ),
+    Fault.ODOMETRY_GAPS: (
+        "odometry readings are lost, late, or come more seldom than before",
+        "check the network and the sender's load; send at least once per scan",
+    ),
     Fault.PROTECTION_ALERT: (
         "the position error may be above the limit that is set, `integrity.alert_m`",
         "read state and reason; drive to where the pose is known, or set a limit that the place allows",
@@ -192,7 +207,10 @@ class Vitals:
     Attributes:
         link, error: of the lidar driver. silent: no valid scan for three scan periods.
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
+        late: counter of scans that arrived late. misfit: what they say is at odds with the map.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the laser.
+        readings, readings_missed, readings_old: counters of odometry readings that came, were lost, and came late.
+        readings_seldom: they come more seldom than before.
         adc: whether blocks of samples arrive, None where there is no photodiode. adc_link, adc_error: of its driver.
         blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked beyond the decoder's reach.
         lamps: what is wrong with lamps and survey.
@@ -213,6 +231,12 @@ class Vitals:
     odometry: bool | None = None
     odometry_jumps: int = 0
     disagree: bool = False
+    late: int = 0
+    misfit: bool = False
+    readings: int = 0
+    readings_missed: int = 0
+    readings_old: int = 0
+    readings_seldom: bool = False
     adc: bool | None = None
     adc_link: Link = Link.CLOSED
     adc_error: HalError | None = None
@@ -239,10 +263,21 @@ def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
     return tuple(sorted(found))
 
 
-def describe(fault: Fault) -> str:
-    """One line for a log: number, meaning, remedy."""
+def describe(fault: Fault, now: Vitals | None = None) -> str:
+    """One line for a log: number, meaning, remedy, and what the device's driver says of it ``now``."""
     text, remedy = FAULTS[fault]
-    return f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
+    line = f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
+    error = None if now is None else _words(fault, now)
+    return line if error is None else f"{line}: {error}"
+
+
+def _words(fault: Fault, now: Vitals) -> HalError | None:
+    """The driver's error that a fault stands for, if it stands for one."""
+    if now.error is not None and fault is _noun(now.error):
+        return now.error
+    if now.adc_error is not None and fault is _adc_noun(now.adc_error):
+        return now.adc_error
+    return None
 
 
 def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
@@ -256,6 +291,10 @@ def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.LIDAR_GARBLED
     if not down and missed > FEW + 0.02 * (scans + missed):
         yield Fault.LIDAR_GAPS
+    if now.late - before.late > FEW + 0.05 * scans:
+        yield Fault.LIDAR_LATE
+    if now.misfit:
+        yield Fault.LIDAR_MISFIT
 
 
 def _noun(error: HalError) -> Fault:
@@ -279,9 +318,13 @@ ADC_NOUNS: Final[tuple[tuple[type[HalError], Fault], ...]] = (
 """What a converter's driver says, by kind: the first that fits."""
 
 
+def _adc_noun(error: HalError) -> Fault:
+    return next(fault for noun, fault in ADC_NOUNS if isinstance(error, noun))
+
+
 def _photodiode(now: Vitals, before: Vitals) -> Iterable[Fault]:
     if now.adc_error is not None:
-        yield next(fault for noun, fault in ADC_NOUNS if isinstance(now.adc_error, noun))
+        yield _adc_noun(now.adc_error)
     elif not (now.adc or before.adc) and now.adc_link is Link.STREAMING and 0 < before.cycles < now.cycles:
         yield Fault.ADC_SILENT
     blocks, lost = now.blocks - before.blocks, now.lost - before.lost
@@ -303,6 +346,11 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.ODOMETRY_JUMPS
     if now.disagree:
         yield Fault.ODOMETRY_DISAGREES
+    readings, missed = now.readings - before.readings, now.readings_missed - before.readings_missed
+    old = now.readings_old - before.readings_old
+    bad = missed > FEW + 0.05 * (readings + missed) or old > FEW + 0.05 * readings or now.readings_seldom
+    if now.odometry and bad:
+        yield Fault.ODOMETRY_GAPS
     if now.alert:
         yield Fault.PROTECTION_ALERT
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from daemon.health import ADC_NOUNS, WINDOW_S, Fault, Vitals, assess, describe
+from daemon.health import WINDOW_S, Fault, Vitals, assess, describe
 from daemon.logs import of_fault
 from daemon.notify import notify
 
@@ -18,10 +18,8 @@ log = logging.getLogger(__name__)
 BEAT_S: Final = 1.0
 STATISTICS_BEATS: Final = 300
 """Beats between two lines of statistics in the log; `systemctl status` shows the latest beat's."""
-SAID_BY_DRIVER: Final = frozenset(
-    [Fault.LIDAR_MISSING, Fault.LIDAR_REFUSED, Fault.LIDAR_BROKEN, *(fault for _, fault in ADC_NOUNS)]
-) - {Fault.ADC_GARBLED}
-"""The drivers log these themselves, with the device's name; of damaged words only where nearly all are."""
+OVER_S: Final = 3.0
+"""A fault is said to be over when it has been gone for this long: one that comes and goes is one fault."""
 
 
 class Heartbeat:
@@ -44,6 +42,7 @@ class Heartbeat:
         self._statistics = statistics
         self._alive = alive
         self._samples: deque[Vitals] = deque()
+        self._seen: dict[Fault, float] = {}  # those that have been said, and when they were last present
         self._beats = 0
 
     def fault(self) -> int:
@@ -68,7 +67,7 @@ class Heartbeat:
         while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
             self._samples.popleft()
         worst = max(sample.lateness for sample in self._samples)
-        self._tell(assess(replace(now, lateness=worst), self._samples[0]))
+        self._tell(now, assess(replace(now, lateness=worst), self._samples[0]))
         if (len(self._samples) < 2 or now.cycles > self._samples[-2].cycles) and self._alive():
             notify("WATCHDOG=1")
         self._beats += 1
@@ -78,12 +77,13 @@ class Heartbeat:
         if statistics and self._beats % STATISTICS_BEATS == 0:
             log.info("%s", statistics)
 
-    def _tell(self, faults: tuple[Fault, ...]) -> None:
-        """Each fault is said once when it comes and once when it has gone."""
+    def _tell(self, now: Vitals, faults: tuple[Fault, ...]) -> None:
+        """Each fault is said once when it comes, in its device's own words, and once when it has gone for good."""
         for fault in faults:
-            if fault not in self.faults and fault not in SAID_BY_DRIVER:
-                log.warning("%s", describe(fault), extra=of_fault(fault))
-        for fault in self.faults:
-            if fault not in faults and fault not in SAID_BY_DRIVER:
-                log.info("over: %s", describe(fault), extra=of_fault(fault, over=True))
+            if fault not in self._seen:
+                log.warning("%s", describe(fault, now), extra=of_fault(fault))
+            self._seen[fault] = now.t_mono
+        for fault in [fault for fault, t_mono in self._seen.items() if now.t_mono - t_mono >= OVER_S]:
+            del self._seen[fault]
+            log.info("over: %s", describe(fault), extra=of_fault(fault, over=True))
         self.faults = faults

@@ -9,7 +9,6 @@ from typing import Any
 
 from daemon.cycle import Cycle
 from daemon.health import Vitals
-from daemon.reasons import Reason
 
 
 def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
@@ -26,7 +25,13 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         period=cycle.period.seconds,
         odometry=cycle.observer.odometry_ok(t_mono),
         odometry_jumps=cycle.odometry.jumps,
-        disagree=cycle.verdict.reason is Reason.WITNESSES_DISAGREE,
+        disagree=cycle.watch.disagree,
+        late=cycle.watch.late,
+        misfit=cycle.watch.misfit,
+        readings=cycle.watch.readings,
+        readings_missed=cycle.watch.missed,
+        readings_old=cycle.watch.old,
+        readings_seldom=cycle.watch.seldom(t_mono, cycle.period.seconds),
         **_photodiode(cycle, t_mono),
         cycles=cycle.cycles,
         overruns=cycle.overruns,

@@ -214,6 +214,7 @@ class InputPort:
             self.invalid += 1
             return
         kind = self._kinds[datagram.magic]
+        lost = kind.counts.lost
         if not kind.accept(datagram.session, datagram.seq, t_rx):
             return
         t_mono = _reading_time(datagram, t_rx)
@@ -225,7 +226,8 @@ class InputPort:
             self._continuity.restart()
         x, y, yaw = self._continuity.follow(*datagram.values)
         if self._on_odometry is not None:
-            self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_mono, x=x, y=y, yaw=yaw))
+            missed = kind.counts.lost - lost
+            self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_mono, x=x, y=y, yaw=yaw, missed=missed))
 
     def send_odometry_to(self, receiver: OnOdometry | None) -> None:
         """Who gets odometry readings."""

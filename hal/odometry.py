@@ -15,6 +15,7 @@ class RawOdometry:
         t_rx: ``t_mono`` of arrival (kernel receive stamp where there is one).
         t_mono: ``t_mono`` at which the pose held; equals ``t_rx`` when the sender has no shared clock.
         x, y: metres. yaw: rad, counter-clockwise, not necessarily wrapped.
+        missed: readings lost on their way since the one before; not recorded.
     """
 
     t_rx: float
@@ -22,6 +23,7 @@ class RawOdometry:
     x: float
     y: float
     yaw: float
+    missed: int = 0
 
 
 class OdometrySource(Protocol):

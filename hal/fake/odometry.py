@@ -32,7 +32,7 @@ ODOMETRY: Vocabulary = {
     "delayed": Word("datagrams arrive `by_s` later", "lasts", {"by_s": Parameter(0.3, 0.0, 60.0)}),
     "intermittent": Word("datagrams are lost on the way", "strikes", share=0.5),
     # what a network and a controller do besides
-    "jump": Word("the pose jumps by `by_m`, as after a counter's overflow", "once", {"by_m": Parameter(3.0, -1e3, 1e3)}),
+    "jump": Word("the pose jumps by `by_m` ahead", "once", {"by_m": Parameter(3.0, -1e3, 1e3)}),
     "restart": Word("the controller starts anew: another session, counting from zero", "once"),
     "blocked": Word("the wheels' counters stand still; what was driven meanwhile is never counted", "lasts"),
 }  # fmt: skip

@@ -286,7 +286,10 @@ class HokuyoDriver:
     # trouble
 
     def _note(self, error: HalError) -> None:
-        """Keep the error for the status; log each kind of problem once until scans have come for a while."""
+        """Keep the error for the status; log each kind of problem once until scans have come for a while.
+
+        As information: whoever runs the driver warns of faults that last, by their number.
+        """
         self._status.error = error
         self._attempts += 1
         if not isinstance(error, (DeviceMissing, DeviceRefused)):
@@ -294,7 +297,7 @@ class HokuyoDriver:
         if error.problem not in self._told:
             self._told.add(error.problem)
             self._loss_told = True
-            log.warning("lidar lost: %s", error)
+            log.info("lidar lost: %s", error)
 
     def _pause(self) -> float:
         """Seconds until the next attempt: doubling, with jitter so that several hosts do not march in step."""

@@ -264,10 +264,10 @@ class PhotodiodeAdc:
             self._tell(error)
 
     def _tell(self, error: HalError) -> None:
-        """Log each kind of problem once, until good blocks come again."""
+        """Log each kind of problem once, until good blocks come again; see `hal.hokuyo.driver` for the level."""
         if error.problem not in self._told:
             self._told.add(error.problem)
-            log.warning("photodiode: %s", error)
+            log.info("photodiode: %s", error)
 
     def _pause(self) -> float:
         """Seconds until the bus is opened again: doubling, with jitter; longer for what only a person can change."""

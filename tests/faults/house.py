@@ -40,9 +40,7 @@ from tools.sim.robot import Body
 from tools.sim.scene import Scenario, SimulatedScene
 from tools.sim.scene_light import Lights
 
-LIDAR: Final[LidarModel] = replace(
-    UTM_30LX, ares=480, amin=0, amax=360, afrt=180, rpm=600, true_period_s=0.1002
-)
+LIDAR: Final[LidarModel] = replace(UTM_30LX, ares=480, amin=0, amax=360, afrt=180, rpm=600, true_period_s=0.1002)
 """A UTM-30LX that turns at 10 Hz and measures 361 beams: all of its dialect at an eighth of the work."""
 PERIOD_S: Final = LIDAR.true_period_s
 ROBOT: Final = Scenario(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.health import Fault
+from daemon.heartbeat import OVER_S
 from daemon.publish.snapshot import State
 from tests.faults.house import ROBOT, House, Line, Sight, live, surveyed, tracking
 from tools.sim.scene import Scenario
@@ -75,7 +77,7 @@ def cells(path: Path = Path(__file__).with_name("cells.toml")) -> tuple[Cell, ..
                 raise ValueError(f"{path.name}: [{device}.{word}] is missing")
             special = {time: table.pop(time, {}) for time in TIMES}
             for time in TIMES:
-                values = {**({} if time == "run" else FIRST), **table, **special[time]}
+                values = {**table, **({} if time == "run" else FIRST), **special[time]}
                 if unknown := set(values) - known:
                     raise ValueError(f"{path.name}: [{device}.{word}] has unknown {', '.join(sorted(unknown))}")
                 made.append(Cell(device, word, time, **{key: _value(value) for key, value in values.items()}))
@@ -88,16 +90,18 @@ def _value(value: Any) -> Any:
 
 @dataclass(slots=True)
 class Outcome:
-    """What happened in a cell. Times in seconds of the loop; ``t_on`` is when the fault came into force.
+    """What happened in a cell. Times in seconds of the loop.
 
     Attributes:
-        sights: published from ``t_on`` on. lines: of the log since then. back: TRACKING came back unaided.
+        t_on, t_off: when the fault came and went. t_again: when a second daemon was started; infinite: there was none.
+        sights: published from ``t_on`` on. lines: of the log since then.
         stop_s: seconds that the stops took. laser: it was on after one, though the sensor could be reached.
-        ended: why the daemon ended by itself. lost: scans, blocks or readings that came to nothing.
+        ended: why the daemon ended by itself.
     """
 
     t_on: float = 0.0
     t_off: float = 0.0
+    t_again: float = math.inf
     sights: list[Sight] = field(default_factory=list)
     lines: list[Line] = field(default_factory=list)
     stop_s: list[float] = field(default_factory=list)
@@ -145,23 +149,23 @@ class Outcome:
                 begun = max(0.0, sight.t - self.t_off)
         return begun
 
-    @property
-    def losses(self) -> list[Line]:
-        """Lines that say that something is wrong."""
-        return [line for line in self.lines if line.level >= logging.WARNING]
-
-    @property
-    def returns(self) -> list[Line]:
-        """Lines that say that it is over."""
-        told = ("over: fault", "delivers again", "works again")
-        return [line for line in self.lines if any(words in line.text for words in told)]
+    def spells(self) -> list[tuple[list[Sight], list[Line]]]:
+        """What each daemon has published and logged."""
+        first = [s for s in self.sights if s.t < self.t_again], [line for line in self.lines if line.t < self.t_again]
+        if math.isinf(self.t_again):
+            return [first]
+        return [
+            first,
+            ([s for s in self.sights if s.t >= self.t_again], [x for x in self.lines if x.t >= self.t_again]),
+        ]
 
     def placed(self, cell: Cell) -> list[Sight]:
-        """Where the pose is judged: all of them; at a start from the first TRACKING on, the place being found before."""
-        if cell.time == "run":
-            return self.sights
-        first = next((k for k, sight in enumerate(self.sights) if tracking(sight)), len(self.sights))
-        return self.sights[first:]
+        """Where the pose is judged: all of them; after a start from the first TRACKING on, the place is found before."""
+        judged: list[Sight] = []
+        for number, (sights, _) in enumerate(self.spells()):
+            at = next((k for k, sight in enumerate(sights) if tracking(sight)), len(sights))
+            judged += sights[0 if number == 0 and cell.time != "start" else at :]
+        return judged
 
     def error_m(self, cell: Cell) -> float:
         """The largest error of a pose."""
@@ -212,6 +216,7 @@ async def _stop(cell: Cell, house: House, out: Outcome) -> None:
     await asyncio.sleep(STOP_AFTER_S)
     await _end(house, out)
     await asyncio.sleep(0.5)
+    out.t_again = house.loop.time()
     out.laser = house.lidar.laser and cell.word not in ("off", "garbage") and cell.device == "lidar"
     house.start()
     await asyncio.sleep(1.0)
@@ -238,7 +243,7 @@ async def _recover(house: House, out: Outcome) -> None:
         sight = house.sights[-1]
         if sight.t <= out.t_off or not tracking(sight) or sight.faults:
             well = house.loop.time()
-        return house.loop.time() - max(well, out.t_off) > CALM_S
+        return house.loop.time() - max(well, out.t_off) > OVER_S + 1.5
 
     await house.until(so, PATIENCE_S)
 
@@ -293,14 +298,21 @@ def _named(cell: Cell, out: Outcome) -> Iterator[str]:
 
 
 def _said(cell: Cell, out: Outcome) -> Iterator[str]:
-    """One line each way for every fault named."""
-    expected = len(set(out.noticed))
-    for way, lines in (("come", out.losses), ("gone", out.returns)):
-        if len(lines) != expected:
-            told = "; ".join(f"{line.t - out.t_on:+.1f} s {line.text[:90]}" for line in lines)
-            yield f"{len(lines)} lines say that a fault has {way}, {expected} expected: {told}"
+    """One line each way for every fault that a daemon has named; it may stop before one is over."""
+    for number, (sights, lines) in enumerate(out.spells()):
+        named = {fault for sight in sights for fault in sight.faults}
+        come = [line for line in lines if line.level >= logging.WARNING]
+        gone = [line for line in lines if line.text.startswith("over: ") or "works again" in line.text]
+        if len(come) != len(named):
+            yield f"{len(come)} lines say that a fault has come, {len(named)} expected: {_told(come, out)}"
+        if len(gone) > len(named) or (len(gone) < len(named) and not (cell.time == "stop" and number == 0)):
+            yield f"{len(gone)} lines say that a fault has gone, {len(named)} expected: {_told(gone, out)}"
     if failed := [line.text for line in out.lines if line.level >= logging.ERROR]:
         yield f"errors: {failed}"
+
+
+def _told(lines: list[Line], out: Outcome) -> str:
+    return "; ".join(f"{line.t - out.t_on:+.1f} s {line.text[:120]}" for line in lines)
 
 
 def _placed(cell: Cell, out: Outcome) -> Iterator[str]:

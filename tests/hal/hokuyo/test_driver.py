@@ -103,7 +103,7 @@ class TestWaiting:
                 assert len(caplog.records) == 1  # once, not at every attempt
                 bench.plugs.plug(PORT, bench.fake)
                 await bench.more(40, 8.0, driver)
-                assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+                assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
                 assert "no such device (plugged in: nothing)" in caplog.text
                 assert "UTM-30LX" in caplog.records[1].message
                 bench.plugs.unplug(PORT)
@@ -113,8 +113,8 @@ class TestWaiting:
                 await bench.more(1, 2.0, driver)
                 assert bench.clock.now() - before < 2.0
                 await bench.more(20, 2.0, driver)
-                assert [record.levelname for record in caplog.records][2:3] == ["WARNING"]
-                assert caplog.records[-1].levelname == "INFO"
+                assert caplog.records[2].message.startswith("lidar lost: ")
+                assert "delivers again" in caplog.records[-1].message
 
         with caplog.at_level(logging.INFO, "hal"):
             on_fake(body)

@@ -1,0 +1,87 @@
+"""What the data say of their devices beyond coming or not: too late, too few, and at odds with everything else.
+
+Counters and facts for the vitals, fed by the cycle; nothing here changes what is done with the data.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from daemon.publish.snapshot import State
+from daemon.reasons import Reason
+from daemon.state_memory import Memory
+from hal.lidar import RawScan
+from hal.odometry import RawOdometry
+
+LATE_PERIODS: Final = 2.5
+"""Scan periods from a scan's first beam to its arrival: a revolution takes one, the line less than another."""
+LATE_S: Final = 0.15
+"""Age of an odometry reading at its arrival, where sender and daemon share a clock."""
+WINDOW_S: Final = 2.0
+ENOUGH: Final = 20
+"""Readings that a rate is judged by."""
+FEWER: Final = 0.6
+"""Part of the usual rate of readings below which they come more seldom than before."""
+LEARNING: Final = 0.03
+"""Weight of a window of readings in the usual rate: what lasts for a minute has become usual."""
+MISFIT_S: Final = 2.0
+"""A laser that is at odds with the map for this long is told, once the place had been known."""
+DISAGREE_S: Final = 1.0
+"""Wheels and laser have to disagree for this long, as in the state machine."""
+ODD: Final = (State.RELOCATING, State.AMBIGUOUS, State.LOST)
+
+
+class Watch:
+    """Watches arrivals and verdicts.
+
+    Attributes:
+        late: scans that arrived late so far. readings, missed, old: odometry readings that came, that were lost on
+            their way, and that came late.
+        misfit: the laser is at odds with the map. disagree: with the wheels.
+    """
+
+    def __init__(self) -> None:
+        self.late = self.readings = self.missed = self.old = 0
+        self.misfit = self.disagree = False
+        self._arrived: deque[float] = deque(maxlen=512)
+        self._usual_hz = 0.0
+        self._t_learned = 0.0
+        self._known = False
+        self._odd_since: float | None = None
+
+    def on_scan(self, scan: RawScan, period: float) -> None:
+        """A scan has been taken."""
+        self.late += scan.t_rx - scan.t_mono > LATE_PERIODS * period
+
+    def on_odometry(self, reading: RawOdometry) -> None:
+        """A reading has been taken."""
+        self.readings += 1
+        self.missed += reading.missed
+        self.old += reading.t_rx - reading.t_mono > LATE_S
+        self._arrived.append(reading.t_rx)
+
+    def seldom(self, t_mono: float, period: float) -> bool:
+        """Whether odometry readings come more seldom than they used to, or than scans do; asked for once a second."""
+        window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
+        recent = sum(t_mono - t <= window for t in self._arrived)
+        if not recent or t_mono - self._arrived[0] < window or window > 10.0 * WINDOW_S:
+            return False
+        hz = recent / window
+        if self._usual_hz == 0.0:
+            self._usual_hz = hz
+        elif t_mono - self._t_learned >= 0.5 * window:
+            self._usual_hz += LEARNING * (hz - self._usual_hz)
+            self._t_learned = t_mono
+        return hz < FEWER * self._usual_hz or hz * period < FEWER
+
+    def on_verdict(self, t_mono: float, memory: Memory, scans: bool) -> None:
+        """A cycle has judged; ``scans``: they arrive."""
+        since = memory.disagree_since
+        self.disagree = since is not None and t_mono - since >= DISAGREE_S
+        self._known |= memory.state is State.TRACKING
+        if memory.state is State.TRACKING or not scans or not self._known:
+            self._odd_since = None
+        elif self._odd_since is None and (memory.reason is Reason.MATCH_FAILED or memory.state in ODD):
+            self._odd_since = t_mono
+        self.misfit = self._odd_since is not None and t_mono - self._odd_since >= MISFIT_S
