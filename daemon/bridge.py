@@ -202,12 +202,13 @@ class SampleBridge:
     beyond the decoder's reach keeps its own rate, and :attr:`off_rate` says so.
 
     Attributes:
-        unfit, stretched: blocks dropped for their words, and blocks whose samples may not be evenly spaced.
+        unfit, dead, stretched: blocks dropped for their words, those of them that hold one word only, and blocks whose
+            samples may not be evenly spaced.
         rate_hz: conversions per second of the latest block as measured, 0 before the first.
     """
 
     def __init__(self, profile: Profile) -> None:
-        self.unfit = self.stretched = 0
+        self.unfit = self.dead = self.stretched = 0
         self.rate_hz = 0.0
         self._profile = profile
 
@@ -220,6 +221,7 @@ class SampleBridge:
         """The same block as the decoder takes it; None for words that the light never was."""
         if raw.blemish & UNFIT or raw.words.size == 0:
             self.unfit += 1
+            self.dead += Blemish.STUCK in raw.blemish
             return None
         self.stretched += Blemish.STRETCHED in raw.blemish
         self.rate_hz = raw.rate_hz

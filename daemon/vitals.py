@@ -54,7 +54,7 @@ def _photodiode(cycle: Cycle, t_mono: float) -> dict[str, Any]:
         "adc_error": blocks.status.error,
         "blocks": cycle.blocks,
         "lost": blocks.status.dropped + (cycle.inbox.blocks_dropped if cycle.cycles else 0),
-        "unfit": samples.unfit,
+        "unfit": samples.unfit - samples.dead,
         "stalled": lamps.stalled,
         "off_rate": samples.off_rate,
         "lamps": lamps.faults if blocks.ok(t_mono) else frozenset(),

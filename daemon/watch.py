@@ -6,6 +6,7 @@ Counters and facts for the vitals, fed by the cycle; nothing here changes what i
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Final
 
 from daemon.publish.snapshot import State
@@ -18,6 +19,7 @@ LATE_PERIODS: Final = 2.5
 """Scan periods from a scan's first beam to its arrival: a revolution takes one, the line less than another."""
 LATE_S: Final = 0.15
 """Age of an odometry reading at its arrival, where sender and daemon share a clock."""
+SILENT_S: Final = 1.0
 WINDOW_S: Final = 2.0
 ENOUGH: Final = 20
 """Readings that a rate is judged by."""
@@ -55,7 +57,10 @@ class Watch:
         self.late += scan.t_rx - scan.t_mono > LATE_PERIODS * period
 
     def on_odometry(self, reading: RawOdometry) -> None:
-        """A reading has been taken."""
+        """A reading has been taken; what was lost while none came at all is told as silence."""
+        if self._arrived and reading.t_rx - self._arrived[-1] > SILENT_S:
+            self._arrived.clear()
+            reading = replace(reading, missed=0)
         self.readings += 1
         self.missed += reading.missed
         self.old += reading.t_rx - reading.t_mono > LATE_S

@@ -17,6 +17,7 @@ from daemon.publish.snapshot import State
 from tests.faults.house import ROBOT, House, Line, Sight, live, surveyed, tracking
 from tools.sim.scene import Scenario
 
+TABLE: Final = Path(__file__).with_name("cells.toml")
 DEVICES: Final = ("lidar", "adc", "odometry")
 WORDS: Final = ("ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
 TIMES: Final = ("start", "run", "stop")
@@ -65,7 +66,7 @@ class Cell:
         return "" if self.word == "ok" else f"where = '{self.device}'; what = '{self.word}'{more}"
 
 
-def cells(path: Path = Path(__file__).with_name("cells.toml")) -> tuple[Cell, ...]:
+def cells(path: Path = TABLE) -> tuple[Cell, ...]:
     """All of them, in the order of the table; raises ValueError for a key that means nothing and for a gap."""
     tree = tomllib.loads(path.read_text())
     known = {one.name for one in fields(Cell)} | set(TIMES)
@@ -154,13 +155,11 @@ class Outcome:
         first = [s for s in self.sights if s.t < self.t_again], [line for line in self.lines if line.t < self.t_again]
         if math.isinf(self.t_again):
             return [first]
-        return [
-            first,
-            ([s for s in self.sights if s.t >= self.t_again], [x for x in self.lines if x.t >= self.t_again]),
-        ]
+        sights = [sight for sight in self.sights if sight.t >= self.t_again]
+        return [first, (sights, [line for line in self.lines if line.t >= self.t_again])]
 
     def placed(self, cell: Cell) -> list[Sight]:
-        """Where the pose is judged: all of them; after a start from the first TRACKING on, the place is found before."""
+        """Where the pose is judged: everywhere; after a start from the first TRACKING on: before, it is looked for."""
         judged: list[Sight] = []
         for number, (sights, _) in enumerate(self.spells()):
             at = next((k for k, sight in enumerate(sights) if tracking(sight)), len(sights))
