@@ -36,6 +36,11 @@ def test_all_is_well() -> None:
         ({"odometry": False}, Fault.ODOMETRY_SILENT),
         ({"odometry": True, "odometry_jumps": 1}, Fault.ODOMETRY_JUMPS),
         ({"odometry": True, "disagree": True}, Fault.ODOMETRY_DISAGREES),
+        ({"late": 30}, Fault.LIDAR_LATE),
+        ({"misfit": True}, Fault.LIDAR_MISFIT),
+        ({"odometry": True, "readings": 100, "readings_missed": 20}, Fault.ODOMETRY_GAPS),
+        ({"odometry": True, "readings": 100, "readings_old": 20}, Fault.ODOMETRY_GAPS),
+        ({"odometry": True, "readings": 100, "readings_seldom": True}, Fault.ODOMETRY_GAPS),
         ({"lateness": 0.21}, Fault.LOOP_STALLED),
         ({"overruns": 30}, Fault.OVERRUNS),
         ({"jobs_failed": 1}, Fault.WORKER_FAILED),
@@ -129,6 +134,24 @@ def test_a_stall_is_said_once_and_over_when_none_has_come_for_a_while(caplog: py
         heart.beat(0.5 if beat in (5, 8, 12) else 0.001)
         assert (Fault.LOOP_STALLED in heart.faults) == (5 <= beat <= 22)
     assert len(caplog.records) == 2
+
+
+def test_a_fault_that_comes_and_goes_is_one_fault_and_said_in_the_devices_words(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    gone = DeviceMissing("/dev/ttyACM0", "no such device", "plug it in")
+    for beat in range(30):
+        lost = 5 <= beat < 15 and beat % 3 != 0
+        patient.now = replace(patient.now, link=Link.WAITING if lost else Link.STREAMING, error=gone)
+        heart.beat(0.0)
+        assert (Fault.LIDAR_MISSING in heart.faults) == lost, "what is published is what is so now"
+    assert len(caplog.records) == 2
+    assert caplog.messages[0].startswith("fault 101: the lidar is not there (")
+    assert caplog.messages[0].endswith(f": {gone}")
+    assert caplog.messages[1].startswith("over: fault 101: ")
 
 
 def test_what_is_lost_before_the_first_cycle_is_no_fault() -> None:
