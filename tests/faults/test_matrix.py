@@ -61,6 +61,9 @@ def test_no_fault_passes_in_silence() -> None:
         assert bool(cell.codes) == (cell.word != "ok"), cell.name
 
 
+@pytest.mark.system
+@pytest.mark.jit
+@pytest.mark.timeout(600)
 def test_a_cell_that_is_not_survived_is_told() -> None:
     """The judge is no friend: a fault that goes unnamed, a lost pose and a strange code are all objected to."""
     cell = next(cell for cell in CELLS if (cell.device, cell.word, cell.time) == ("odometry", "off", "run"))
