@@ -44,7 +44,7 @@ UNASKED: Final = 16
 """Jobs that the estimator waits for no longer, but that may still answer."""
 CYCLE_PARTS: Final = (
     "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
-    "alarm", "trust", "inbox",
+    "alarm", "trust", "inbox", "paused",
 )  # fmt: skip
 """What a cycle remembers."""
 QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))

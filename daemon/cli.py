@@ -66,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
     _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
+    _why(commands.add_parser("why", help="replay what was recorded around a moment, and say why it was as it was"))
     _status(commands.add_parser("status", help="show what a running daemon publishes"))
     _explain(commands.add_parser("explain", help="what a key, a state, a fault, a reason or a register means"))
     _map(commands.add_parser("map", help="work with maps"))
@@ -139,6 +140,20 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
     _config_arguments(parser)
     parser.set_defaults(body=_estimating("daemon.replay", "main"))
+
+
+def _why(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("time", metavar="TIME", help="21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning")
+    parser.add_argument(
+        "log",
+        nargs="?",
+        type=Path,
+        metavar="REC",
+        help="a recording or a dump, or a folder of several; default: `flight` in the state directory",
+    )
+    parser.add_argument("--out", type=Path, metavar="PNG", help="and draw it")
+    _config_arguments(parser)
+    parser.set_defaults(body=_estimating("daemon.why", "main"))
 
 
 def _status(parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -116,6 +117,7 @@ class Rerun:
         self.odometry_m = 0.0
         self.readings = self.blocks = 0
         self.t_first = math.inf
+        self.watch: Callable[[CycleRecord], object] | None = None
         self._source = source
         self._clock = ReplayClock()
         self._lights, self._localise = lights, config.map.localise
@@ -292,6 +294,8 @@ class Rerun:
 
     def _keep(self, record: CycleRecord) -> None:
         self._kept.append(record)
+        if self.watch is not None:
+            self.watch(record)
         rows = len(self.ledger)
         self.ledger.take(record, *self._latest)
         if self._journal is not None:

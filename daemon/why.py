@@ -1,0 +1,194 @@
+"""`lumiloop why TIME`: replays what the flight recorder holds around a moment, and says why it was as it was.
+
+The text is `daemon/whysaid.py`, the picture `daemon/whyplot.py`; here the recording is found, and replayed from the
+last state before the moment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from daemon import cli, warmup, whyplot, whysaid
+from daemon.config import Config
+from daemon.cycle import CycleRecord
+from daemon.replay import NOTHING_GIVEN, config_for, lights_for, start_for
+from daemon.rerun import Rerun
+from daemon.results import Folder, OutputRefused
+from daemon.sampleclock import state_folder
+from daemon.sources import RecordingSource, Turn
+from daemon.whysaid import Moment
+from hal.errors import DataInvalid, HalError
+from hal.replay.recording import SUFFIX, open_recording
+from hal.replay.report import LogReport
+
+FLIGHT: Final = "flight"
+"""Folder below the state directory in which recordings are looked for where none is named."""
+BEFORE_S, AFTER_S = 20.0, 5.0
+"""How much around the moment is looked at."""
+UNIX_S: Final = 1e8
+"""A number of seconds beyond is since the Unix epoch, else since the recording began."""
+
+
+class NoMoment(Exception):
+    """There is no such moment in what was recorded; the text says what there is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A recording, and the time (UTC) that it covers; ``utc_at_zero``: of its monotonic clock."""
+
+    path: Path
+    begin: float
+    end: float
+    utc_at_zero: float
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; ``args``: the ``time`` as it was typed, ``log`` or None, where to draw (``out``) or None."""
+    folder = args.log or state_folder() / FLIGHT
+    try:
+        span, utc = find(spans(folder), args.time, folder)
+        told, rerun = moments(span, utc)
+        sys.stdout.write(whysaid.report(told, utc, span.path.name))
+        if rerun.comparison.differ:
+            cli.say(
+                f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
+            )
+        if args.out is not None:
+            return _draw(args.out, told, utc, rerun)
+    except (HalError, NoMoment, OutputRefused, warmup.CannotLoad) as error:
+        return cli.fail(str(error))
+    return cli.OK
+
+
+def _draw(out: Path, told: list[Moment], utc: float, rerun: Rerun) -> int:
+    picture = whyplot.draw(told, utc, rerun.render())
+    if picture is None:
+        return cli.fail("pictures need matplotlib: pip install 'lumiloop[plot]'")
+    Folder(out.parent).write(out.name, picture)
+    return cli.OK
+
+
+def spans(folder: Path) -> list[Span]:
+    """The recordings and dumps in a folder, or the one that it is.
+
+    Raises:
+        HalError: it cannot be read, or there is none.
+    """
+    inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    runs = [path for path in inside if any(path.glob(f"*{SUFFIX}"))] or [folder]
+    found = []
+    for path in runs:
+        try:
+            found.append(_span(path))
+        except DataInvalid as error:
+            if len(runs) == 1:
+                raise
+            cli.say(f"{error}: passed over")
+    return found
+
+
+def _span(path: Path) -> Span:
+    recording = open_recording(path)
+    source = RecordingSource(path)
+    header = recording.header
+    utc = float(header["t_utc"]) - float(header["t_mono"])
+    begin = float(header["t_mono"]) if source.begin is None else source.begin.t_mono
+    last = open_recording(recording.segments[-1])
+    end = max((frame.t_mono for frame in last.frames(LogReport())), default=begin)
+    return Span(path, utc + begin, utc + end, utc)
+
+
+def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float]:
+    """The recording that holds a moment, with most of the time before it, and that moment (UTC).
+
+    Raises:
+        NoMoment: none does, or that is no time.
+    """
+    asked = [(span, utc) for span in recorded for utc in meant(words, span)]
+    here = [
+        (min(utc - span.begin, BEFORE_S), span.begin, span, utc) for span, utc in asked if span.begin <= utc <= span.end
+    ]
+    if here:
+        _, _, span, utc = max(here, key=lambda one: one[:2])
+        return span, utc
+    there = "\n".join(f"  {whysaid.clock(s.begin)} to {whysaid.clock(s.end)}  {s.path.name}" for s in recorded)
+    raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n{there}")
+
+
+def meant(words: str, span: Span) -> list[float]:
+    """The instants (UTC) that somebody may mean.
+
+    A time of the day, on the days that the recording covers; a date with a time; local time unless it ends with Z or an
+    offset. Or a number: of seconds since the recording began, or since the Unix epoch.
+
+    Raises:
+        NoMoment: it is no time.
+    """
+    text = words.strip()
+    if re.fullmatch(r"[0-9]+(\.[0-9]*)?", text):
+        number = float(text)
+        return [number if number > UNIX_S else span.begin + number]
+    try:
+        if re.fullmatch(r"\d{1,2}:\d\d(:\d\d(\.\d+)?)?Z?", text):
+            zone = UTC if text.endswith("Z") else None
+            first = datetime.fromtimestamp(span.begin, zone).astimezone(zone)
+            days = int((span.end - span.begin) / 86400.0) + 2
+            at = _time_of(text.removesuffix("Z"))
+            midnight = first.replace(hour=0, minute=0, second=0, microsecond=0)
+            return [(midnight + timedelta(days=day) + at).timestamp() for day in range(days)]
+        return [datetime.fromisoformat(text).astimezone().timestamp()]  # without a zone: local time
+    except ValueError as error:
+        raise NoMoment(
+            f"{words}: not a time; write 21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning"
+        ) from error
+
+
+def _time_of(text: str) -> timedelta:
+    hours, minutes, *seconds = text.split(":")
+    if int(hours) > 23 or int(minutes) > 59:
+        raise ValueError(text)
+    return timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds[0]) if seconds else 0.0)
+
+
+def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:
+    """Every cycle around an instant, replayed.
+
+    Raises:
+        HalError: the recording cannot be replayed.
+    """
+    t_mono = utc - span.utc_at_zero
+    source = RecordingSource(span.path, until=t_mono - BEFORE_S)
+    config = config_for(source, Config(), NOTHING_GIVEN)
+    lights = lights_for(source, config, NOTHING_GIVEN)
+    if lights is not None:
+        warmup.load_aloud(cli.say, "warm-lights", partial(warmup.load, lights))
+    rerun = Rerun(source, config, lights, None, start_for(source, config, lights, NOTHING_GIVEN))
+    records: list[CycleRecord] = []
+    rerun.watch = records.append
+    told: list[Moment] = []
+    shown = time.monotonic()
+    for event in source.events():
+        rerun.feed(event)
+        if isinstance(event, Turn) and records:
+            if event.t_mono >= t_mono - BEFORE_S:
+                told.append(whysaid.moment_of(span.utc_at_zero, event.entry, records[-1], rerun.cycle))
+            records.clear()
+            if event.t_mono > t_mono + AFTER_S:
+                break
+            if time.monotonic() - shown > 5.0:
+                cli.say(f"replaying, {max(0.0, t_mono - event.t_mono):.0f} s before it")
+                shown = time.monotonic()
+    rerun.finish()
+    if not told or math.isinf(told[0].utc):
+        raise NoMoment("no cycle was recorded around then")
+    return told, rerun

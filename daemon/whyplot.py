@@ -1,0 +1,149 @@
+"""The picture of `lumiloop why`: the place with the way around the moment, and what the witnesses told over time."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Any, Final
+
+import numpy as np
+
+from daemon.publish.snapshot import LinkUse, State
+from daemon.whysaid import AXES, GAP, Moment, at, clock, laser_dissents, light_apart
+from estimator import se2
+from estimator.grid import Grid
+from estimator.records import Array
+
+_INCHES: Final = (14.0, 8.0)
+_MARGIN_M: Final = 4.0
+COLOURS: Final = {
+    State.TRACKING: "tab:green",
+    State.MAPPING: "tab:blue",
+    State.DEGRADED: "tab:orange",
+    State.AMBIGUOUS: "tab:purple",
+    State.RELOCATING: "tab:purple",
+    State.LOST: "tab:red",
+    State.NO_LIDAR: "tab:red",
+    State.STARTING: "0.5",
+}
+
+
+def draw(told: Sequence[Moment], utc: float, grid: Grid) -> bytes | None:
+    """PNG; None without matplotlib."""
+    if find_spec("matplotlib") is None:
+        return None
+    from matplotlib.figure import Figure
+
+    one = told[at(told, utc)]
+    canvas = Figure(figsize=_INCHES, dpi=100, layout="constrained")
+    canvas.suptitle(f"{clock(utc)}: {one.state.name}, {one.reason.name.lower().replace('_', ' ')}")
+    parts = canvas.add_gridspec(4, 2, width_ratios=(3, 2))
+    _place(canvas.add_subplot(parts[:, 0]), told, one, grid)
+    seconds = np.array([moment.utc - utc for moment in told])
+    rows = [canvas.add_subplot(parts[row, 1]) for row in range(4)]
+    _states(rows[0], told, seconds)
+    _uncertainty(rows[1], told, seconds)
+    _wheels(rows[2], told, seconds)
+    _light(rows[3], told, seconds)
+    for row in rows:
+        row.axvline(0.0, color="k", linewidth=0.8)
+        row.set_xlim(seconds[0], seconds[-1])
+    rows[-1].set_xlabel("seconds from the moment")
+    out = io.BytesIO()
+    canvas.savefig(out, format="png")
+    return out.getvalue()
+
+
+def _place(axes: Any, told: Sequence[Moment], one: Moment, grid: Grid) -> None:
+    """Map, way in the colours of the state, the robot, what light alone says, and the way the wheels alone tell."""
+    poses = [(moment.state, moment.snapshot.pose) for moment in told if moment.snapshot.pose is not None]
+    if not poses:
+        axes.set_title("there was no pose")
+        return
+    rows, columns = grid.log_odds.shape
+    if rows and columns:
+        x, y = grid.origin.tolist()
+        extent = (x, x + columns * grid.resolution, y, y + rows * grid.resolution)
+        axes.imshow(1.0 - grid.probability, origin="lower", extent=extent, cmap="gray", vmin=0.0, vmax=1.0, alpha=0.6)
+    way = np.array([pose[:2] for _, pose in poses])
+    for state in dict.fromkeys(state for state, _ in poses):
+        part = np.array([said is state for said, _ in poses])
+        axes.plot(way[part, 0], way[part, 1], ".", color=COLOURS[state], markersize=4, label=state.name)
+    if one.snapshot.pose is not None:
+        x, y, yaw = one.snapshot.pose
+        axes.plot(x, y, "^", color="k", markersize=9, label="robot")
+        axes.plot((x, x + 0.8 * math.cos(yaw)), (y, y + 0.8 * math.sin(yaw)), color="k")
+        _wheel_way(axes, one)
+    _lamps(axes, one)
+    low, high = way.min(axis=0) - _MARGIN_M, way.max(axis=0) + _MARGIN_M
+    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x of the map, m", ylabel="y, m")
+    axes.legend(loc="best", fontsize=8)
+
+
+def _wheel_way(axes: Any, one: Moment) -> None:
+    """Where the wheels say that the robot came from, and where the laser does."""
+    if one.wheels is None or one.snapshot.pose is None:
+        return
+    here: Array = np.array(one.snapshot.pose)
+    for name, T, style in (("wheels", one.wheels.wheels, "C3--"), ("laser", one.wheels.laser, "C0--")):
+        then = se2.compose(here, se2.inverse(T))
+        label = f"from where, by the {name}"
+        axes.plot((then[0], here[0]), (then[1], here[1]), style, linewidth=1.5, label=label)
+
+
+def _lamps(axes: Any, one: Moment) -> None:
+    light = one.snapshot.light
+    if light is None or light.pose is None:
+        return
+    x, y, _ = light.pose
+    used = sum(link.use is LinkUse.ACCEPTED for link in light.links)
+    axes.plot(x, y, "*", color="gold", markeredgecolor="k", markersize=14, label=f"by light alone ({used} lamps)")
+    if light.sigma is not None:
+        turn = np.linspace(0.0, 2.0 * np.pi, 60)
+        axes.plot(x + 2 * light.sigma[0] * np.cos(turn), y + 2 * light.sigma[1] * np.sin(turn), color="goldenrod")
+
+
+def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
+    """Strips: state, axes, scans that came to nothing."""
+    ends = np.append(seconds[1:], seconds[-1] + 0.05)
+    for moment, begin, end in zip(told, seconds.tolist(), ends.tolist(), strict=True):
+        axes.barh(0, end - begin, left=begin, color=COLOURS[moment.state], height=0.8)
+        for axis in range(3):
+            if not moment.snapshot.known[axis]:
+                axes.barh(axis + 1, end - begin, left=begin, color="tab:red", height=0.8)
+        if laser_dissents(moment):
+            axes.barh(4, end - begin, left=begin, color="tab:red", height=0.8)
+    axes.set_yticks(range(5), ["state", *(f"{name} unknown" for name in AXES), "scan refused"], fontsize=8)
+    axes.set_ylim(-0.5, 4.5)
+
+
+def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
+    sigma = [math.nan if (P := one.snapshot.covariance) is None else math.sqrt(max(P[0], P[2])) for one in told]
+    bound = [math.nan if (m := one.snapshot.trust.horizontal_m) is None else m for one in told]
+    axes.plot(seconds, sigma, label="sigma of the place, m")
+    axes.plot(seconds, bound, label="bound on its error, m")
+    axes.set_yscale("log")
+    axes.legend(fontsize=7)
+
+
+def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
+    apart = np.array([(math.nan, math.nan) if one.wheels is None else one.wheels.apart for one in told])
+    odd = np.array([one.wheels is not None and not one.wheels.agree for one in told])
+    axes.plot(seconds, apart[:, 0], label="wheels from laser, m")
+    axes.plot(seconds, apart[:, 1], label="rad")
+    axes.plot(seconds[odd], apart[odd, 0], ".", color="tab:red", label="they dissent")
+    axes.legend(fontsize=7)
+
+
+def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
+    if all(one.snapshot.light is None for one in told):
+        axes.set_title("no photodiode", fontsize=8)
+        return
+    away = [math.nan if (far := light_apart(one)) is None else far[0] for one in told]
+    gap = [math.nan if (g := one.snapshot.trust.gap) is None else math.sqrt(g) for one in told]
+    axes.plot(seconds, away, label="light from pose, m")
+    axes.plot(seconds, gap, label="in deviations")
+    axes.axhline(math.sqrt(GAP), color="tab:red", linewidth=0.8)
+    axes.legend(fontsize=7)

@@ -1,0 +1,290 @@
+"""What `lumiloop why` says of a moment: state and reason, who contradicts whom, axes, lamps, and what led there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from daemon.cycle import Cycle, CycleRecord
+from daemon.publish.meanings import USES
+from daemon.publish.snapshot import LinkUse, Snapshot, State
+from daemon.reasons import REASONS, Reason
+from daemon.record import CycleEntry
+from daemon.witness import Told as Wheels
+from estimator import se2
+from estimator.records import Array
+from estimator.result import StepResult
+
+AXES: Final = ("x", "y", "heading")
+GAP: Final = 16.27
+"""Squared Mahalanobis distance of three components that is beyond chance (1 in 1000)."""
+SILENT_S: Final = 0.5
+MOST: Final = 12
+"""Changes that are listed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One cycle as it was replayed.
+
+    Attributes:
+        utc: when it began. state: as it was published then. snapshot, result: of the replay. scan: number of the scan
+            it took. fresh: whether the result is of this cycle. wheels: what wheels and laser told over the last two
+            seconds, None where that cannot be said. dropped: scans that were not taken.
+    """
+
+    utc: float
+    state: State
+    snapshot: Snapshot
+    result: StepResult | None
+    scan: int | None
+    fresh: bool
+    wheels: Wheels | None
+    dropped: int
+    orders: tuple[str, ...]
+
+    @property
+    def reason(self) -> Reason:
+        """Why the state is what it is."""
+        return Reason(self.snapshot.reason)
+
+
+def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle: Cycle) -> Moment:
+    """A cycle that has just been repeated."""
+    return Moment(
+        utc=utc_at_zero + record.t_mono,
+        state=State(entry.state),
+        snapshot=record.snapshot,
+        result=record.result,
+        scan=record.scan,
+        fresh=record.limits is not None,
+        wheels=cycle.observer.witnesses.told(),
+        dropped=len(record.dropped),
+        orders=tuple(command.order for command in entry.commands),
+    )
+
+
+def clock(utc: float) -> str:
+    """Local time of day with its date and zone."""
+    return f"{datetime.fromtimestamp(utc, UTC).astimezone():%Y-%m-%d %H:%M:%S.%f}"[:-3]
+
+
+def of_day(utc: float) -> str:
+    """Local time of day."""
+    return f"{datetime.fromtimestamp(utc, UTC).astimezone():%H:%M:%S.%f}"[:-3]
+
+
+def at(told: Sequence[Moment], utc: float) -> int:
+    """Index of the cycle in force at an instant."""
+    return max((k for k, one in enumerate(told) if one.utc <= utc), default=0)
+
+
+def report(told: Sequence[Moment], utc: float, where: str) -> str:
+    """The text."""
+    k = at(told, utc)
+    one = told[k]
+    lines = [f"{clock(utc)}, cycle of {of_day(one.utc)}, {where}", *_state(told, k)]
+    lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
+    lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
+    if one.snapshot.light is not None:
+        lines += ["", "lamps", *(f"  {line}" for line in _lamps(told, k))]
+    changes = list(_changes(told[: k + 1]))
+    first = f"{one.utc - told[0].utc:.0f} s before"
+    lines += ["", f"what changed in the {first}"]
+    lines += [f"  ... {len(changes) - MOST} more"] if len(changes) > MOST else []
+    lines += [f"  {line}" for line in changes[-MOST:]] or ["  nothing"]
+    return "\n".join(lines) + "\n"
+
+
+def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
+    one = told[k]
+    since = _since(told, k, lambda moment: (moment.state, moment.reason))
+    meaning, remedy = REASONS[one.reason]
+    yield f"{one.state.name} since {since}: {meaning or 'nothing is the matter'}" + (f" ({remedy})" if remedy else "")
+    if one.snapshot.state is not one.state:
+        yield f"(the replay says {one.snapshot.state.name}: what the driver said of the device is not recorded)"
+    if one.snapshot.pose is not None:
+        x, y, yaw = one.snapshot.pose
+        said = f"pose {x:.3f} {y:.3f} m, {math.degrees(yaw):.1f} deg"
+        if one.snapshot.covariance is not None:
+            xx, _, yy, *_, tt = one.snapshot.covariance
+            said += f"; sigma {math.sqrt(max(xx, yy)):.3f} m, {math.degrees(math.sqrt(tt)):.2f} deg"
+        trust = one.snapshot.trust
+        if trust.horizontal_m is not None:
+            rests = [name for name in ("laser", "light", "wheels") if getattr(trust, name)]
+            said += f"; not wrong by more than {trust.horizontal_m:.2f} m, which rests on {', '.join(rests)}"
+        yield said
+    if one.snapshot.trust.places is not None:
+        yield f"the place in the map is looked for: {one.snapshot.trust.places} fit"
+
+
+def _since(told: Sequence[Moment], k: int, what: Callable[[Moment], object]) -> str:
+    """When something became what it is at ``k``."""
+    now = what(told[k])
+    begin = k
+    while begin > 0 and what(told[begin - 1]) == now:
+        begin -= 1
+    return f"before {of_day(told[0].utc)}" if begin == 0 else of_day(told[begin].utc)
+
+
+def _witnesses(told: Sequence[Moment], k: int) -> Iterator[str]:
+    yield _laser(told, k)
+    yield _wheels(told[k])
+    if told[k].snapshot.light is not None:
+        yield _light(told[k])
+
+
+def laser_dissents(one: Moment) -> bool:
+    """Whether the scan of this cycle came to nothing."""
+    match = None if one.result is None else one.result.match
+    return one.scan is not None and one.fresh and match is not None and not match.ok
+
+
+def _laser(told: Sequence[Moment], k: int) -> str:
+    latest = next((one for one in reversed(told[: k + 1]) if one.scan is not None and one.fresh), None)
+    if latest is None or latest.result is None or latest.result.match is None:
+        return "laser   no scan in all that time"
+    match, ago = latest.result.match, told[k].utc - latest.utc
+    when = f", {ago:.2f} s ago" if ago > 0.3 else ""
+    if not match.ok:
+        return f"laser   DISSENTS: the scan{when} came to nothing: {match.reason.value} ({match.queries} points)"
+    x, y, yaw = match.correction.tolist()
+    moved = f"moved the prediction by {1e3 * math.hypot(x, y):.0f} mm, {math.degrees(yaw):.2f} deg"
+    fit = f"{match.inliers} of {match.queries} points fit, residual {1e3 * match.residual_m:.0f} mm"
+    word = f"silent for {ago:.1f} s; before" if ago > SILENT_S else f"speaks{when}"
+    return f"laser   {word}: {fit}, {moved}"
+
+
+def _wheels(one: Moment) -> str:
+    said = one.wheels
+    if one.snapshot.odometry_ok is None:
+        return "wheels  there is no odometry"
+    if one.snapshot.odometry_ok is False:
+        return "wheels  silent"
+    if said is None:
+        return "wheels  cannot be compared with the laser: two seconds of both, and of all axes, are wanted"
+    told, seen = _motion(said.wheels), _motion(said.laser)
+    away_m, away_rad = said.apart
+    apart = f"{away_m:.2f} m, {math.degrees(away_rad):.1f} deg apart"
+    word = "agree with the laser" if said.agree else "DISSENT"
+    return f"wheels  {word}: in {said.seconds:.1f} s they told {told}, the laser {seen}; {apart}"
+
+
+def _motion(T: Array) -> str:
+    x, y, yaw = T.tolist()
+    return f"{math.hypot(x, y):.2f} m, {math.degrees(yaw):.1f} deg"
+
+
+def light_apart(one: Moment) -> tuple[float, float] | None:
+    """How far the place that light alone tells is from the pose, m and rad; None where it tells none."""
+    light, pose = one.snapshot.light, one.snapshot.pose
+    if light is None or light.pose is None or pose is None:
+        return None
+    x, y, yaw = se2.between(np.array(pose), np.array(light.pose)).tolist()
+    return math.hypot(x, y), abs(yaw)
+
+
+def _light(one: Moment) -> str:
+    light = one.snapshot.light
+    assert light is not None
+    if one.snapshot.adc_ok is False:
+        return "light   silent: no samples come"
+    away, gap = light_apart(one), one.snapshot.trust.gap
+    if away is None:
+        return f"light   tells no place ({light.fix.name}, {light.used} lamps used)"
+    far = f"its place is {away[0]:.2f} m, {math.degrees(away[1]):.1f} deg from the pose"
+    if gap is None:
+        return f"light   {light.fix.name}, {light.used} lamps used; {far}"
+    word = "DISSENTS" if gap > GAP else "agrees"
+    return f"light   {word}: {far}, {math.sqrt(gap):.1f} deviations; {light.fix.name}, {light.used} lamps used"
+
+
+def _axes(told: Sequence[Moment], k: int) -> Iterator[str]:
+    for axis, name in enumerate(AXES):
+        since = _since(told, k, partial(_known, axis))
+        yield f"{name:8}{'known' if told[k].snapshot.known[axis] else 'UNKNOWN'} since {since}"
+    result = told[k].result
+    match = None if result is None else result.match
+    if match is not None and match.ok and len(blind := match.blind_directions()):
+        said = "; ".join(_direction(row) for row in blind.tolist())
+        yield f"this scan says nothing {said} (odom frame)"
+
+
+def _known(axis: int, one: Moment) -> bool:
+    return one.snapshot.known[axis]
+
+
+def _direction(row: list[float]) -> str:
+    x, y, turn = row
+    if abs(turn) > 0.7:
+        return "of the heading"
+    return f"along {math.degrees(math.atan2(y, x)) % 180.0:.0f} deg"
+
+
+def _lamps(told: Sequence[Moment], k: int) -> Iterator[str]:
+    light = told[k].snapshot.light
+    assert light is not None
+    if not light.links:
+        yield "none is received"
+    for use in LinkUse:
+        links = [link for link in light.links if link.use is use]
+        if links:
+            said = ", ".join(_link(link.lamp_id, link.code, link.residual) for link in links)
+            yield f"{len(links)} {use.name}: {USES[use]}: {said}"
+
+
+def _link(lamp_id: int | None, code: int, residual: float | None) -> str:
+    name = f"code {code}" if lamp_id is None else f"lamp {lamp_id}"
+    return name if residual is None else f"{name} ({math.exp(residual):.2f} of expected)"
+
+
+def _changes(told: Sequence[Moment]) -> Iterator[str]:
+    """One line for everything that became otherwise, oldest first."""
+    for before, one in pairwise(told):
+        for text in _changed(before, one):
+            yield f"{of_day(one.utc)}  {text}"
+
+
+def _changed(before: Moment, one: Moment) -> Iterator[str]:
+    old, new = before.snapshot, one.snapshot
+    yield from (f"order {order}" for order in one.orders)
+    if (before.state, before.reason) != (one.state, one.reason):
+        yield f"{one.state.name}: {REASONS[one.reason][0] or 'all is well'}"
+    for axis, name in enumerate(AXES):
+        if old.known[axis] != new.known[axis]:
+            yield f"{name} {'known' if new.known[axis] else 'unknown'}"
+    agreed, agrees = (None if m.wheels is None else m.wheels.agree for m in (before, one))
+    if agrees is False and agreed is not False:
+        yield "the wheels begin to dissent"
+    if laser_dissents(one) and not laser_dissents(before):
+        assert one.result is not None
+        assert one.result.match is not None
+        yield f"a scan comes to nothing: {one.result.match.reason.value}"
+    if new.loop_counter != old.loop_counter:
+        yield f"a loop is closed, keyframe {new.loop_new} on {new.loop_old}"
+    if new.jumps != old.jumps and new.pose is not None and old.pose is not None:
+        yield f"the pose jumps by {math.dist(new.pose[:2], old.pose[:2]):.2f} m"
+    if one.dropped:
+        yield f"{one.dropped} scans came too fast and were left out"
+    if new.fault != old.fault:
+        yield f"fault {new.fault}" if new.fault else f"fault {old.fault} is over"
+    yield from _lamps_changed(old, new)
+
+
+def _lamps_changed(old: Snapshot, new: Snapshot) -> Iterator[str]:
+    if old.light is None or new.light is None or old.light.links is new.light.links:
+        return
+    if old.light.fix is not new.light.fix:
+        yield f"light: {new.light.fix.name}"
+    was = {link.lamp_id: link.use for link in old.light.links if link.lamp_id is not None}
+    for link in new.light.links:
+        use = None if link.lamp_id is None else was.get(link.lamp_id)
+        if use is not None and use is not link.use:
+            yield f"lamp {link.lamp_id}: {use.name} -> {link.use.name}"

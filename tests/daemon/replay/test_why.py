@@ -1,0 +1,137 @@
+"""`lumiloop why`: the moment that is meant, the recording that holds it, and what is said of it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import blackbox, cli, disk
+from daemon.flight import DUMP
+from daemon.why import NoMoment, Span, find, meant
+from daemon.witness import Told
+from hal.odometry import RawOdometry
+from tests.daemon.replay.test_dump import let_write, unplugged
+from tests.daemon.replay.test_recorded_run import Bench, record
+
+AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
+SPAN = Span(Path("rec"), AT, AT + 3600.0, AT - 100.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "after"),
+    [
+        ("22:13:25Z", 5.0),
+        ("22:14Z", 40.0),
+        ("22:13:25.5Z", 5.5),
+        ("2023-11-14T22:13:25Z", 5.0),
+        ("2023-11-14 23:13:25+01:00", 5.0),
+        ("5", 5.0),
+        ("5.25", 5.25),
+        (f"{AT + 5.0}", 5.0),
+    ],
+)
+def test_times_are_understood(words: str, after: float) -> None:
+    span, utc = find([SPAN], words, Path())
+    assert span is SPAN
+    assert utc - AT == pytest.approx(after, abs=1e-6)
+
+
+def test_a_time_of_the_day_may_be_of_the_next_day() -> None:
+    night = Span(Path("rec"), AT, AT + 7200.0, 0.0)
+    assert find([night], "00:05:00Z", Path())[1] - AT == 6700.0
+
+
+def test_without_a_zone_it_is_local_time() -> None:
+    local = datetime.fromtimestamp(AT + 5.0, UTC).astimezone()
+    assert find([SPAN], f"{local:%H:%M:%S}", Path())[1] - AT == 5.0
+    assert find([SPAN], f"{local:%Y-%m-%dT%H:%M:%S}", Path())[1] - AT == 5.0
+
+
+@pytest.mark.parametrize("words", ["yesterday", "25:00:00", "21:61", "", "nan", "-5", "2023-13-01T00:00:00Z"])
+def test_what_is_no_time_is_refused_with_the_ways_to_write_one(words: str) -> None:
+    with pytest.raises(NoMoment, match="write 21:14:07"):
+        meant(words, SPAN)
+
+
+def test_of_two_recordings_the_one_with_more_before_it_is_taken() -> None:
+    ring = Span(Path("ring"), AT + 4.0, AT + 3600.0, 0.0)
+    assert find([ring, SPAN], "22:13:30Z", Path())[0] is SPAN
+
+
+def test_a_time_that_nobody_has_recorded_is_told_with_those_that_were() -> None:
+    with pytest.raises(NoMoment, match=r"not in what is recorded in .*there is(.|\n)* rec"):
+        find([SPAN], "21:00:00Z", Path())
+
+
+@pytest.mark.parametrize(("wheels_m", "turn", "agree"), [(1.0, 0.0, True), (0.65, 0.0, False), (1.0, 0.4, False)])
+def test_witnesses_agree_within_slip(wheels_m: float, turn: float, agree: bool) -> None:
+    told = Told(2.0, np.array((1.0, 0.0, 0.0)), np.array((wheels_m, 0.0, turn)))
+    assert told.agree is agree
+    assert told.apart == pytest.approx((abs(1.0 - wheels_m), turn))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("why") / "rec"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(disk, "WRITE_S", 0.002)
+        patch.setattr(blackbox, "LEAST_S", 2.0)
+        record(folder, unplugged, keep_s=60.0)
+    return folder
+
+
+def asked(words: str, folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    assert cli.main(["why", words, str(folder), *options]) == cli.OK
+    return capsys.readouterr().out
+
+
+def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (dump,) = recorded.glob(f"{DUMP}*")
+    said = asked("9", dump, capsys)
+    assert "NO_LIDAR since" in said
+    assert "laser   silent for 5.0 s" in said
+    assert "x       UNKNOWN since" in said
+    assert "TRACKING: the pose is confirmed" in said
+    assert "NO_LIDAR: no valid scan" in said
+
+
+def test_a_run_where_all_is_well_from_a_folder_of_several(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = asked("2023-11-14T22:13:23Z", recorded, capsys)
+    assert "TRACKING since" in said
+    assert "laser   speaks" in said
+    assert "wheels  agree with the laser" in said
+    assert "heading known since" in said
+
+
+def test_it_is_drawn(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from PIL import Image
+
+    asked("9", recorded, capsys, "--out", str(tmp_path / "why.png"))
+    with Image.open(tmp_path / "why.png") as image:
+        assert min(image.size) > 700
+
+
+async def slipping(bench: Bench) -> None:
+    """Wheels that turn on the spot for a while."""
+    put, ahead = bench.put_odometry, 0.0
+
+    def slip(reading: RawOdometry) -> None:
+        nonlocal ahead
+        ahead += 0.02
+        put(RawOdometry(reading.t_rx, reading.t_mono, reading.x + ahead, reading.y, reading.yaw))
+
+    await bench.drive(4.0)
+    let_write(0.02)
+    bench.put_odometry = slip
+    await bench.drive(4.0)
+
+
+def test_wheels_that_slip_dissent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(tmp_path / "rec", slipping)
+    said = asked("7.5", tmp_path / "rec", capsys)
+    assert "wheels  DISSENT: in" in said
+    assert "the wheels begin to dissent" in said
+    assert "odometry and laser disagree" in said
