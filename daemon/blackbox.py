@@ -151,11 +151,6 @@ class BlackBox:
 
         self._dump("asked", "somebody has asked for it", back)
 
-    def restarted(self) -> None:
-        """The estimator's state has been exchanged for another one: a replay goes on with that."""
-        self._jobs.clear()
-        self._begin(_nothing, anew=True)
-
     def close(self, ended: bool) -> None:
         """Finish what is under way; after the disk."""
         self.flight.close(ended)
@@ -177,7 +172,7 @@ class BlackBox:
                 self._pending = now + AFTER_S, fault
                 self._dumped[fault] = now
 
-    def _begin(self, then: Callable[[int | None], None], anew: bool = False) -> None:
+    def _begin(self, then: Callable[[int | None], None]) -> None:
         """Begin a segment with the state of this moment."""
         now = self._clock.now()
         taken = self._take()
@@ -185,12 +180,7 @@ class BlackBox:
         self._bytes = self._disk.taken
         cycle = 0 if self._cycle is None else self._cycle.cycles
         line = self.line.said()
-        if taken is not None:
-            self._disk.begin(partial(self._begun, now, taken, line, cycle, then))
-            if anew:
-                self._disk.put(Kind.STATE, 0, now, b"anew")
-        else:
-            self._disk.begin(partial(self._begun, now, None, line, cycle, then))
+        self._disk.begin(partial(self._begun, now, taken, line, cycle, then))
 
     def _begun(
         self,

@@ -41,6 +41,8 @@ DUMPS: Final = 8
 """Dumps that are kept, the latest."""
 DUMP_S: Final = 600.0
 """What a dump of a recording that is kept as a whole reaches back."""
+MAP_SUFFIX: Final = ".lumimap"
+"""Of the map that the run began with, and of those that it went on in."""
 RING: Final = "ring"
 """File of a ring's folder, locked while somebody writes; empty until the run has ended as it should."""
 MB_A_MINUTE: Final = 24
@@ -228,8 +230,9 @@ class Flight:
         names = [
             segment_name(number) for number, one in sorted(self._segments.items()) if number >= begin and one.bytes
         ]
-        names += [state_name(begin), RESIDUALS, *([START] if begin == 0 else [])]
-        return [name for name in names if name in there]
+        names += [state_name(number) for number in sorted(self._segments) if number >= begin]
+        maps = {name for name in there if name.endswith(MAP_SUFFIX)} - ({START} if begin > 0 else set())
+        return [name for name in (*names, RESIDUALS, *sorted(maps)) if name in there]
 
 
 def _load() -> None:

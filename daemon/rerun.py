@@ -23,7 +23,7 @@ from daemon.moment import Restored
 from daemon.photodiode import BlockWatch
 from daemon.record import CycleEntry, light_of, switch_name
 from daemon.results import finest
-from daemon.sources import Anew, Event, Source, Turn
+from daemon.sources import Event, Source, Turn
 from daemon.store import Start, recorded_start
 from daemon.store_file import BadMap
 from daemon.worker import CycleWorker, ScheduledWorker
@@ -168,9 +168,6 @@ class Rerun:
         if isinstance(event, Turn):
             self._repeat(event)
             return
-        if isinstance(event, Anew):
-            self._begin_anew(event.moment.load())
-            return
         self._arrive(event.t1 if isinstance(event, RawSamples) else event.t_rx)
         if isinstance(event, RawSamples):
             self.blocks += 1
@@ -234,15 +231,6 @@ class Rerun:
             self.comparison.note(entry.cycle, str(error))
         else:
             self._compare(entry, record)
-
-    def _begin_anew(self, begin: Restored) -> None:
-        """The recorded run went on with another state from here on."""
-        self.ledger.settle(pipeline.keyframe_poses(self._state))
-        self._state = begin.keep_history()
-        begin.put_into(self.cycle)
-        self.cycle.parts.worker = self._scheduled(begin)
-        if self._journal is not None:
-            self._journal.attach(self._state)
 
     def _switch(self, sha256: str) -> tuple[int, str]:
         """Go on in the map that the recorded run went on in.

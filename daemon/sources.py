@@ -55,14 +55,7 @@ class Turn:
     entry: CycleEntry
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Anew:
-    """A recorded run goes on with another state than it had."""
-
-    moment: Moment
-
-
-Event = RawScan | RawSamples | RawOdometry | RawImu | Turn | Anew
+Event = RawScan | RawSamples | RawOdometry | RawImu | Turn
 
 
 class Source(ABC):
@@ -282,18 +275,9 @@ class RecordingSource(Source):
                 return unpack_imu(frame.payload)
             case Kind.CYCLE:
                 return Turn(frame.t_mono, decode_cycle(frame.payload))
-            case Kind.STATE:
-                return self._anew()
             case Kind.NOTE:
                 self.report.notes.append(frame.payload.decode("utf-8", "replace"))
         return None
-
-    def _anew(self) -> Anew | None:
-        """The state of the segment that is being read, unless it is the one that this begins with."""
-        segment = self._recording.segments[self._recording.reading]
-        if self.begin is not None and self._recording.reading == 0:
-            return None
-        return Anew(read_moment(state_beside(segment)))
 
     def _claim(self, mark: ScanMark) -> RawScan | None:
         """The decoded scan that the driver delivered then, under the driver's number and time.

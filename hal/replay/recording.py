@@ -64,7 +64,6 @@ class Kind(IntEnum):
     IMU = 17
     COMMAND = 18
     CYCLE = 32
-    STATE = 33  # the state beside this segment takes the place of the one there was
     NOTE = 48  # text for people: gaps of the recording itself
 
 
@@ -184,7 +183,7 @@ def _choose(folder: Path, runs: list[Path]) -> list[Path]:
     return []
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Recording:
     """A recording on disk: its header, and its records as a stream."""
 
@@ -193,8 +192,6 @@ class Recording:
     segments: tuple[Path, ...]
     first: int = 0
     """Number of the segment that it begins with."""
-    reading: int = 0
-    """Index of the segment whose records are being read."""
 
     def frames(self, report: LogReport) -> Iterator[Frame]:
         """Every whole record in order; what is torn or damaged is counted in ``report``, with its place.
@@ -203,8 +200,7 @@ class Recording:
             DeviceRefused: a segment cannot be read.
         """
         number = self.first - 1
-        for index, path in enumerate(self.segments):
-            self.reading = index
+        for path in self.segments:
             data = _load(path)
             header, at = _read_head(data)
             if header is None:
