@@ -44,19 +44,22 @@ from daemon.stallwatch import StallWatch
 from daemon.store import NoMap, Start, folder_of, judge_for, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
+from daemon.streambeat import StreamBeat
 from daemon.supervise import Supervisor
+from daemon.tapped import tapped
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.warmup import CannotLoad, Warmth, warm_up
 from daemon.worker import ThreadWorker
 from daemon.world import NoLidar, World
 from estimator.records import Command, Limits, Order, Record, no_lap
 from estimator.result import StepResult
-from hal.adc import BusStuck
+from hal.adc import BusStuck, RawSamples
 from hal.clock import SystemClock
 from hal.errors import HalError
 from hal.inputs import OnImu, OnOdometry
 from hal.lidar import Lidar, RawScan
 from hal.photodiode.silence import HANG_S
+from hal.replay.recording import Kind
 
 if TYPE_CHECKING:
     from daemon.record import Recorder
@@ -87,6 +90,7 @@ class Daemon:
         self._recorder = recorder
         lights = world.lights or load_lights(settings)
         opener = world.opener if recorder is None else recorder.tap(world.opener)
+        opener = opener if world.stream is None else tapped(opener, self._on_raw, world.clock)
         fitted = settings.lidar.fitted
         self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
         self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
@@ -210,7 +214,12 @@ class Daemon:
         if self._world.store is not None:
             parts["map"] = self.keeper.run
         if (adc := self.adc) is not None:
-            parts["photodiode"] = lambda: adc.run(self._on_samples)
+            parts["photodiode"] = lambda: adc.run(self._take_samples)
+        if self.network.stream is not None:
+            beat = StreamBeat(
+                self.network.stream, self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults
+            )
+            parts["stream beat"] = beat.run
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
@@ -228,6 +237,15 @@ class Daemon:
         if (adc := self.adc) is not None:
             answers.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
         return answers
+
+    def _on_raw(self, kind: Kind, t_mono: float, data: bytes) -> None:
+        if self.network.stream is not None:
+            self.network.stream.on_raw("lidar", kind.name.lower(), t_mono, data)
+
+    def _take_samples(self, block: RawSamples) -> None:
+        self._on_samples(block)
+        if self.network.stream is not None:
+            self.network.stream.on_samples(block)
 
     def _take_scan(self, scan: RawScan) -> None:
         self._on_scan(scan)

@@ -24,17 +24,18 @@ from daemon.cycle import CycleRecord
 from daemon.disk import SegmentWriter
 from daemon.lights import RESIDUALS, Lights
 from daemon.store import START, Start
+from daemon.tapped import tapped
 from daemon.versions import versions
 from daemon.wholefile import write_whole
 from estimator.records import UNLIMITED, Array, Command, Limits, Order
 from estimator.result import StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
-from hal.errors import DeviceRefused, HalError
+from hal.errors import DeviceRefused
 from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
-from hal.port import OnData, OnLost, Port, PortOpener
+from hal.port import PortOpener
 from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_samples, pack_scan
 
 MAP: Final = "map"
@@ -258,58 +259,9 @@ class Recorder:
 
     def tap(self, opener: PortOpener, channel: int = LIDAR) -> PortOpener:
         """A port opener whose ports keep what passes through them."""
-
-        async def open_tapped(device: str, baud: int) -> Port:
-            port = await opener(device, baud)
-            self._passed(channel, Kind.OPEN, self._clock.now(), f"{port.name} {baud}".encode())
-            return _TappedPort(port, partial(self._passed, channel), self._clock)
-
-        return open_tapped
+        return tapped(opener, partial(self._passed, channel), self._clock)
 
     def _passed(self, channel: int, kind: Kind, t_mono: float, payload: bytes) -> None:
         self.disk.put(kind, channel, t_mono, payload)
         if channel == LIDAR:
             self.box.line.passed(kind, t_mono, payload)
-
-
-class _TappedPort:
-    """A port that keeps everything that passes through it (`hal.port.Port`)."""
-
-    def __init__(self, port: Port, passed: Callable[[Kind, float, bytes], None], clock: Clock) -> None:
-        self._port = port
-        self._passed = passed
-        self._clock = clock
-
-    @property
-    def name(self) -> str:
-        """The port as the user named it."""
-        return self._port.name
-
-    def start(self, on_data: OnData, on_lost: OnLost) -> None:
-        """Begin delivering; bytes are kept before anybody else sees them."""
-        passed = self._passed
-
-        def keep(data: bytes, t_rx: float) -> None:
-            passed(Kind.RX, t_rx, data)
-            on_data(data, t_rx)
-
-        def lose(error: HalError) -> None:
-            passed(Kind.LOST, self._clock.now(), str(error).encode())
-            on_lost(error)
-
-        self._port.start(keep, lose)
-
-    def write(self, data: bytes) -> None:
-        """Send a short command; it is kept once the port has taken it."""
-        self._port.write(data)
-        self._passed(Kind.TX, self._clock.now(), data)
-
-    def set_baud(self, baud: int) -> None:
-        """Change the line rate."""
-        self._port.set_baud(baud)
-        self._passed(Kind.BAUD, self._clock.now(), str(baud).encode())
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
-        self._passed(Kind.LOST, self._clock.now(), b"closed")

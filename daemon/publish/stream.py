@@ -14,14 +14,16 @@ import logging
 import os
 import socket
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 
+from daemon.maptiles import NOTHING_SHOWN, RESOLUTION_M, MapTiles
 from daemon.publish.snapshot import Snapshot
+from hal.adc import RawSamples
 from hal.errors import DeviceRefused
 from hal.lidar import VALID, RawScan
 
@@ -34,17 +36,29 @@ LATEST: Final = {
     "pose": "after each cycle: the whole snapshot, with the state in words",
     "lights": "after each cycle: what lights alone say, with every link",
     "scan": "each scan: ranges in m as little-endian float32, not a number where there is none",
+    "statistics": "once a second: counters and times of cycle, devices and process",
 }
 """Topics of which a slow client gets the latest only."""
 ONCE: Final = {
     "state": "a change of state or reason, with meaning and remedy",
     "loop": "a loop closed: counter, both keyframes, residual, reason",
+    "faults": "at first and at a change: all that are present, with meaning and remedy",
 }
 """Topics of which a client gets every one, up to :data:`KEPT`."""
-TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE}
+RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}
+"""As those, up to :data:`RAW_KEPT`."""
+MAP: Final = {"map": "the map as tiles: at first all, then those that have changed"}
+"""A client gets every tile as it is when it comes to it."""
+TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE, **RAW, **MAP}
 
 CLIENTS: Final = 32
 KEPT: Final = 64
+RAW_KEPT: Final = 256
+TILE_BYTES: Final = 32 << 10
+"""Of deflated tiles in one frame."""
+SIDE: Final = 128
+UNIT: Final = 0.1
+"""Cells of a tile, each way; log-odds of a cell's unit (`estimator.patch`, which is not loaded here)."""
 BUFFER_BYTES: Final = 256 << 10
 """Bytes that may wait in this process for one client, and one frame."""
 LONGEST_REQUEST: Final = 4096
@@ -78,6 +92,9 @@ def scan_message(scan: RawScan) -> dict[str, object]:
 class StreamServer:
     """Serves the stream at a path in the file system.
 
+    Attributes:
+        clients: that are connected. tiles: of the map; None: there are none.
+
     Args:
         path: of the socket; its folder is made. name: of the robot.
         explain: meaning and remedy of a reason's number.
@@ -90,6 +107,9 @@ class StreamServer:
         self._explain = explain
         self._state: tuple[int, int] | None = None
         self._loops = 0
+        self._map_id = 0
+        self._faults: list[dict[str, object]] = []
+        self.tiles: MapTiles | None = None
 
     async def run(self) -> None:
         """Serve until cancelled.
@@ -145,10 +165,68 @@ class StreamServer:
             if snapshot.loop_counter != self._loops:
                 self._tell("loop", lambda: _loop(snapshot))
         self._state, self._loops = (snapshot.state, snapshot.reason), snapshot.loop_counter
+        self._map_id = snapshot.map_id
 
     def on_scan(self, scan: RawScan) -> None:
         """Tell a scan."""
         self._tell("scan", lambda: scan_message(scan))
+
+    def on_raw(self, device: str, kind: str, t_mono: float, data: bytes) -> None:
+        """Tell what has passed through a device's port; ``kind``: rx, tx, open, lost, baud."""
+        self._tell("raw", lambda: {"device": device, "kind": kind, "t_mono": t_mono, "bytes": data})
+
+    def on_samples(self, block: RawSamples) -> None:
+        """Tell a block of the photodiode's samples."""
+        self._tell("raw", lambda: _samples(block))
+
+    def on_faults(self, t_mono: float, faults: Iterable[tuple[int, str, str]]) -> None:
+        """Tell which faults are present (number, meaning, remedy), where they are others than before."""
+        told: list[dict[str, object]] = [{"fault": number, "meaning": m, "remedy": r} for number, m, r in faults]
+        if told != self._faults:
+            self._faults = told
+            self._tell("faults", lambda: {"t_mono": t_mono, "present": told})
+
+    def on_statistics(self, figures: Callable[[], Mapping[str, object]]) -> None:
+        """Tell statistics, if anybody wants them."""
+        self._tell("statistics", figures)
+
+    def on_tiles(self) -> None:
+        """There are new tiles."""
+        for client in [client for client in self.clients if "map" in client.wants]:
+            self.show(client)
+
+    def wanted(self, topic: str) -> bool:
+        """Whether anybody wants it."""
+        return any(topic in client.wants for client in self.clients)
+
+    def welcome(self, client: Client, fresh: frozenset[str]) -> None:
+        """A client wants these from now on: it is told how things stand."""
+        if "faults" in fresh:
+            client.tell("faults", _encode({"t_mono": None, "present": self._faults}))
+        if "map" in fresh:
+            client.shown = NOTHING_SHOWN
+            self.show(client)
+
+    def show(self, client: Client) -> None:
+        """Send the tiles that a client has not seen yet, as far as it takes them."""
+        tiles = [] if self.tiles is None else self.tiles.since(client.shown)
+        while tiles and not client.stuck:
+            size = count = 0
+            while count < len(tiles) and size < TILE_BYTES:
+                size += len(tiles[count][1])
+                count += 1
+            now, tiles = tiles[:count], tiles[count:]
+            client.shown = now[-1][0]
+            message = {
+                "map_id": self._map_id,
+                "resolution": RESOLUTION_M,
+                "side": SIDE,
+                "unit": UNIT,
+                "version": client.shown[0],
+                "more": bool(tiles),
+                "tiles": [[*tile, cells] for (_, tile), cells in now],
+            }
+            client.tell("map", _encode(message))
 
     def _tell(self, topic: str, data: Callable[[], Mapping[str, object]]) -> None:
         """Encode once for all that want it."""
@@ -164,6 +242,7 @@ class Client(asyncio.Protocol):
 
     Attributes:
         wants: topics. replaced: frames that a newer one has replaced before it took them.
+        shown: the last tile of the map that it was sent.
     """
 
     def __init__(self, server: StreamServer) -> None:
@@ -174,7 +253,14 @@ class Client(asyncio.Protocol):
         self._received = b""
         self._latest: dict[str, bytes] = {}
         self._events: deque[tuple[str, bytes]] = deque(maxlen=KEPT)
+        self._raw: deque[tuple[str, bytes]] = deque(maxlen=RAW_KEPT)
+        self.shown = NOTHING_SHOWN
         self._stuck: asyncio.TimerHandle | None = None
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it does not take what it has asked for at the moment."""
+        return self._stuck is not None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Greet, or say that there are too many."""
@@ -215,11 +301,14 @@ class Client(asyncio.Protocol):
         if self._stuck is not None:
             self._stuck.cancel()
             self._stuck = None
-        events, latest = list(self._events), self._latest
+        waiting = [*self._events, *self._latest.items(), *self._raw]
         self._events.clear()
+        self._raw.clear()
         self._latest = {}
-        for topic, body in [*events, *latest.items()]:
+        for topic, body in waiting:
             self.tell(topic, body)
+        if "map" in self.wants:
+            self._server.show(self)
 
     def tell(self, topic: str, body: bytes) -> None:
         """Send, or keep for when it has caught up."""
@@ -228,9 +317,10 @@ class Client(asyncio.Protocol):
             # a map of three with the data's bytes as they are: encoded once, whoever wants it
             joined = b"\x83" + head[1:] + b"\xa4data" + body
             self._transport.write(len(joined).to_bytes(4, "little") + joined)
-        elif topic in ONCE:
-            self.replaced += len(self._events) == KEPT
-            self._events.append((topic, body))
+        elif topic in ONCE or topic in RAW:
+            kept = self._events if topic in ONCE else self._raw
+            self.replaced += len(kept) == kept.maxlen
+            kept.append((topic, body))
         else:
             self.replaced += topic in self._latest
             self._latest[topic] = body
@@ -251,7 +341,8 @@ class Client(asyncio.Protocol):
         elif unknown := sorted(set(wanted) - set(TOPICS)):
             self._refuse(f"no such topic: {', '.join(unknown)[:100]}; there are {', '.join(TOPICS)}")
         else:
-            self.wants = frozenset(wanted)
+            before, self.wants = self.wants, frozenset(wanted)
+            self._server.welcome(self, self.wants - before)
 
     def _refuse(self, text: str) -> None:
         self.wants = frozenset()
@@ -273,6 +364,17 @@ def _fields(record: object) -> dict[str, Any]:
     built = msgspec.to_builtins(record)
     assert isinstance(built, dict)
     return built
+
+
+def _samples(block: RawSamples) -> dict[str, object]:
+    return {
+        "device": "photodiode",
+        "kind": "samples",
+        "t_mono": block.t_first,
+        "rate": block.rate_hz,
+        "bits": block.bits,
+        "bytes": block.words.astype("<u2").tobytes(),
+    }
 
 
 def _loop(snapshot: Snapshot) -> dict[str, object]:

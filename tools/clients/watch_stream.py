@@ -1,6 +1,6 @@
 """Watch what a lumiloop on this computer says on its local stream. Needs `msgpack` or `msgspec`, nothing of lumiloop.
 
-    python watch_stream.py SOCKET [TOPIC...]        topics: pose, lights, scan, state, loop
+    python watch_stream.py SOCKET [TOPIC...]    topics: pose, lights, scan, state, loop, faults, statistics, raw, map
 
 Written from docs/stream.md alone, so it can be copied into any program.
 """
@@ -45,6 +45,8 @@ def line_of(topic: str, data: dict[str, Any]) -> str:
         seen = [r for r in ranges if r == r]
         nearest = min(seen, default=0.0)
         return f"{data['t_mono']:.3f} scan {data['seq']}: {len(seen)} of {len(ranges)} beams, nearest {nearest:.2f} m"
+    if topic == "map":
+        return f"map {data['map_id']:08x} version {data['version']}: {len(data['tiles'])} tiles" + " ..." * data["more"]
     return f"{topic}: {data}"
 
 
