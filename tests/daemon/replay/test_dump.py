@@ -114,7 +114,7 @@ async def unplugged(bench: Bench) -> None:
 def test_a_fault_makes_a_dump_that_shows_what_became_of_it(tmp_path: Path) -> None:
     record(tmp_path / "rec", unplugged, keep_s=60.0)
     dumps = sorted((tmp_path / "rec").glob(f"{DUMP}*"))
-    assert [dump.name.split("Z-")[1] for dump in dumps] == ["fault-101"]
+    assert dumps[0].name.endswith("-fault-101")
     said = json.loads((dumps[0] / ABOUT).read_text())
     assert said["faults"][0] == 101
     compared = replayed(dumps[0], tmp_path / "out")["recorded_run"]

@@ -89,7 +89,7 @@ def asked(words: str, folder: Path, capsys: pytest.CaptureFixture[str], *options
 
 
 def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (dump,) = recorded.glob(f"{DUMP}*")
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
     said = asked("9", dump, capsys)
     assert "NO_LIDAR since" in said
     assert "laser   silent for 5.0 s" in said
