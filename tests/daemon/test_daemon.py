@@ -14,12 +14,13 @@ import numpy.typing as npt
 import pytest
 
 from daemon.budget import FixedBudget
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount
+from daemon.config import Config, LidarConfig, MapConfig, ModbusConfig, Mount
 from daemon.health import Fault
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot, State
 from daemon.reasons import Reason
 from daemon.state_evidence import SILENT_PERIODS
+from daemon.store import started
 from daemon.worker import CycleWorker
 from estimator import se2
 from hal.clock import LoopClock, run_virtual
@@ -34,7 +35,8 @@ from hal.odometry import RawOdometry
 
 DEVICE = "/dev/ttyACM0"
 PERIOD = URG_04LX_UG01.true_period_s
-SETTINGS = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0))
+UNKEPT = MapConfig(folder="none")
+SETTINGS = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0), map=UNKEPT)
 
 
 async def warm() -> None:
@@ -70,6 +72,7 @@ class Bench:
         if self.plugged:
             self.opener.plug(DEVICE, self.device)
         self.faults = FaultSchedule({"lidar": self.device})
+        store, start = started(self.settings.map, None)
         world = World(
             clock,
             opener=self.opener,
@@ -79,6 +82,8 @@ class Bench:
             warm_up=warm,
             sinks=(self.snapshots.append,),
             draw_map_id=lambda: 4711,
+            store=store,
+            start=start,
         )
         self.daemon = Daemon(self.settings, world)
 
@@ -116,11 +121,15 @@ class Bench:
             self.daemon.cycle.inbox.put_odometry(RawOdometry(t, t, scale * x, scale * y, yaw))
 
 
-def run_daemon(scenario: Callable[[Bench], Awaitable[None]], **options: object) -> Bench:
+def run_daemon(
+    scenario: Callable[[Bench], Awaitable[None]], bench: type[Bench] | None = None, **options: object
+) -> Bench:
     """Run the daemon around a scenario, stop it as a signal would, and hand back what is left."""
 
+    kind = bench or Bench
+
     async def go() -> Bench:
-        bench = Bench(**options)  # type: ignore[arg-type]  # test shorthand
+        bench = kind(**options)  # type: ignore[arg-type]  # test shorthand
         stop = asyncio.Event()
         running = asyncio.create_task(bench.daemon.run(stop))
         try:
@@ -375,7 +384,7 @@ def test_mount_and_inversion_reach_the_pose() -> None:
 
 def replace_lidar(**changes: object) -> Config:
     lidar = LidarConfig(**{"device": DEVICE, **changes})  # type: ignore[arg-type]  # test shorthand
-    return Config(lidar=lidar, modbus=ModbusConfig(port=0))
+    return Config(lidar=lidar, modbus=ModbusConfig(port=0), map=UNKEPT)
 
 
 def test_overruns_are_counted_published_and_named() -> None:

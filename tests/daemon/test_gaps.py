@@ -40,8 +40,11 @@ def answered(bench: Bench) -> list[float]:
     return times
 
 
+SLOW = [pytest.param(gap, marks=pytest.mark.slow) for gap in ("garbage", "stuck", "intermittent")]
+
+
 @pytest.mark.parametrize("wheels", [True, False])
-@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize("gap", ["unplugged", "power", "silence", *SLOW])
 def test_a_gap_is_shown_at_once_and_over_at_once(gap: str, wheels: bool) -> None:
     """With wheels the robot drives through it, without it stands."""
 
