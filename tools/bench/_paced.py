@@ -10,7 +10,6 @@ being solved without a pause (its own).
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import json
 import logging
 import os
@@ -27,7 +26,6 @@ import numpy as np
 from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
 from daemon.lights import Lights
 from daemon.main import Daemon, World
-from daemon.realtime import PRIORITY, line_up
 from daemon.stallwatch import StallWatch
 from daemon.warmup import warm_up
 from daemon.worker import ThreadWorker
@@ -42,6 +40,7 @@ from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
 from hal.port import PortOpener
 from hal.timerfd import timer
 from tools.bench._drive import PERIOD_S, Delivery
+from tools.bench._first import first_in_line
 from tools.bench.liveloop import SUBMAPS, old_map
 
 SETTLE_S: Final = 8.0
@@ -130,7 +129,7 @@ class Feeder:
         while daemon.cycle.cycles == 0:  # noqa: ASYNC110  # nothing tells of the first cycle
             await asyncio.sleep(0.05)
         if self._wanted.fifo:
-            _first_in_line()
+            first_in_line()
         loop, ring = asyncio.get_running_loop(), asyncio.Event()
         clock = timer(loop, ring.set)
         run = daemon.cycle.run
@@ -190,13 +189,6 @@ class Feeder:
             self.told.late[self.stretch].append(1e6 * late)
             self.told.cycle[self.stretch].append(float(self.daemon.cycle.cycle_us or 0))
         return snapshot
-
-
-def _first_in_line() -> None:
-    """As `daemon.realtime.claim` does where a unit allows it; this process is its own and needs no unit."""
-    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
-    ctypes.CDLL(None).mlockall(1 | 2 | 4)
-    line_up()
 
 
 async def go(wanted: Wanted, drive: Any) -> Told:
