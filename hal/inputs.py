@@ -7,17 +7,15 @@ counted; none of them makes the pose that is delivered jump. The bytes are in :m
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 import socket
-import struct
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
 from hal import inet
+from hal.arrival import MAX_AGE_S, STAMP_SPACE, kernel_age, stamp_arrivals
 from hal.clock import Clock
 from hal.errors import DataInvalid
 from hal.imu import RawImu
@@ -26,12 +24,9 @@ from hal.odometry import RawOdometry
 from hal.share import Reader, Share
 
 SESSION_TIMEOUT_S: Final = 1.0  # another sender is taken when the present one has been silent for this long
-MAX_AGE_S: Final = 1.0  # an older kernel stamp or shared-clock time is not believed
 MAX_LEAD_S: Final = 0.001  # a reading cannot be from the future
 _PER_TURN: Final = 16
 _BUFFER: Final = 256
-_TIMESPEC: Final = struct.Struct("@ll")
-_SO_TIMESTAMPNS: Final = 35  # asm-generic/socket.h; the socket module has no name for it
 
 
 class Continuity:
@@ -179,8 +174,7 @@ class InputPort:
     def _listen(self, address: inet.Address) -> None:
         sock = inet.listening((address[0], (address[1][0], self.port)), socket.SOCK_DGRAM)
         self._sockets.append(sock)
-        with contextlib.suppress(OSError):  # a kernel without it: the time of reading is used
-            sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        stamp_arrivals(sock)
         self._readers.append(Reader(sock.fileno(), partial(self._read, sock), self._share))
 
     def close(self) -> None:
@@ -200,11 +194,11 @@ class InputPort:
     def _read(self, sock: socket.socket) -> None:
         for _ in range(_PER_TURN):
             try:
-                data, ancillary, _, peer = sock.recvmsg(_BUFFER, socket.CMSG_SPACE(_TIMESPEC.size))
+                data, ancillary, _, peer = sock.recvmsg(_BUFFER, STAMP_SPACE)
             except OSError:  # nothing more
                 return
             if self._allowed is None or self._allowed(peer[0]):
-                self.take(data, self._clock.now() - _kernel_age(ancillary))
+                self.take(data, self._clock.now() - kernel_age(ancillary))
 
     def take(self, data: bytes, t_rx: float) -> None:
         """One datagram and its time of arrival (also for replay)."""
@@ -270,16 +264,6 @@ class UdpImu:
         finally:
             self._port.send_imu_to(None)
             self._port.close()
-
-
-def _kernel_age(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """Seconds since the kernel received a datagram; 0 where it does not say, or its clock was set in between."""
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) >= _TIMESPEC.size:
-            seconds, nanoseconds = _TIMESPEC.unpack_from(data)
-            age = (time.clock_gettime_ns(time.CLOCK_REALTIME) - seconds * 1_000_000_000 - nanoseconds) * 1e-9
-            return age if 0.0 <= age <= MAX_AGE_S else 0.0
-    return 0.0
 
 
 def _reading_time(datagram: InputDatagram, t_rx: float) -> float:

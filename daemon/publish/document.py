@@ -109,7 +109,8 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 `modbus.serial = "/dev/ttyUSB1@115200#1"`: the line, its rate, our unit. Without a rate it is 19200 bit/s; characters
 are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2). An answer goes
 out 3.5 characters after its request at the earliest; a request that pauses for more than {1e3 * SILENCE_S:g} ms is
-given up. What is sent to unit 0 is carried out and not answered. Adapters that echo are fine. Try it with
+given up. What is sent to unit 0 is carried out and not answered. Adapters that echo are fine. A reference client is
+`tools/clients/read_rtu.py`. Try it with
 `mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0` from the other end, and with
 `mbpoll -m tcp -p 1502 -t 3 -0 -r 0 -c 64 HOST` over the network.
 
@@ -249,7 +250,8 @@ for itself.
 
 ### Odometry input, {holding.ODOMETRY_ADDRESS} to {holding.ODOMETRY_ADDRESS + holding.ODOMETRY.words - 1}
 
-All {holding.ODOMETRY.words} registers in one request (function 16), at a steady rate of 10 per second or more.
+All {holding.ODOMETRY.words} registers in one request (function 16), at a steady rate of 10 per second or more. Over UDP
+the reading's time is the kernel's time of arrival less `age`; over TCP and on a serial line it is that of reading.
 
 {table(head, holding_rows(holding.ODOMETRY, holding.ODOMETRY_ADDRESS))}
 """

@@ -7,6 +7,7 @@ from typing import Final
 from daemon.publish import integrity, lights, registers, subscribe
 from daemon.publish.tables import NOT_KNOWN, NOTICE, layout_rows, table
 from hal import input_codec, inputs
+from hal.arrival import MAX_AGE_S
 
 
 def udp_page() -> str:
@@ -73,7 +74,7 @@ CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
   at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored
   and counted.
 * The time of a reading is the kernel's time of arrival. A sender on the same computer does better: it sets bit 0 of
-  `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {inputs.MAX_AGE_S:g} s old is not
+  `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {MAX_AGE_S:g} s old is not
   believed.
 * Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped and counted.
 """

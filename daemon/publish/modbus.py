@@ -29,6 +29,7 @@ from daemon.publish.pulse import encode_pulse
 from daemon.publish.requests import MAX_FRAME, Responder, frame_size
 from daemon.publish.snapshot import Snapshot, State
 from hal import inet
+from hal.arrival import STAMP_SPACE, kernel_age, stamp_arrivals
 from hal.clock import Clock
 from hal.inputs import Continuity
 from hal.odometry import RawOdometry
@@ -77,8 +78,13 @@ class UdpEndpoint:
         counts: Counts,
         allowed: Allowed = everyone,
         share: Share | None = None,
+        on_age: Callable[[float], None] | None = None,
     ) -> None:
+        """``on_age``: told before each request how long ago the kernel received it, and 0 after the last."""
         self._sock = sock
+        self._on_age = on_age
+        if on_age is not None:
+            stamp_arrivals(sock)
         self._allowed = allowed
         self._responder = responder
         self._counts = counts
@@ -90,9 +96,18 @@ class UdpEndpoint:
         self._sock.close()
 
     def _serve(self) -> None:
+        self._serve_some()
+        if self._on_age is not None:
+            self._on_age(0.0)
+
+    def _serve_some(self) -> None:
         for _ in range(UDP_PER_TURN):
             try:
-                frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
+                if self._on_age is None:
+                    frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
+                else:
+                    frame, stamp, _, peer = self._sock.recvmsg(MAX_FRAME + 1, STAMP_SPACE)
+                    self._on_age(kernel_age(stamp))
             except OSError:  # nothing more, or the network's complaint about an earlier answer
                 return
             if not self._allowed(peer[0]):
@@ -320,6 +335,7 @@ class ModbusPublisher:
         self._holding = Holding(on_command, self._take_odometry, on_loop_seen) if write else None
         self._responder = Responder(self._holding)
         self._share = Share()
+        self._age_s = 0.0  # of the datagram that is being answered
         self._udp: list[UdpEndpoint] = []
         self._tcp: TcpEndpoint | None = None
         self.counts = Counts()
@@ -360,7 +376,8 @@ class ModbusPublisher:
             undo.callback(datagrams.close)
             datagrams.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
             await tcp.listen(stream)
-            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts, self._allowed, self._share))
+            on_age = None if self._holding is None else self._received_before
+            self._udp.append(UdpEndpoint(datagrams, self._responder, self.counts, self._allowed, self._share, on_age))
             undo.pop_all()
 
     def publish(self, snapshot: Snapshot) -> None:
@@ -382,8 +399,11 @@ class ModbusPublisher:
         if tcp is not None:
             await tcp.close()
 
+    def _received_before(self, age_s: float) -> None:
+        self._age_s = age_s
+
     def _take_odometry(self, written: WrittenOdometry) -> None:
-        t_rx = self._clock.now()
+        t_rx = self._clock.now() - self._age_s
         if written.restarted:
             self._continuity.restart()
         x, y, yaw = self._continuity.follow(written.x, written.y, written.yaw)

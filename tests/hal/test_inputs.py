@@ -282,16 +282,16 @@ def test_two_sources_that_cannot_listen_both_say_so(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_kernel_stamp_from_before_a_clock_step_is_not_believed() -> None:
-    from hal.inputs import _SO_TIMESTAMPNS, _kernel_age
+    from hal.arrival import _SO_TIMESTAMPNS, kernel_age
 
     def stamp(age: float) -> list[tuple[int, int, bytes]]:
         ns = time.clock_gettime_ns(time.CLOCK_REALTIME) - int(age * 1e9)
         return [(socket.SOL_SOCKET, _SO_TIMESTAMPNS, struct.pack("@ll", ns // 10**9, ns % 10**9))]
 
-    assert _kernel_age(stamp(0.25)) == pytest.approx(0.25, abs=0.1)
-    assert _kernel_age(stamp(-5.0)) == 0.0
-    assert _kernel_age(stamp(3600.0)) == 0.0
-    assert _kernel_age([]) == 0.0
+    assert kernel_age(stamp(0.25)) == pytest.approx(0.25, abs=0.1)
+    assert kernel_age(stamp(-5.0)) == 0.0
+    assert kernel_age(stamp(3600.0)) == 0.0
+    assert kernel_age([]) == 0.0
 
 
 def test_a_port_in_use_is_refused_with_a_remedy() -> None:

@@ -32,6 +32,7 @@ from tools.figures import Figure, bounded
 COMMAND: Final = "python -m tools.bench modbus_load"
 CLIENTS: Final = 8
 READS: Final = 100_000
+FLOODS: Final = ("UDP", "rubbish", "TCP", "connections")
 ROUNDS: Final = 6
 ROUND_S: Final = 5.0
 _PERIOD_S: Final = 0.025
@@ -133,7 +134,10 @@ def reads(port: int, total: int) -> tuple[int, int, float]:
 
 
 def flood(port: int, kind: str) -> None:
-    """Send as fast as this process can, for ever: whole requests or rubbish by UDP, or pipelined requests by TCP."""
+    """As fast as this process can, for ever: whole requests or rubbish by UDP, pipelined by TCP, or new connections."""
+    while kind == "connections":
+        with suppress(OSError):
+            connected(port, socket.SOCK_STREAM).close()
     if kind == "TCP":
         socks = [connected(port, socket.SOCK_STREAM) for _ in range(CLIENTS)]
         data = b"".join(request(number) for number in range(100))
@@ -182,7 +186,7 @@ def run() -> list[Figure]:
         figures.append(bounded("answers to another's or an earlier request", wrong, "", "<= 0", COMMAND))
         figures.append(bounded("reads per second", rate, "1/s", ">= 5000", COMMAND))
         scheduling = "SCHED_FIFO" if fifo else "ordinary scheduling"
-        for kind in ("UDP", "rubbish", "TCP"):
+        for kind in FLOODS:
             quiet, busy, ticks = added(port, late, kind)
             name = f"lateness p99, {scheduling}, {ticks} ticks"
             figures.append(Figure(f"{name}, no flood", quiet, "ms", command=COMMAND))

@@ -12,6 +12,7 @@ from typing import Any
 from daemon.publish import modbus
 from daemon.publish.modbus import ModbusPublisher
 from hal.clock import SystemClock
+from hal.errors import DeviceRefused
 from tests.daemon.publish.test_registers import snapshot
 
 PATIENCE_S = 5.0
@@ -22,7 +23,14 @@ BLOCK = (4, 0, 64)
 async def publishing(**options: Any) -> AsyncIterator[ModbusPublisher]:
     """A publisher on a free loopback port that shows a snapshot."""
     publisher = ModbusPublisher(SystemClock(), **options)
-    await publisher.start("127.0.0.1", 0)
+    for attempt in range(5):  # the free TCP port's number may be in use for UDP by another program
+        try:
+            await publisher.start("127.0.0.1", 0)
+        except DeviceRefused:
+            if attempt == 4:
+                raise
+        else:
+            break
     publisher.publish(snapshot())
     try:
         yield publisher

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -238,3 +240,30 @@ def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> N
 
     asyncio.run(run())
     assert 0 < max(per_turn) <= 64
+
+
+def test_odometry_over_udp_has_the_kernels_time_of_arrival() -> None:
+    """The loop is held up for 0.2 s with the datagram in the socket; a write by TCP afterwards is of now."""
+    readings: list[RawOdometry] = []
+
+    def body(number: int) -> bytes:
+        return struct.pack(">BHHBHHiii", 16, 1100, 8, 16, number, 0, 10_000, 0, 0)
+
+    async def run() -> tuple[float, float]:
+        async with publishing(write=True, on_odometry=readings.append) as publisher:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+                sock.connect(("127.0.0.1", publisher.port))
+                for number in (1, 2):
+                    sock.send(struct.pack(">HHHB", number, 0, 1 + len(body(number)), 1) + body(number))
+                sent = time.monotonic()
+                time.sleep(0.2)  # noqa: ASYNC251  # the loop is to be late
+                await until(lambda: len(readings) == 2)
+            asked = time.monotonic()
+            async with tcp_client(publisher.port) as (reader, writer):
+                writer.write(struct.pack(">HHHB", 3, 0, 1 + len(body(3)), 1) + body(3))
+                await read_answer(reader)
+            return sent, asked
+
+    sent, asked = asyncio.run(run())
+    assert [reading.t_mono for reading in readings[:2]] == pytest.approx([sent, sent], abs=0.1)
+    assert readings[2].t_rx >= asked

@@ -25,6 +25,7 @@ from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.port import MemoryPort, memory_pair
 from tests.daemon.publish.network import publishing
 from tests.daemon.publish.test_registers import snapshot
+from tools.clients import read_rtu
 
 READ = struct.pack(">BHH", 4, 0, 64)
 UNIT = 17
@@ -126,6 +127,39 @@ def test_a_block_over_a_pseudo_terminal() -> None:
             assert (server.requests, server.unsent) == (6, 0)
 
     asyncio.run(run())
+
+
+def test_the_reference_client_reads_the_line() -> None:
+    """Between them a second pair of pseudo-terminals, joined byte by byte."""
+
+    def read(name: str, unit: int) -> dict[str, float | int | str | None]:
+        reader = read_rtu.Line(name, 115200, unit)
+        try:
+            return reader.read(5.0 if unit == UNIT else 0.1)
+        finally:
+            reader.close()
+
+    async def run() -> dict[str, float | int | str | None]:
+        joint, theirs = os.openpty()
+        tty.setraw(joint)
+        loop = asyncio.get_running_loop()
+        async with line() as (ours, _, _, _):
+            loop.add_reader(ours, lambda: os.write(joint, os.read(ours, 4096)))
+            loop.add_reader(joint, lambda: os.write(ours, os.read(joint, 4096)))
+            try:
+                with pytest.raises(TimeoutError):
+                    await asyncio.to_thread(read, os.ttyname(theirs), UNIT + 1)
+                return await asyncio.to_thread(read, os.ttyname(theirs), UNIT)
+            finally:
+                loop.remove_reader(ours)
+                loop.remove_reader(joint)
+                os.close(joint)
+                os.close(theirs)
+
+    assert asyncio.run(run()) == {
+        "seq": 70_000, "state": "TRACKING", "reason": 7, "fault": 9, "flags": 0b10111 | 1 << 5,
+        "x": 1.2345, "y": -2.3456, "yaw": 3.0,
+    }  # fmt: skip
 
 
 class Line:
