@@ -9,7 +9,7 @@ import shutil
 import struct
 import subprocess
 import tty
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 from hypothesis import given
@@ -106,6 +106,24 @@ async def line(baud: int = 115200) -> AsyncIterator[tuple[int, str, RtuServer, M
         os.close(ours)
 
 
+@contextlib.contextmanager
+def joined(ours: int) -> Iterator[str]:
+    """A second pseudo-terminal for a program, joined with the server's by the loop: its name."""
+    joint, theirs = os.openpty()
+    tty.setraw(theirs)
+    tty.setraw(joint)
+    loop = asyncio.get_running_loop()
+    loop.add_reader(ours, lambda: os.write(joint, os.read(ours, 4096)))
+    loop.add_reader(joint, lambda: os.write(ours, os.read(joint, 4096)))
+    try:
+        yield os.ttyname(theirs)
+    finally:
+        loop.remove_reader(ours)
+        loop.remove_reader(joint)
+        os.close(joint)
+        os.close(theirs)
+
+
 async def answer(ours: int, size: int) -> bytes:
     """So many bytes from the line; fails when they do not come."""
     got = b""
@@ -140,21 +158,11 @@ def test_the_reference_client_reads_the_line() -> None:
             reader.close()
 
     async def run() -> dict[str, float | int | str | None]:
-        joint, theirs = os.openpty()
-        tty.setraw(joint)
-        loop = asyncio.get_running_loop()
         async with line() as (ours, _, _, _):
-            loop.add_reader(ours, lambda: os.write(joint, os.read(ours, 4096)))
-            loop.add_reader(joint, lambda: os.write(ours, os.read(joint, 4096)))
-            try:
+            with joined(ours) as name:
                 with pytest.raises(TimeoutError):
-                    await asyncio.to_thread(read, os.ttyname(theirs), UNIT + 1)
-                return await asyncio.to_thread(read, os.ttyname(theirs), UNIT)
-            finally:
-                loop.remove_reader(ours)
-                loop.remove_reader(joint)
-                os.close(joint)
-                os.close(theirs)
+                    await asyncio.to_thread(read, name, UNIT + 1)
+                return await asyncio.to_thread(read, name, UNIT)
 
     assert asyncio.run(run()) == {
         "seq": 70_000, "state": "TRACKING", "reason": 7, "fault": 9, "flags": 0b10111 | 1 << 5,
@@ -288,7 +296,7 @@ def polled(*options: str) -> list[int]:
     """What mbpoll reads of registers 0 to 3: values behind their numbers, `[1]: 	19532`."""
     assert MBPOLL is not None
     command = [MBPOLL, "-0", "-r", "0", "-c", "4", "-t", "3", "-1", *options]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [row for row in done.stdout.splitlines() if row.startswith("[")]
     return [int(row.split(":")[1].split("(")[0]) for row in rows]
@@ -302,36 +310,9 @@ def test_mbpoll_reads_tcp_and_rtu() -> None:
     async def run() -> tuple[list[int], list[int]]:
         async with publishing() as publisher:
             tcp = await asyncio.to_thread(polled, "-m", "tcp", "-p", str(publisher.port), "127.0.0.1")
-        async with line() as (ours, _, server, _):
-            rtu_words = await asyncio.to_thread(through, ours, server)
-        return tcp, rtu_words
-
-    def through(ours: int, server: RtuServer) -> list[int]:
-        """A second pseudo-terminal for mbpoll, joined with the server's."""
-        joint, theirs = os.openpty()
-        tty.setraw(theirs)
-        tty.setraw(joint)
-        pump = subprocess.Popen(
-            ["python3", "-c", PUMP.format(ours, joint)], pass_fds=(ours, joint), stdout=subprocess.PIPE
-        )
-        try:
-            assert pump.stdout is not None
-            pump.stdout.readline()
-            return polled("-m", "rtu", "-a", str(UNIT), "-b", "115200", "-P", "none", os.ttyname(theirs))
-        finally:
-            pump.kill()
-            pump.communicate()
-            os.close(joint)
-            os.close(theirs)
+        async with line() as (ours, _, _, _):
+            with joined(ours) as name:
+                options = ("-m", "rtu", "-a", str(UNIT), "-b", "115200", "-P", "none", name)
+                return tcp, await asyncio.to_thread(polled, *options)
 
     assert asyncio.run(run()) == (words, words)
-
-
-PUMP = """
-import os, select
-a, b = {}, {}
-print("on", flush=True)
-while True:
-    for ready in select.select([a, b], [], [])[0]:
-        os.write(b if ready == a else a, os.read(ready, 4096))
-"""
