@@ -90,6 +90,12 @@ def read(path: Path) -> Remembered | None:
     return max((slot for slot in slots if slot is not None), key=lambda slot: slot.number, default=None)
 
 
+def _may_write(folder: Path) -> bool:
+    """Whether files can be made in a folder, or where it is to be made."""
+    there = next((one for one in (folder, *folder.parents) if one.exists()), folder)
+    return os.access(there, os.W_OK)
+
+
 class LastPose:
     """Keeps the pose of a running daemon; :meth:`take` is a sink of the cycle.
 
@@ -98,9 +104,14 @@ class LastPose:
         busy_since: when the write began that has not ended yet (`time.monotonic`), None: there is none.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Read what is there; nothing is written before :meth:`start`."""
-        self.path = folder / FILE
+    def __init__(self, folder: Path, otherwise: Path | None = None) -> None:
+        """Read what is there; nothing is written before :meth:`start`.
+
+        Args:
+            folder: of the maps.
+            otherwise: where it is kept if nothing may be written there.
+        """
+        self.path = (folder if otherwise is None or _may_write(folder) else otherwise) / FILE
         self.before = read(self.path)
         self.error = ""
         self.busy_since: float | None = None

@@ -39,7 +39,7 @@ from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
 from daemon.realtime import claim, line_up
-from daemon.sampleclock import SampleClock, runtime_folder
+from daemon.sampleclock import SampleClock, runtime_folder, state_folder
 from daemon.stallwatch import StallWatch
 from daemon.store import NoMap, Start, folder_of, judge_for, started
 from daemon.store_keeper import About, Keeper
@@ -116,7 +116,7 @@ class Daemon:
         )
         self._estimator.lap = self.cycle.laps.lap
         self.keeper = self._keeper(settings, lights)
-        self.last_pose = None if world.store is None else LastPose(world.store.folder)
+        self.last_pose = None if world.store is None else LastPose(world.store.folder, state_folder())
         self.maps = self._map_switch(lights)
         self.pacemaker = Pacemaker(self.cycle)
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)

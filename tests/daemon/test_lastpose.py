@@ -109,3 +109,13 @@ def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, caplog: pytes
     (tmp_path / FILE).mkdir()
     assert LastPose(tmp_path).before is None
     assert "cannot be read" in caplog.text
+
+
+def test_where_maps_are_only_read_the_pose_is_kept_beside_what_else_is_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps, learned = tmp_path / "maps", tmp_path / "learned"
+    maps.mkdir()
+    monkeypatch.setattr("daemon.lastpose.os.access", lambda path, mode: path != maps)  # who tests may be root
+    assert LastPose(maps, learned).path == learned / FILE
+    assert LastPose(tmp_path / "other", learned).path == tmp_path / "other" / FILE

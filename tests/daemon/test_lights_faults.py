@@ -10,7 +10,9 @@ import pytest
 
 from daemon.health import FAULTS, Fault
 from daemon.publish.snapshot import State
+from estimator.cdma_profile import PROFILE_A
 from hal.fake.adc_faults import ERRORS
+from hal.fake.models import URG_04LX_UG01
 from tests.daemon.lightroom import CODES, CURRENTS_A
 from tests.daemon.test_lights import Bench, decoded, run_daemon
 
@@ -105,6 +107,20 @@ def test_with_a_lidar_the_pose_goes_on_and_says_what_is_missing() -> None:
             assert snapshot.links == 0 or snapshot.state is not State.TRACKING
 
     run_daemon(scenario, lidar=True)
+
+
+@pytest.mark.parametrize("order", ["what = 'off'", "what = 'hang'", "what = 'gone'"])
+@pytest.mark.parametrize("lidar", [True, False])
+def test_a_converter_that_falls_silent_is_shown_within_five_blocks(order: str, lidar: bool) -> None:
+    async def scenario(bench: Bench) -> None:
+        await bench.until(lambda snapshot: bool(snapshot.adc_ok) and snapshot.pose is not None, 6.0)
+        begun = bench.loop.time()
+        bench.order(order)
+        shown = await bench.until(lambda snapshot: snapshot.adc_ok is False, 2.0)
+        cycle = 1.5 * (URG_04LX_UG01.true_period_s if lidar else PROFILE_A.epoch_s)
+        assert shown.t_sent - begun <= 5.0 * PROFILE_A.epoch_s + cycle
+
+    run_daemon(scenario, lidar=lidar)
 
 
 def test_dark_and_dazzled_are_told_apart_by_a_dc_channel() -> None:

@@ -109,3 +109,33 @@ def test_who_is_carried_off_after_the_start_is_not_held_by_an_old_memory(floor: 
     robot, _ = stand(floor, HERE, HERE, 4)
     robot.at(HERE, Command(robot.t, Order.RELOCALISE))
     assert robot.state.atlas.seek.remembered is None
+
+
+def trial(seed: int) -> tuple[str, bool, float]:
+    """One building, one start: how the robot was treated, whether it was found, how far off it was told then."""
+    rng = np.random.default_rng(seed)
+    widths = rng.uniform(3.0, 5.0, 3) if seed % 2 else np.full(3, 4.0)
+    scene = furnished(widths, seed) if seed % 3 else rooms(widths)
+    doors = np.concatenate(([0.0], np.cumsum(widths)[:-1])) + 1.85
+    inside = [corner for x in doors for corner in ((x, 6.0), (x, 2.6), (x, 6.0))]
+    floor = scene, mapped(scene, ((1.0, 6.0), *inside, (sum(widths) - 1.2, 6.0)), seed)
+    room, into = int(rng.integers(3)), np.array((*rng.uniform(-0.3, 0.3, 2), rng.uniform(-np.pi, np.pi)))
+    here = np.array((doors[room], rng.choice([6.0, 3.0]), 0.0)) + into
+    how = ("left", "another room", "turned", "pushed")[seed // 6 % 4]
+    left = here.copy()
+    if how == "another room":
+        left[0] = doors[(room + 1) % 3] + into[0]
+    elif how == "turned":
+        left[2] += rng.choice([np.pi, np.pi / 2])
+    elif how == "pushed":
+        left[:2] += rng.uniform(0.4, 0.9) * np.array((np.cos(into[2]), np.sin(into[2])))
+    robot, said = stand(floor, here, left, 16)
+    return how, None in said, robot.off()[0]
+
+
+@pytest.mark.slow
+def test_whatever_the_building_nobody_is_believed_where_it_is_not() -> None:
+    tried = [trial(seed) for seed in range(48)]
+    assert all(off < 0.1 for _, found, off in tried if found)
+    left = [found for how, found, _ in tried if how == "left"]
+    assert sum(left) >= 0.7 * len(left)
