@@ -16,11 +16,13 @@ import pytest
 from daemon.budget import FixedBudget
 from daemon.config import Config, LidarConfig, ModbusConfig, OdometryConfig, PoseConfig
 from daemon.main import Daemon, World
-from daemon.publish import registers
+from daemon.network import Feeds, Network
+from daemon.publish import registers, subscribe
 from daemon.publish.holding import COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.publish.snapshot import Snapshot, State
+from daemon.reasons import Reason
 from daemon.worker import CycleWorker
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock, SystemClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX_UG01
 from hal.fake.transport import FakeOpener
@@ -194,3 +196,60 @@ def test_without_any_socket_the_daemon_runs_for_its_sinks() -> None:
         return bench.snapshots
 
     assert run_virtual(go())[-1].state is State.TRACKING
+
+
+def test_a_pause_leaves_the_pose_to_others_until_it_is_resumed() -> None:
+    port = free_port()
+
+    async def go() -> None:
+        bench = Bench(settings(modbus=ModbusConfig(port=port, write=True)))
+        with closing(Plc(port)) as plc:
+            await asyncio.sleep(3.0)
+            for number, code, reason in ((1, CommandCode.PAUSE, Reason.PAUSED), (2, CommandCode.RESUME, None)):
+                await outside(lambda number=number, code=code: plc.order(number, code, 0, 0, 0))  # type: ignore[misc]  # bound now
+                await asyncio.sleep(1.0)
+                assert await outside(plc.outcome) == (number, Outcome.DONE)
+                said = bench.snapshots[-1].state, bench.snapshots[-1].reason
+                assert (said == (State.DEGRADED, reason)) is (reason is not None)
+        await bench.end()
+
+    run_virtual(go())
+
+
+def test_who_subscribes_gets_poses_and_this_computer_always_may() -> None:
+    port = free_port()
+
+    async def answers(allow: tuple[str, ...]) -> int:
+        pose = PoseConfig(receivers=(f"*:{port}",))
+        bench = Bench(settings(modbus=ModbusConfig(port=0), pose=pose, allow=allow, bind="127.0.0.1"))
+        cookie = 0
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.connect(("127.0.0.1", port))
+            client.setblocking(False)
+            for _ in range(2):
+                await asyncio.sleep(0.5)
+                client.send(subscribe.encode(subscribe.Message(subscribe.Status.ASK, 30, cookie)))
+                await asyncio.sleep(0.01)
+                cookie = subscribe.decode(client.recv(24)).cookie
+            await asyncio.sleep(1.0)
+            seq = registers.decode_datagram(client.recv(2000))["seq"]
+        await bench.end()
+        return int(seq or 0)
+
+    assert run_virtual(answers(())) > 0
+    assert run_virtual(answers(("10.0.0.0/8",))) > 0, "this computer always is"
+
+
+def test_each_form_of_publishing_is_a_part_of_its_own() -> None:
+    def parts(**more: object) -> tuple[set[str], Network]:
+        feeds = Feeds(lambda _: None, lambda _: None, lambda _: None, lambda _: None)
+        network = Network(settings(**more), SystemClock(), feeds)
+        return set(network.parts), network
+
+    serial = ModbusConfig(port=0, serial="/dev/ttyUSB1@115200#3")
+    names, network = parts(modbus=serial, pose=PoseConfig(receivers=("*:5601", "127.0.0.1:9")))
+    assert names == {"modbus serial", "pose", "pose subscriptions"}
+    assert network.modbus is not None
+    assert len(network.sinks) == 3
+    assert parts(modbus=ModbusConfig(port=0))[0] == set()
+    assert parts()[0] == {"modbus"}
