@@ -235,7 +235,8 @@ def plant(root: Path) -> None:
     processor; the folder is the only one of these that differs.
     """
     environment = {**ENVIRONMENT, "PYTHONPATH": str(ROOT)}
-    _do([sys.executable, "-m", "daemon", "warm", "--config", str(GUEST / "lumiloop.toml")], "compiling", environment)
+    warm = [sys.executable, "-m", "daemon", "warm", "--config", str(GUEST / "lumiloop.toml")]
+    _do([*warm, "--set", "photodiode.bus=adapter:bench"], "compiling kernels", environment)
     where = "from estimator.kernel import CACHE_DIR; print(CACHE_DIR)"
     compiled = Path(_do([sys.executable, "-c", where], "finding the kernels", environment).split()[-1])
     installed = next((root / "opt/lumiloop/lib").glob("python3*/site-packages/estimator"))

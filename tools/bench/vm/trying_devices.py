@@ -45,11 +45,15 @@ def comes_back_under_another_name(bench: Bench) -> str:
     """Another program holds the old device node, so that the lidar comes back as ttyACM1."""
     bench.machine.run("sh", "-c", "sleep 1000 < /dev/ttyACM0 > /dev/null 2>&1 & echo $! > /run/holder", check=False)
     bench.machine.run("sh", "-c", f"echo 1 > {PLUG}; sleep 2; echo 0 > {PLUG}")
-    bench.until("/dev/ttyACM1", 20.0, lambda: "ttyACM1" in bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar"))
+    bench.until("/dev/ttyACM1", 20.0, lambda: "ttyACM1" in _lidar_node(bench))
     said = back(bench, bench.memory["pid"])
     bench.machine.run("sh", "-c", f"kill $(cat /run/holder); echo 1 > {PLUG}; sleep 1", check=False)
     bench.machine.run("sh", "-c", f"echo 0 > {PLUG}")
     return f"found as ttyACM1: {said}; and again as ttyACM0: {back(bench, bench.memory['pid'])}"
+
+
+def _lidar_node(bench: Bench) -> str:
+    return bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar", check=False)
 
 
 @scenario

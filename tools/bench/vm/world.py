@@ -40,10 +40,9 @@ LAP_CORNERS = ((-2.6, -1.9), (2.4, -1.9), (2.4, 1.6), (-2.6, 1.6))
 
 
 def register() -> None:
-    """A lidar whose scans an emulated computer can keep up with: 180 deg, 361 beams, 10 Hz, on USB."""
-    MODELS[MODEL] = replace(
-        PAPER, modl="BENCH-180[180 degrees, 361 beams, 10 Hz]", ares=720, amax=360, afrt=180, rpm=600, true_period_s=0.1
-    )
+    """A lidar whose scans an emulated computer can keep up with: 180 deg, 181 beams, 5 Hz, on USB."""
+    modl = "BENCH-180[180 degrees, 181 beams, 5 Hz]"
+    MODELS[MODEL] = replace(PAPER, modl=modl, ares=360, amax=180, afrt=90, rpm=300, true_period_s=0.2)
 
 
 def room() -> Building:

@@ -27,6 +27,7 @@ from pathlib import Path
 PORTS = Path("/dev/virtio-ports")
 GADGET, WIRE = "/dev/ttyGS0", "/dev/fakei2c"
 PIECE = 4096
+PATIENCE_S = 0.2
 HEAD, MESSAGE = struct.Struct("=Ii"), struct.Struct("=HHHH")
 READ = 1
 ADAPTER_S = 1.0
@@ -53,8 +54,9 @@ def hand_over(source: int, sink: int) -> None:
         return
     if not data:
         raise OSError(errno.EIO, "hung up")
-    with contextlib.suppress(BlockingIOError):
-        os.write(sink, data)
+    while data and select.select([], [sink], [], PATIENCE_S)[1]:
+        with contextlib.suppress(BlockingIOError):
+            data = data[os.write(sink, data) :]
 
 
 def carry_lidar() -> None:
