@@ -126,7 +126,17 @@ class BlackBox:
         self._cycle, self._state, self._faults = cycle, state, faults
 
     def on_cycle(self, record: CycleRecord) -> None:
-        """A cycle has ended and is recorded; nothing that comes from now on belongs to it."""
+        """A cycle has ended and is recorded; nothing that comes from now on belongs to it. Never raises."""
+        try:
+            self._look(record)
+        except Exception as error:  # a defect in here must not end the cycle; it is a fault, and told in full
+            if not self.error:
+                log.exception("the flight recorder has failed")
+            self.error = repr(error)
+            self._due = record.t_mono + RETRY_S
+
+    def _look(self, record: CycleRecord) -> None:
+        """Follow the jobs and the faults; take a state, or make a dump, where it is due."""
         self._follow_jobs(record)
         now = record.t_mono
         if record.cycle == 1:

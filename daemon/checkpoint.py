@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import io
 import pickle
-import sys
 import types
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
+from importlib import import_module
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 from weakref import WeakSet
@@ -39,6 +39,8 @@ WHOLE: Final = (Survey, ResidualMap, np.ndarray)
 """Pieces that refer to nothing else."""
 FIXED: Final = (Keyframe, Settled, Patch)
 """Pieces that refer to others; they never change once something refers to them."""
+ESTIMATOR: Final = "estimator."
+"""Numbers only: nothing in there knows the operating system."""
 ROOT: Final = -1
 """Number of the piece with all that is small."""
 
@@ -257,7 +259,9 @@ def _function(
     module: str, qualname: str, line: int, held: tuple[object, ...], defaults: tuple[object, ...] | None
 ) -> types.FunctionType:
     """A function within another one, with what it holds."""
-    space = sys.modules[module].__dict__
+    if not module.startswith(ESTIMATOR):
+        raise CannotRestore(f"{module}.{qualname} does not belong into a state")
+    space = import_module(module).__dict__
     outer = space.get(qualname.partition(".<locals>")[0].partition(".")[0])
     code = _code(outer, qualname, line)
     if code is None or len(code.co_freevars) != len(held):
@@ -280,7 +284,17 @@ def _code(within: object, qualname: str, line: int) -> types.CodeType | None:
     return next((code for one in inside if (code := _code(one, qualname, line)) is not None), None)
 
 
-OURS: Final = ("estimator.", "daemon.", "hal.")
+PARTS: Final = frozenset(
+    (
+        *(
+            f"daemon.{name}"
+            for name in ("alarm", "bridge", "evidence", "health", "inbox", "lampwatch", "pace", "picture")
+        ),
+        *(f"daemon.{name}" for name in ("publish.snapshot", "reasons", "state", "state_evidence", "state_memory")),
+        *("daemon.witness", "hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),
+    )
+)
+"""Modules whose classes the cycle's memory consists of."""
 KNOWN: Final = {
     "builtins": {"set", "frozenset", "complex", "bytearray", "dict", "list", "object", "range", "slice"},
     "collections": {"deque", "Counter", "OrderedDict", "defaultdict"},
@@ -293,6 +307,9 @@ KNOWN: Final = {
 }
 """What may be made besides classes of our own and functions of the estimator: a dump may come from anywhere."""
 HERE: Final = {one.__name__: one for one in (_weak, _blank, _fill, _function)}
+
+
+_MADE: Final = (type, types.FunctionType)
 
 
 class _Reader(pickle.Unpickler):
@@ -308,9 +325,9 @@ class _Reader(pickle.Unpickler):
             return self._piece if name == "_piece" else HERE[name]
         if name in KNOWN.get(module, ()):
             return super().find_class(module, name)
-        if module.startswith(OURS) or module == "estimator":
+        if (module in PARTS or module.startswith(ESTIMATOR)) and "." not in name:
             found = super().find_class(module, name)
-            if isinstance(found, type) or module.startswith("estimator."):
+            if found.__module__ == module and isinstance(found, _MADE if module.startswith(ESTIMATOR) else type):
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} does not belong into a state")
 

@@ -55,6 +55,8 @@ class Span:
 def main(args: argparse.Namespace) -> int:
     """The command's body; ``args``: the ``time`` as it was typed, ``log`` or None, where to draw (``out``) or None."""
     folder = args.log or state_folder() / FLIGHT
+    if args.log is None and not folder.is_dir():
+        return cli.fail(f"nothing is recorded in {folder}; name a recording, or run with --record {folder} --last 10")
     try:
         span, utc = find(spans(folder), args.time, folder)
         told, rerun = moments(span, utc)

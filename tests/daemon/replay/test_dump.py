@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
-from daemon import blackbox, cli, disk
+from daemon import blackbox, checkpoint, cli, disk
 from daemon.checkpoint import ROOT, CannotRestore, Piece, restore
 from daemon.config import Config
 from daemon.disk import SegmentWriter
 from daemon.flight import ABOUT, DUMP, Flight
+from daemon.health import Fault
 from daemon.replay import replay
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
@@ -170,12 +171,42 @@ def test_a_ring_whose_run_was_killed_is_kept_as_a_dump_and_one_that_ended_goes(t
     assert frame.payload == b"abc"
 
 
-@pytest.mark.parametrize("name", ["os.system", "subprocess.Popen", "daemon.cli.main", "builtins.eval"])
-def test_a_state_makes_nothing_but_what_a_state_consists_of(name: str) -> None:
-    module, _, function = name.rpartition(".")
-    content = f"c{module}\n{function}\n(S'true'\ntR.".encode()
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("os", "system"),
+        ("subprocess", "Popen"),
+        ("builtins", "eval"),
+        ("daemon.cli", "main"),
+        ("daemon.disk", "SegmentWriter"),
+        ("daemon.bridge", "re"),
+        ("estimator.records", "np"),
+        ("estimator.records", "np.ctypeslib.os.system"),
+    ],
+)
+def test_a_state_makes_nothing_but_what_a_state_consists_of(module: str, name: str) -> None:
+    content = b"\x80\x04" + f"c{module}\n{name}\n(S'true'\ntR.".encode()
     with pytest.raises(CannotRestore, match="does not belong"):
         restore(iter([Piece(ROOT, "", content)]))
+
+
+def test_a_state_takes_no_functions_from_elsewhere() -> None:
+    with pytest.raises(CannotRestore, match="does not belong"):
+        checkpoint._function("os", "popen.<locals>.x", 1, (), None)
+
+
+def test_a_defect_of_the_flight_recorder_is_a_fault_and_the_cycle_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: object) -> None:
+        raise KeyError("a defect")
+
+    monkeypatch.setattr(checkpoint, "take", broken)
+    bench = record(tmp_path / "rec", long)
+    assert bench.snapshots[-1].pose is not None
+    assert bench.recorder.failing == {"flight recorder"}
+    assert bench.snapshots[-1].fault == Fault.FLIGHT_RECORDER_FAILED
+    assert caplog.text.count("the flight recorder has failed") == 1
 
 
 def test_a_damaged_state_is_told_and_named(tmp_path: Path) -> None:
