@@ -44,7 +44,7 @@ UNASKED: Final = 16
 """Jobs that the estimator waits for no longer, but that may still answer."""
 CYCLE_PARTS: Final = (
     "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
-    "alarm", "trust", "inbox", "paused",
+    "alarm", "trust", "inbox", "paused", "watch", "_used",
 )  # fmt: skip
 """What a cycle remembers."""
 QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
@@ -52,38 +52,54 @@ QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
 
 
 class Line:
-    """What a lidar's line has said that whoever joins later must know: how it was opened, and the latest scans."""
+    """What a lidar's line has said that whoever joins later must know: how it was opened, and the latest scans.
+
+    A piece of bytes may end a scan, several of them, or none: the last three that end some are kept, with all since.
+    """
 
     OPENING_BYTES: Final = 64 << 10
-    SCAN_BYTES: Final = 256 << 10
+    LATEST_BYTES: Final = 512 << 10
+    ENDS: Final = 3
 
     def __init__(self) -> None:
         self._opening: list[bytes] = []
-        self._scans: deque[list[bytes]] = deque(maxlen=3)
-        self._opening_bytes = self._scan_bytes = 0
+        self._latest: deque[tuple[bytes, bool]] = deque()  # frames, and whether a scan has ended with them
+        self._streaming = False
+        self._ends = self._opening_bytes = self._latest_bytes = 0
 
     def passed(self, kind: Kind, t_mono: float, payload: bytes) -> None:
         """Something passed through the port."""
         frame = pack_frame(kind, 0, t_mono, payload)
         if kind in (Kind.OPEN, Kind.LOST):
-            self._opening, self._opening_bytes = [], 0
-            self._scans.clear()
-        if self._scans:
-            self._scan_bytes += len(frame)
-            if self._scan_bytes <= self.SCAN_BYTES:
-                self._scans[-1].append(frame)
+            self._opening, self._streaming = [], False
+            self._latest.clear()
+            self._ends = self._opening_bytes = self._latest_bytes = 0
+        if self._streaming:
+            self._latest.append((frame, False))
+            self._latest_bytes += len(frame)
+            while self._latest_bytes > self.LATEST_BYTES:
+                self._drop()
         elif self._opening_bytes + len(frame) <= self.OPENING_BYTES:
             self._opening.append(frame)
             self._opening_bytes += len(frame)
 
     def scan(self) -> None:
-        """A scan was complete."""
-        self._scans.append([])
-        self._scan_bytes = 0
+        """A scan was complete with what has just passed."""
+        self._streaming = True
+        if self._latest and not self._latest[-1][1]:
+            self._latest[-1] = self._latest[-1][0], True
+            self._ends += 1
+            while self._ends > self.ENDS or not self._latest[0][1]:
+                self._drop()
+
+    def _drop(self) -> None:
+        frame, ended = self._latest.popleft()
+        self._latest_bytes -= len(frame)
+        self._ends -= ended
 
     def said(self) -> bytes:
         """All of it, as records."""
-        return b"".join((*self._opening, *(frame for scan in self._scans for frame in scan)))
+        return b"".join((*self._opening, *(frame for frame, _ in self._latest)))
 
 
 class BlackBox:

@@ -291,7 +291,7 @@ PARTS: Final = frozenset(
             for name in ("alarm", "bridge", "evidence", "health", "inbox", "lampwatch", "pace", "picture")
         ),
         *(f"daemon.{name}" for name in ("publish.snapshot", "reasons", "state", "state_evidence", "state_memory")),
-        *("daemon.witness", "hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),
+        *("daemon.watch", "daemon.witness", "hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),
     )
 )
 """Modules whose classes the cycle's memory consists of."""
@@ -327,7 +327,9 @@ class _Reader(pickle.Unpickler):
             return super().find_class(module, name)
         if (module in PARTS or module.startswith(ESTIMATOR)) and "." not in name:
             found = super().find_class(module, name)
-            if found.__module__ == module and isinstance(found, _MADE if module.startswith(ESTIMATOR) else type):
+            if getattr(found, "__module__", "") == module and isinstance(
+                found, _MADE if module.startswith(ESTIMATOR) else type
+            ):
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} does not belong into a state")
 

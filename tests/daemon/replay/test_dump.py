@@ -19,7 +19,7 @@ from daemon.health import Fault
 from daemon.replay import replay
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
-from hal.replay.recording import Kind, open_recording
+from hal.replay.recording import Kind, frames_in, open_recording
 from hal.replay.report import LogReport
 from tests.daemon.replay.test_recorded_lights import Recorded
 from tests.daemon.replay.test_recorded_lights import record as record_lit
@@ -143,13 +143,31 @@ def test_with_lights(tmp_path: Path) -> None:
     assert compared["cycles"] > 10
 
 
+@pytest.mark.parametrize("scans", [1, 2, 5])
+def test_who_joins_a_line_hears_the_last_pieces_that_ended_scans_whole(scans: int) -> None:
+    """A piece may hold several scans, and the beginning of the next."""
+    line = blackbox.Line()
+    line.passed(Kind.OPEN, 0.0, b"port")
+    line.passed(Kind.RX, 0.0, b"PP")
+    for number in range(10):
+        line.passed(Kind.RX, float(number), b"middle")
+        line.passed(Kind.RX, number + 0.5, b"end, and the next begins")
+        for _ in range(scans):
+            line.scan()
+    line.passed(Kind.RX, 10.0, b"more")
+    said = [(frame.t_mono, frame.payload) for frame in frames_in(line.said())]
+    assert said[:2] == [(0.0, b"port"), (0.0, b"PP")]
+    assert [t for t, _ in said][-6:] == [7.5, 8.0, 8.5, 9.0, 9.5, 10.0]
+    assert len(said) <= 11, "and the first scan, with which the opening ends"
+
+
 def test_everything_that_a_cycle_remembers_is_kept_or_left_out_on_purpose() -> None:
     async def cycle() -> set[str]:
         bench = Bench(Path(tempfile.mkdtemp()))
         bench.recorder.close()
         return set(vars(bench.daemon.cycle))
 
-    left_out = {"parts", "cycle_us", "failing", "_switch", "_switched", "_held"}  # held answers: their jobs are kept
+    left_out = {"parts", "cycle_us", "failing", "laps", "taker", "_switch", "_switched", "_held"}  # their jobs are kept
     assert run_virtual(cycle()) == {*blackbox.CYCLE_PARTS, *left_out}
 
 
