@@ -19,14 +19,14 @@ from typing import Any, Final
 
 from daemon import configfile, store_file
 from daemon.health import FAULTS
-from daemon.publish import holding, integrity, lights, pulse, registers, snapshot, stream, subscribe
+from daemon.publish import holding, integrity, lights, parts, pulse, registers, snapshot, stream, subscribe
 from daemon.publish.points import Layout
 from daemon.reasons import REASONS
 from hal import input_codec
 from hal.replay import recording
 
 FROZEN: Final = Path(__file__).parent.parent / "tests" / "daemon" / "publish" / "frozen" / "release.json"
-ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason")
+ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason", "Part", "Thread")
 
 Items = dict[str, str]
 Contracts = dict[str, dict[str, Any]]
@@ -40,6 +40,7 @@ def contracts() -> Contracts:
         "modbus lights": _contract(lights.VERSION, _points("register", lights.BLOCK, lights.BODY_ADDRESS)),
         "modbus integrity": _contract(integrity.VERSION, _points("register", integrity.BLOCK, integrity.BODY_ADDRESS)),
         "modbus cycle": _contract(pulse.VERSION, _points("register", pulse.BLOCK, pulse.BODY_ADDRESS)),
+        "modbus parts": _contract(parts.VERSION, _points("register", parts.BLOCK, parts.BODY_ADDRESS)),
         "modbus holding": _contract(0, _holding_registers()),
         "numbers": _contract(0, _numbers()),
         "pose datagram": _contract(registers.VERSION, _datagram()),
