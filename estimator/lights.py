@@ -234,9 +234,9 @@ def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array) -> floa
         return 0.0
     out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
     ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
-    judge(lights, track, kept, out)
+    likelihood = judge(lights, track, kept, out)
     x0, P0 = track.x.copy(), track.P.copy()
-    likelihood = ekf_links.absorb(track.x, track.P, track.n, x0, links, out)
+    likelihood += ekf_links.absorb(track.x, track.P, track.n, x0, links, out)
     around = x0
     for _ in range(ITERATIONS):
         step = track.x[:3] - around[:3]

@@ -209,12 +209,17 @@ def view_of(lights: Lights, back: Array) -> Array:
     return np.concatenate([rx, back, (model.ln, model.floor, model.white, model.edge)])
 
 
-def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> None:
+def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> float:
     """Decide on every link; what is not to be used gets an infinite noise, what may be an outlier a larger one.
 
     Gating waits until the place is known well; before, a deviation is held against the link only softly, because it
-    may as well be the place or a gain that is wrong.
+    may as well be the place or a gain that is wrong. A lamp that something hides would pull at the place twenty times a
+    second, though, and a robot that stands would be led to where it fits: it only counts against the hypothesis.
+
+    Returns:
+        ln of the likelihood of the links that are left out.
     """
+    likelihood = 0.0
     half, rim = lights.survey.receiver.half_fov_rad, lights.settings.rim_rad
     cos_rim, cos_out = math.cos(max(half - rim, 0.1)), math.cos(half + rim)
     gating = settled(track) and len(lights.tracks) == 1  # hypotheses are compared by the same links
@@ -227,10 +232,26 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> None:
         elif gating:
             sight.state = gate(lights, track, sight)
         elif r * r > 4.0 * S:
-            out[i, ekf_links.WHITE] += 0.25 * r * r - S
+            soft = 0.25 * r * r
+            out[i, ekf_links.WHITE] += soft - S
+            if weak(lights, sight):
+                likelihood -= 0.5 * (4.0 + math.log(soft) + ekf_links.LOG_2PI)
+                sight.state = OCCLUDED
         if sight.state is not ACCEPTED:
             out[i, ekf_links.WHITE] = math.inf
     shorten(lights, kept, out)
+    return likelihood
+
+
+def weak(lights: Lights, sight: Sight) -> bool:
+    """Whether a link is weaker than its lamp is anywhere in view, so that something hides it, wherever the receiver is.
+
+    Without wheels nothing holds a wrong hypothesis but such links: there they go on pulling.
+    """
+    if sight.lamp is None or not lights.course.wheels:
+        return False
+    gain = math.exp(float(remembered(lights, sight.lamp)[0][0]))
+    return sight.amplitude < DIFFUSE * gain * lights.catalogue.rims[sight.lamp.lamp_id]
 
 
 def rim_of(lights: Lights, track: Track, sight: Sight) -> float:

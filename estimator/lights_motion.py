@@ -47,9 +47,10 @@ def on_odometry(lights: Lights, record: Odometry) -> None:
     made = se2.between(course.ahead, delta) if follows else rest(delta, record, course.t_mono)
     way, turn = abs(float(made[0])), 0.0 if by_gyro else abs(float(made[2]))
     idle = min(max(dt, 0.0), CARRY_S)
+    skid = noise.skid**2 * abs(float(made[2]))
     q = (
-        noise.slip**2 * way + noise.idle_m**2 * idle,
-        noise.side**2 * way + noise.idle_m**2 * idle,
+        noise.slip**2 * way + skid + noise.idle_m**2 * idle,
+        noise.side**2 * way + skid + noise.idle_m**2 * idle,
         noise.turn**2 * turn + (0.0 if by_gyro else noise.wander**2 * way) + noise.idle_rad**2 * idle,
     )
     blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else made[2], 0.0 if by_gyro else made[0], 0.0, 1.0)

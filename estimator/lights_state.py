@@ -44,6 +44,7 @@ class MotionErrors:
 
     Attributes:
         slip, side: m per root metre, along and across. turn: rad per root radian. wander: rad per root metre.
+        skid: m per root radian turned: where a robot turns about, and where its photodiode sits, is known to centimetres.
         idle_m, idle_rad: per root second.
         scale, turn_scale: share of the way and of the turn that wheels may be off for good. curve: rad per metre.
         gyro: rad per root second. gyro_bias: rad/s.
@@ -53,13 +54,14 @@ class MotionErrors:
 
     slip: float = 0.009
     side: float = 0.004
-    turn: float = 0.015
-    wander: float = 0.006
+    turn: float = 0.03
+    wander: float = 0.03
+    skid: float = 0.03
     idle_m: float = 0.0005
     idle_rad: float = 0.0005
-    scale: float = 0.02
+    scale: float = 0.04
     turn_scale: float = 0.03
-    curve: float = 0.01
+    curve: float = 0.05
     gyro: float = 0.001
     gyro_bias: float = 0.02
     acceleration: float = 0.4
