@@ -79,7 +79,8 @@ class Absolute:
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
         elsewhere_since: since when what is received does not fit the place.
-        way, way_young: driven so far, and when light last began to find the place.
+        way, way_young: driven so far, and when light last began to find the place. way_start: of the `lights` filter,
+            the start that has led to the place on which the two last agreed.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
         since: ID of the first keyframe laid after the pose was known for the last time.
         t_match: instant of the latest match; scan_s: what had passed since the scan before it.
@@ -96,6 +97,7 @@ class Absolute:
     elsewhere_since: float | None = None
     way: float = 0.0
     way_young: float = 0.0
+    way_start: float = -math.inf
     fresh: float = 0.0
     since: int = 0
     t_match: float = -math.inf
@@ -173,6 +175,8 @@ def on_lights(state: State, lights: LightsResult) -> None:
         gain(state, lights, T_odom_base, off)
     if lights.fix is Fix.GOOD and tie.odd_since is None:
         tie.proved, tie.broken = True, False
+        assert state.light is not None
+        tie.way_start = state.light.filter.way_start
 
 
 def on_order(state: State, command: Command) -> None:
@@ -337,8 +341,23 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
     held = tie.proved and not tie.broken and not blind(state)
     turned = abs(off[2]) > FAR_RAD and not holds_heading(state)
     far = math.hypot(off[0], off[1]) > FAR_M or turned
-    believed = not held or (far and lights.fix is Fix.GOOD)
+    believed = not held or (far and lights.fix is Fix.GOOD and _elsewhere(state))
     return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
+
+
+def _elsewhere(state: State) -> bool:
+    """Whether light has had to look for its place anew since it last agreed, or a lamp cannot be received here.
+
+    Else the wheels have led it away, which the laser has put right for the pose: nothing that is received speaks against
+    the place.
+    """
+    from estimator.relocate_light import out_of_place
+
+    assert state.absolute is not None
+    assert state.light is not None
+    if state.light.filter.way_start > state.absolute.way_start:
+        return True
+    return out_of_place(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
 
 
 def _surer(tie: Absolute, lights: LightsResult) -> bool:

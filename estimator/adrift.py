@@ -60,10 +60,15 @@ def begin(state: State) -> bool:
 def local_map_lost(state: State) -> None:
     """The local map is begun anew: the robot may have been carried off, unless light holds it where it is.
 
-    One that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
+    Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
     """
     tie = state.absolute
-    held = tie is not None and tie.placed and tie.gap is not None and tie.gap <= SURPRISE
+    held = False
+    if tie is not None and tie.placed and tie.gap is not None:
+        from estimator.relocate_light import in_place
+
+        here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+        held = tie.gap <= SURPRISE or (tie.proved and in_place(state, here))
     if not held or state.atlas.adrift is not None:
         begin(state)
 

@@ -54,9 +54,9 @@ class MotionErrors:
 
     slip: float = 0.009
     side: float = 0.004
-    turn: float = 0.03
-    wander: float = 0.03
-    skid: float = 0.03
+    turn: float = 0.02
+    wander: float = 0.015
+    skid: float = 0.02
     idle_m: float = 0.0005
     idle_rad: float = 0.0005
     scale: float = 0.04

@@ -124,19 +124,29 @@ def out_of_place(state: State, T_map_base: Array) -> bool:
     It asks the latest epoch alone, not the `lights` filter, which wheels that turn more than they say can lead astray;
     and not the heading, of which strengths know nothing. Of lamps of one code the nearest counts.
     """
+    return any(received(state, T_map_base))
+
+
+def in_place(state: State, T_map_base: Array) -> bool:
+    """Whether lamps enough are received now, and all of them can be received about a pose as strong as they are."""
+    strong = received(state, T_map_base)
+    return len(strong) >= LEAST and not any(strong)
+
+
+def received(state: State, T_map_base: Array) -> list[bool]:
+    """Of each lamp that is received, whether it is stronger than it can be about a pose; none where there is no light."""
     if state.light is None or state.light.epoch is None:
-        return False
+        return []
     lights, epoch = state.light.filter, state.light.epoch
     if lights.course.t_mono - epoch.t_end > SILENT_S or epoch.block & UNUSABLE:
-        return False
+        return []
     rx = lights.survey.receiver
     (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
-    return any(
-        sight.state is LinkState.ACCEPTED
-        and sight.lamp is not None
-        and too_strong(lights, sight.lamp, sight.amplitude, x, y)
+    return [
+        too_strong(lights, sight.lamp, sight.amplitude, x, y)
         for sight in sights(lights, epoch, x, y)
-    )
+        if sight.state is LinkState.ACCEPTED and sight.lamp is not None
+    ]
 
 
 def too_strong(lights: Lights, lamp: Lamp, amplitude: float, x: float, y: float) -> bool:
