@@ -348,8 +348,7 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
 def _elsewhere(state: State) -> bool:
     """Whether light has had to look for its place anew since it last agreed, or a lamp cannot be received here.
 
-    Else the wheels have led it away, which the laser has put right for the pose: nothing that is received speaks against
-    the place.
+    Else the wheels have led it away, which the laser has put right for the pose: nothing received speaks against it.
     """
     from estimator.relocate_light import out_of_place
 

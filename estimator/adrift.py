@@ -60,7 +60,8 @@ def begin(state: State) -> bool:
 def local_map_lost(state: State) -> None:
     """The local map is begun anew: the robot may have been carried off, unless light holds it where it is.
 
-    Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
+    Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One
+    that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
     """
     tie = state.absolute
     held = False

@@ -44,7 +44,7 @@ class MotionErrors:
 
     Attributes:
         slip, side: m per root metre, along and across. turn: rad per root radian. wander: rad per root metre.
-        skid: m per root radian turned: where a robot turns about, and where its photodiode sits, is known to centimetres.
+        skid: m per root radian turned: what a robot turns about is known to centimetres only.
         idle_m, idle_rad: per root second.
         scale, turn_scale: share of the way and of the turn that wheels may be off for good. curve: rad per metre.
         gyro: rad per root second. gyro_bias: rad/s.

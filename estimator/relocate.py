@@ -142,7 +142,8 @@ def look(query: Query, told: LoopSettings) -> Looked:
     """Look for a keyframe in the whole map."""
     terrain = terrain_of(query.pieces, query.before)
     view = view_of(query.frame, told)
-    guesses = tuple(fit(view, terrain, T, told) for T in query.guesses)
+    outvoted = query.windows is not None
+    guesses = tuple(fit(view, terrain, T, told, outvoted) for T in query.guesses)
     if view is None or not query.search:
         return Looked(terrain, guesses, (), None, 0)
     hits, complete, nodes = searched(query, terrain, view)
@@ -152,14 +153,14 @@ def look(query: Query, told: LoopSettings) -> Looked:
     for T in hits:
         if any(same(T, other) for other in known):
             continue
-        one = fit(view, terrain, T, told)
+        one = fit(view, terrain, T, told, outvoted)
         if one.verdict is Verdict.NO or any(same(one.T_map_keyframe, other) for other in known):
             continue
         known.append(one.T_map_keyframe)
         earlier = []
         for frame, seen in past:
             T_back = se2.between(query.frame.T_odom_keyframe, frame.T_odom_keyframe)
-            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), told))
+            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), told, outvoted))
         if all(other.verdict is not Verdict.NO for other in earlier):
             fresh.append((one, tuple(earlier)))
     return Looked(terrain, guesses, tuple(fresh), complete, nodes)
@@ -218,8 +219,12 @@ def same(T: Array, other: Array) -> bool:
     return math.hypot(x, y) < SAME_M and abs(yaw) < SAME_RAD
 
 
-def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings) -> Fit:
-    """Match a scan at a place of the map, and judge it."""
+def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings, outvoted: bool = False) -> Fit:
+    """Match a scan at a place of the map, and judge it.
+
+    ``outvoted``: something else says that it is here or nearby (light, a person). Then a single witness that has looked
+    through where the scan has points does not rule the place out: a door that stood open then is shut now.
+    """
     near = nearest(terrain, T)
     piece = terrain.pieces[near[0]]
     if view is None:
@@ -227,11 +232,13 @@ def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings) -> Fi
     local = local_of(terrain, near, T)
     result = match(view, local, Prior(T, GUESS), 60, MatchSettings())
     T_found = result.T_odom_base  # the prediction where the match is none
-    against = worst(terrain, near, local, T_found, view)
+    against, second = worst(terrain, near, local, T_found, view)
     share = result.inliers / max(1, result.queries) if result.ok else 0.0
     extra = np.diag((told.extra_m**2, told.extra_m**2, told.extra_rad**2))
     P = invert3(result.information) + extra if result.ok else np.eye(3)
     verdict = judged(result, share, against, told) if same(T, T_found) else Verdict.NO
+    if outvoted and against > POSSIBLE >= second and result.ok and same(T, T_found):
+        verdict = Verdict.OPEN
     T_submap_keyframe = se2.between(piece.T_map_submap, T_found)
     return Fit(T_found, P, share, against, result.residual_m, piece.key, T_submap_keyframe, verdict)
 
@@ -256,14 +263,15 @@ def local_of(terrain: Terrain, near: Sequence[int], T: Array) -> LocalMap:
     return localmap.index(np.vstack([terrain.elements[k] for k in near]), T[:2], 1, None)
 
 
-def worst(terrain: Terrain, near: Sequence[int], local: LocalMap, T: Array, view: View) -> float:
-    """Largest share of the evidence against a place that the map with one of its witnesses knows of."""
+def worst(terrain: Terrain, near: Sequence[int], local: LocalMap, T: Array, view: View) -> tuple[float, float]:
+    """The two largest shares of the evidence against a place that the map or one of its witnesses knows of."""
     eye = se2.compose(T, view.T_base_lidar)
-    most = contradicted(local, eye, view.beams, view.noise_m)
+    shares = [0.0, contradicted(local, eye, view.beams, view.noise_m)]
     for k in near[:WITNESSES]:
         piece = terrain.pieces[k]
         T_submap_eye = se2.between(piece.T_map_submap, eye)
         empty = localmap.empty(np.zeros(2))
         empty.newest = piece.settled.witness
-        most = max(most, contradicted(empty, T_submap_eye, view.beams, view.noise_m))
-    return most
+        shares.append(contradicted(empty, T_submap_eye, view.beams, view.noise_m))
+    second, most = sorted(shares)[-2:]
+    return most, second

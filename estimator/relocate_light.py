@@ -134,7 +134,7 @@ def in_place(state: State, T_map_base: Array) -> bool:
 
 
 def received(state: State, T_map_base: Array) -> list[bool]:
-    """Of each lamp that is received, whether it is stronger than it can be about a pose; none where there is no light."""
+    """Of each lamp that is received, whether it is stronger than it can be about a pose."""
     if state.light is None or state.light.epoch is None:
         return []
     lights, epoch = state.light.filter, state.light.epoch
