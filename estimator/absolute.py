@@ -193,7 +193,7 @@ def on_order(state: State, command: Command) -> None:
         R = se2.rotation(state.T_map_odom[2])
         tie.P, tie.X = R.T @ SAID @ R, np.zeros((3, 3))
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0
-        tie.broken = False
+        tie.broken, tie.way_start = False, state.light.filter.way_start
 
 
 def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
@@ -339,16 +339,17 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
         return False
     tie.odd_since = lights.t_mono if tie.odd_since is None else tie.odd_since
     held = tie.proved and not tie.broken and not blind(state)
-    turned = abs(off[2]) > FAR_RAD and not holds_heading(state)
+    turned = abs(off[2]) > FAR_RAD and not holds_heading(state) and _elsewhere(state)
     far = math.hypot(off[0], off[1]) > FAR_M or turned
-    believed = not held or (far and lights.fix is Fix.GOOD and _elsewhere(state))
+    believed = not held or (far and lights.fix is Fix.GOOD)
     return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
 
 
 def _elsewhere(state: State) -> bool:
     """Whether light has had to look for its place anew since it last agreed, or a lamp cannot be received here.
 
-    Else the wheels have led it away, which the laser has put right for the pose: nothing received speaks against it.
+    Else it is its heading that wheels have led away, or that a row of lamps has left open: the laser holds its own, and
+    nothing that is received speaks against the place.
     """
     from estimator.relocate_light import out_of_place
 

@@ -345,6 +345,7 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
         tie.P, tie.X = state.P_anchor + state.fused.P, state.fused.P.copy()
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
+        tie.way_start = -math.inf if state.light is None else state.light.filter.way_start
 
 
 def rehang(state: State, since: int) -> None:

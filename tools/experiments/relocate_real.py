@@ -46,7 +46,7 @@ WALL_M: Final = 0.2
 SECONDS: Final = 5.0
 TRIALS: Final = 200
 KNOWN_M, KNOWN_RAD = 1.0, 1.05
-"""A place counts as mapped if the first half passed within this of it, and looked within 60 deg of the same way: a lidar
+"""A place counts as mapped if the first half passed within this of it and looked within 60 deg of the same way: a lidar
 that sees half the horizon has never seen what is behind it."""
 EFFECTS: Final = Effects(bounces=0, people=False, sway=False)
 
@@ -275,7 +275,8 @@ NOTES: Final = (
     "truth: the run's own final trajectory over the whole log; lamps are made up along it",
     "stamps of the log are put in an even rhythm: at their word a seventh of all increments is faster than 5 m/s",
     f"each query is {SECONDS:.0f} s of the second half, some 25 scans, with its odometry",
-    "right: 20 cm and 3 deg, from then on to the end; mapped: the first half passed within 1 m of where it begins, looking within 60 deg of the same way",
+    "right: 20 cm and 3 deg, from then on to the end",
+    "mapped: the first half passed within 1 m of where it begins, and looked within 60 deg of the same way",
 )
 
 
