@@ -37,6 +37,9 @@ log = logging.getLogger(__name__)
 
 NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap")
 BROKEN: Final = ".broken"
+BROKEN_NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap\.broken")
+MOST_BROKEN: Final = 8
+"""Files that a failing disk has spoilt while they were saved, kept for who wants to know."""
 START: Final = "start.lumimap"
 """File of a recording's folder: the map that the run began with."""
 MAPS: Final = "maps"
@@ -266,9 +269,17 @@ class Store:
             verify(path, content)
         except BadMap:
             path.replace(path.with_name(path.name + BROKEN))
+            self._drop_broken()
             raise
         self._let_go(map_id)
         return path
+
+    def _drop_broken(self) -> None:
+        """A disk that does not keep what is written would fill up with what it has spoilt: the newest few stay."""
+        found = [(int(match[2]), path) for path in self.folder.iterdir() if (match := BROKEN_NAME.fullmatch(path.name))]
+        for _, path in sorted(found)[:-MOST_BROKEN]:
+            log.warning("%s goes: %d damaged maps are newer", path, MOST_BROKEN)
+            path.unlink(missing_ok=True)
 
     def _use(self) -> None:
         """Make the folder and take it for this process; what a killed one has left half written goes."""

@@ -297,7 +297,10 @@ def land(state: State, one: Hypothesis, alone: bool) -> None:
         return
     T_map_keyframe = se2.compose(atlas.submaps[fit.key].T_map_submap, fit.T_submap_keyframe)
     T_map_odom = se2.compose(T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
-    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), atlas.since)
+    moved = se2.compose(T_map_odom, se2.inverse(state.T_map_odom))
+    shift_map(state, moved, atlas.since)
+    if atlas.since == atlas.kept:  # what was mapped since the start: the start lies in it
+        state.T_map_start = se2.compose(moved, state.T_map_start)
     move_map(state, T_map_odom)
     since, first = atlas.since, atlas.adrift
     if first is not None:

@@ -205,6 +205,20 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.M
     assert names(tmp_path) == [name(1)]
 
 
+def test_a_disk_that_keeps_lying_is_not_filled_with_what_it_has_spoilt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_with(tmp_path, 1)
+    write = module.write_whole
+    monkeypatch.setattr(module, "write_whole", lambda path, data: write(path, data[:-50] + bytes(50)))
+    for _ in range(module.MOST_BROKEN + 3):
+        with pytest.raises(Damaged, match="the disk is failing"):
+            store.save(content(seed=2), MAP)
+    last = 1 + module.MOST_BROKEN + 3
+    kept = [name(k, more=".broken") for k in range(last - module.MOST_BROKEN + 1, last + 1)]
+    assert names(tmp_path) == [name(1), *kept]
+
+
 def test_a_disk_that_lies_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_with(tmp_path, 1)
     write = module.write_whole

@@ -282,6 +282,25 @@ def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> No
     assert np.sqrt(np.diag(grid.covariance)) == pytest.approx((0.05, 0.05, 0.02), abs=0.005)
 
 
+@pytest.mark.parametrize(("anew", "followed"), [(False, False), (True, True)])
+def test_a_heading_from_light_is_followed_against_the_laser_only_if_light_has_looked_for_its_place_anew(
+    driven: tuple[State, Log], anew: bool, followed: bool
+) -> None:
+    state = copy.deepcopy(driven[0])
+    assert state.light is not None
+    assert state.absolute is not None
+    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    told = T + np.array((0.0, 0.0, 1.0))
+    if anew:
+        state.light.filter.way_start = state.light.filter.course.way
+    for _ in range(30):
+        state.fused.t_mono += 0.05
+        state.absolute.t_match = state.fused.t_mono
+        absolute.on_lights(state, lights_at(told, frozenset((1, 4, 13, 16)), state))
+    now = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    assert abs(se2.wrap(now[2] - T[2])) == pytest.approx(1.0 if followed else 0.0, abs=0.05)
+
+
 @pytest.mark.parametrize(("away", "broken", "followed"), [(0.9, False, False), (2.5, False, True), (0.9, True, True)])
 def test_only_what_the_laser_could_have_lost_is_taken_from_light(
     driven: tuple[State, Log], away: float, broken: bool, followed: bool

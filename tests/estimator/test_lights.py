@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from estimator import ekf, se2
 from estimator import lights as lf
-from estimator import se2
 from estimator.cdma_epoch import BlockFlag
 from estimator.lamps import Survey
 from estimator.records import Array, Imu
@@ -63,6 +63,34 @@ def test_standing_still_it_says_that_it_does_not_know_the_heading() -> None:
         result = lf.update(filter_, room.epoch(0.1 * k, circle(0.0)))
     assert result.fix is Fix.STARTING
     assert math.sqrt(result.covariance[2, 2]) > 1.0
+
+
+def test_a_hidden_lamp_leads_no_robot_astray_that_stands_after_its_start() -> None:
+    here = np.array((2.6, 2.4, 0.5))
+    room = Room(cover=lambda lamp, _: 0.05 if lamp in (5, 7, 10) else 1.0)  # 6, 2 and 1 are clear, and one further off
+    filter_ = lf.new_lights(SURVEY)
+    for k in range(400):
+        t = 0.05 * k
+        lf.predict(filter_, wheels(lambda _: here, t, 0.05))
+        result = lf.update(filter_, room.epoch(t, here))
+    error, _ = off(result, here)
+    assert error < 0.3
+    assert error < 3.0 * math.sqrt(result.covariance[0, 0] + result.covariance[1, 1])
+
+
+@pytest.mark.parametrize("curve", [-0.06, 0.06])
+def test_wheels_that_have_never_been_calibrated_are_found_out(curve: float) -> None:
+    filter_, room = lf.new_lights(SURVEY), Room()
+    for _, odometry, epoch in drive(room, circle, 40.0):
+        x, y, yaw = odometry.delta.tolist()
+        wrong = np.array((1.03 * x, 1.03 * y, yaw + curve * x))
+        lf.predict(filter_, dataclasses.replace(odometry, delta=wrong))
+        result = lf.update(filter_, epoch)
+    assert result.fix is Fix.GOOD
+    error, heading = off(result, circle(40.0))
+    assert error < 0.06
+    assert heading < math.radians(3.0)
+    assert filter_.tracks[0].x[ekf.CURVE] == pytest.approx(-curve, abs=0.02)
 
 
 def test_gains_of_lamps_are_learned() -> None:
