@@ -36,19 +36,24 @@ def export(args: argparse.Namespace) -> int:
         image = image_from(opened(args.log))
         folder = Folder(args.out)
         frames = placed(image)
+        written: list[str] = []
         if args.pgm or not (args.tum or args.carmen):
             grid = grid_of(image)
             picture = encode_png(draw(grid, np.zeros((0, 3)), lamps_of(image)))
             files = [("map.pgm", pgm(grid)), ("map.yaml", map_yaml(grid, "map.pgm")), ("map.png", picture)]
             folder.write_each(files)
+            written += [name for name, _ in files]
         if args.tum:
             stamps = np.array([frame.key for frame, _ in frames], dtype=np.float64)
             folder.write("keyframes.tum", tum(Trajectory(stamps, np.array([T for _, T in frames]).reshape(-1, 3))))
+            written.append("keyframes.tum")
         if args.carmen:
             scans = ((frame.key, T, frame.T_base_lidar, frame.beams()) for frame, T in frames)
             folder.write("keyframes.clf", carmen(scans))
+            written.append("keyframes.clf")
     except (BadMap, OutputRefused, OSError) as error:
         return cli.fail(str(error))
+    sys.stdout.write(f"{args.out}: {', '.join(written)}\n")
     return cli.OK
 
 
@@ -60,6 +65,7 @@ def render(args: argparse.Namespace) -> int:
         Folder(args.out.parent).write(args.out.name, encode_png(pixels))
     except (BadMap, OutputRefused, OSError) as error:
         return cli.fail(str(error))
+    sys.stdout.write(f"{args.out}: {pixels.shape[1]} x {pixels.shape[0]} pixels\n")
     return cli.OK
 
 

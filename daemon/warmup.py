@@ -231,4 +231,5 @@ def _progress_line(seconds: float, lights: bool = False) -> str:
     count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
     if count == 0:
         return f"still loading the estimator after {seconds:.0f} s"
-    return f"compiling: {count} of {kernel_count(lights)} kernels after {seconds:.0f} s"
+    total = kernel_count(lights)  # kernels that only one part of the program loads may have been compiled beside
+    return f"compiling: {min(count, total)} of {total} kernels after {seconds:.0f} s"

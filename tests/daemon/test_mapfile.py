@@ -83,8 +83,9 @@ def keyframes_of(file: Path) -> list[tuple[Keyframe, Array]]:
     return placed(image_from(opened(file)))
 
 
-def test_tum_has_every_keyframe_where_it_lies(file: Path, tmp_path: Path) -> None:
+def test_tum_has_every_keyframe_where_it_lies(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("export", file, "--tum", "--out", tmp_path / "out") == cli.OK
+    assert capsys.readouterr().out == f"{tmp_path / 'out'}: keyframes.tum\n"
     rows = np.loadtxt(tmp_path / "out" / "keyframes.tum")
     frames = keyframes_of(file)
     np.testing.assert_array_equal(rows[:, 0], [frame.key for frame, _ in frames])
@@ -128,8 +129,9 @@ def test_carmen_keeps_beams_mount_and_bearings(made: MapImage) -> None:
     assert line.laser == pytest.approx(tuple(se2.compose(T, mount)), abs=1e-6)
 
 
-def test_a_picture(file: Path, tmp_path: Path) -> None:
+def test_a_picture(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("render", file, tmp_path / "hall.png") == cli.OK
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'hall.png'}: ")
     with Image.open(tmp_path / "hall.png") as picture:
         dark = (np.array(picture).sum(axis=2) < 300).mean()
     assert 0.005 < dark < 0.2

@@ -138,6 +138,9 @@ def test_progress_counts_what_was_compiled_since_the_start(tmp_path: Path, monke
     assert warmup._progress_line(10.0) == "still loading the estimator after 10 s"
     (tmp_path / "new.nbc").touch()
     assert warmup._progress_line(10.0) == f"compiling: 1 of {kernel_count()} kernels after 10 s"
+    for k in range(kernel_count() + 5):
+        (tmp_path / f"{k}.nbc").touch()
+    assert warmup._progress_line(10.0) == f"compiling: {kernel_count()} of {kernel_count()} kernels after 10 s"
 
 
 def test_there_are_kernels_to_count() -> None:
