@@ -35,7 +35,7 @@ def log_root() -> Path:
 def warm_kernels() -> None:
     """Compile the kernels of this tree once, before anything is judged against the wall clock."""
     command = [sys.executable, "-c", "from daemon.warmup import load; load()"]
-    subprocess.run(command, cwd=ROOT, check=True, timeout=240)
+    subprocess.run(command, cwd=ROOT, check=True, timeout=900)
 
 
 @pytest.fixture(autouse=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -23,6 +24,8 @@ from tools.bench.vm.scenarios import SCENARIOS
 
 ROOM = 2_000_000_000
 CANNOT = 2
+BUSY = 2.0
+"""Load for each processor; the bench itself makes about one."""
 
 
 def say(text: str) -> None:
@@ -77,6 +80,11 @@ def version() -> str:
     return said.stdout.strip() or "unknown"
 
 
+def load() -> str:
+    """How busy this computer is with other things, too: the emulated one takes two processors."""
+    return f"{os.getloadavg()[1]:.1f} on {os.cpu_count()} processors"
+
+
 def main() -> int:
     """Make what is missing, run, report."""
     parser = argparse.ArgumentParser(prog="python -m tools.bench.vm", description=__doc__)
@@ -101,7 +109,7 @@ def main() -> int:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT
     seconds = f"{time.monotonic() - begun:.0f}"
-    about = {"version": version(), "image": made.folder.name, "seconds in all": seconds}
+    about = {"version": version(), "image": made.folder.name, "seconds in all": seconds, "load": load()}
     worse = write(options.out, results, about, options.against)
     failed = [one.name for one in results if not one.passed]
     for text in worse:

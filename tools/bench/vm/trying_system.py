@@ -50,7 +50,7 @@ def probes(bench: Bench) -> str:
 
 @scenario
 def starts(bench: Bench) -> str:
-    """`systemctl enable --now lumiloop`: warmed up, READY, nothing compiled."""
+    """`systemctl enable --now lumiloop`: warmed up and READY."""
     bench.configure()
     bench.ears.poses.clear()
     begun = time.monotonic()
