@@ -215,7 +215,8 @@ def solve_graph(state: State, atlas: Atlas) -> None:
         if correct(state, atlas, submaps, graph.poses, solution):
             R = se2.rotation(-state.T_map_odom[2])
             atlas.tied = submaps[-1]
-            atlas.ties = {submap.key: R @ P @ R.T for submap, P in zip(submaps, ties, strict=True)}
+            turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
+            atlas.ties = dict(zip([submap.key for submap in submaps], turned, strict=True))
 
     atlas.solution = atlas.ask(SOLVE, lambda: solved(graph), then)
 
@@ -270,7 +271,8 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
     newest = atlas.newest
     held, last = lit(state) and not atlas.held, submaps[-1]
     counts = np.array([submap.into is None and not (held and submap is last) for submap in submaps])
-    there = all(submap.into is not None or atlas.submaps.get(submap.key) is submap for submap in submaps)
+    known = atlas.submaps.get
+    there = all(submap.into is not None or known(submap.key) is submap for submap in submaps)
     same = there and np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
     if newest is None or not same or not np.isfinite(solution.poses).all():
         atlas.stale |= not same
