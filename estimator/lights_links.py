@@ -34,6 +34,8 @@ DIFFUSE = 0.6
 """A strength below this share of what the lamp gives at the edge of view has not come straight."""
 RELEARN_S, RELEARN_M = 15.0, 3.0
 """A link that contradicts so long and far, and always by the same factor, is a lamp of another power: learn it anew."""
+HIDDEN = 1.4
+"""A lamp that has lost three quarters (ln) is hidden, not old: it is not learned as one of another power."""
 STEADY = 0.12
 """Spread of its ln residual up to which a contradiction is called steady."""
 TOO_STRONG = 3.0
@@ -339,6 +341,8 @@ def relearn(lights: Lights, track: Track) -> None:
         if not long or watch.strikes >= STRIKES or lamp_id not in track.slots:
             continue
         mean = watch.total / watch.count
+        if mean < -HIDDEN:
+            continue
         if watch.square / watch.count - mean * mean < STEADY**2:
             at = ekf.FIRST + ekf.OWN * track.slots[lamp_id]
             ekf.cut(track.P, track.n, at)

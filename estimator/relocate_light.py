@@ -150,12 +150,15 @@ def received(state: State, T_map_base: Array) -> list[bool]:
 
 
 def too_strong(lights: Lights, lamp: Lamp, amplitude: float, x: float, y: float) -> bool:
-    """Whether a lamp is received straight, and stronger than it can be near a place of the receiver."""
+    """Whether a lamp is received straight, and stronger than it can be near a place of the receiver.
+
+    However dim it was known last, it may shine as surveyed: something may have stood in its light while it was learned.
+    """
     rx = lights.survey.receiver
     h = max(lamp.z - rx.z, 0.1)
     away = max(math.hypot(lamp.x - x, lamp.y - y) - NEARER_M, 0.0)
     fall = h / math.hypot(h, away) / math.cos(min(rx.half_fov_rad, 1.5))
-    rim = lights.catalogue.rims[lamp.lamp_id] * math.exp(float(remembered(lights, lamp)[0][0]))
+    rim = lights.catalogue.rims[lamp.lamp_id] * math.exp(max(float(remembered(lights, lamp)[0][0]), 0.0))
     return amplitude > rim * max(1.0, STRONGER * math.pow(fall, lamp.order + rx.order + 2.0))
 
 

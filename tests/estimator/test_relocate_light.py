@@ -193,6 +193,15 @@ def test_lamps_that_cannot_be_received_here_say_that_the_robot_is_elsewhere(bear
     assert not out_of_place(state, HERE + 5.0 * way)
 
 
+def test_a_lamp_that_was_hidden_while_it_was_learned_may_be_received_clearly_here() -> None:
+    state = shown(robot())
+    assert state.light is not None
+    nearest = state.light.result.links[0].lamp_id
+    assert nearest is not None
+    state.light.filter.gains[nearest] = np.array((-3.4, 0.0, 0.0)), np.full(3, 0.01)
+    assert not out_of_place(state, HERE)
+
+
 @pytest.mark.parametrize("proved", [True, False])
 def test_a_filter_led_astray_sets_no_robot_adrift_that_receives_the_lamps_of_its_place(proved: bool) -> None:
     for at, carried in ((HERE, False), (HERE + np.array((5.0, 0.0, 0.0)), True)):
