@@ -19,6 +19,7 @@ from estimator.posegraph import UPPER
 from estimator.records import Answer, Array, Job
 from estimator.result import Loop
 from estimator.submap import SIZE, Settled, settle
+from estimator.thinning import handed_on, thinned
 
 Ints = npt.NDArray[np.int64]
 
@@ -99,11 +100,14 @@ class Constraints:
         A = se2.adjoint(T)
         return a, se2.inverse(T), A @ P @ A.T
 
-    def reroute(self, key: int, hub: int, T_hub_key: Array, P: Array) -> None:
-        """Take a submap out: whatever else it is joined with is joined with ``hub`` by way of it; ``P`` in its axes."""
-        rows = self.of(key)
+    def reroute(self, key: int, hub: int, T_hub_key: Array, P: Array, rows: Ints | None = None) -> None:
+        """Take a submap out: what else it is joined with is joined with ``hub`` by way of it; ``P`` in its axes.
+
+        ``rows``: constraints that are handed on so, all if None.
+        """
+        rows = self.of(key) if rows is None else rows
         others = [(*self.seen_from(key, row), bool(self.loop[row])) for row in rows]
-        self.keep(~np.isin(np.arange(len(self.loop)), rows))
+        self.keep(~(self.between == key).any(axis=1))
         for other, T, P_other, is_loop in others:
             if other != hub:
                 A = se2.adjoint(se2.inverse(T))
@@ -353,6 +357,7 @@ class Atlas:
         here = [other for other in part if cell_of(other) == cell_of(latest) and not self.is_held(other)]
         for submap in here[:-KEPT]:
             self.let_go(submap)
+        self.constraints.keep(thinned(np.array(list(self.submaps)), self.constraints))
         if self.held:
             own = [submap for submap in self.submaps.values() if not self.is_held(submap)]
             for submap in own[:-OWN]:
@@ -366,12 +371,13 @@ class Atlas:
 
     def let_go(self, submap: Submap) -> None:
         """Take a submap out of the graph; what hangs on it goes on hanging, on the neighbour that is surest of it."""
-        joined = [self.constraints.seen_from(submap.key, row) for row in self.constraints.of(submap.key)]
+        rows = handed_on(np.array(list(self.submaps)), self.constraints, submap.key)
+        joined = [self.constraints.seen_from(submap.key, row) for row in rows]
         if not joined:
             return
         key, T, P = min(joined, key=lambda one: float(np.trace(one[2])))
         hub, A = self.submaps[key], se2.adjoint(T)
-        self.constraints.reroute(submap.key, key, se2.inverse(T), A @ P @ A.T)
+        self.constraints.reroute(submap.key, key, se2.inverse(T), A @ P @ A.T, rows)
         submap.hang_on(hub, se2.between(hub.T_map_submap, submap.T_map_submap))
         submap.settled = None
         del self.submaps[submap.key]
@@ -383,6 +389,6 @@ def swing(lever: Array) -> Array:
 
 
 def cell_of(submap: Submap) -> tuple[int, int, int]:
-    """Place (of CELL_M) and heading (a quarter turn) of a submap."""
+    """Place (of CELL_M) and heading (a quarter turn) of a submap; who drives along an axis is well within a quarter."""
     x, y, yaw = submap.T_map_submap.tolist()
-    return math.floor(x / CELL_M), math.floor(y / CELL_M), math.floor((yaw + math.pi) * 2.0 / math.pi) % 4
+    return math.floor(x / CELL_M), math.floor(y / CELL_M), math.floor(yaw * 2.0 / math.pi + 0.5) % 4

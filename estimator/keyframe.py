@@ -123,9 +123,9 @@ class Keyframe:
 
 
 def square_of(T_map_keyframe: Array) -> tuple[int, int, int]:
-    """Half metre square and eighth of a turn."""
+    """Half metre square and eighth of a turn; who drives along an axis is well within an eighth."""
     x, y, yaw = T_map_keyframe.tolist()
-    return math.floor(2.0 * x), math.floor(2.0 * y), math.floor((yaw + math.pi) * 4.0 / math.pi) % 8
+    return math.floor(2.0 * x), math.floor(2.0 * y), math.floor(yaw * 4.0 / math.pi + 0.5) % 8
 
 
 def unturned(bearing_rad: Array, turned_rad: float) -> Array:

@@ -53,6 +53,8 @@ def read_capture(path: Path, report: LogReport) -> list[Chunk]:
         problem = "the file is empty" if not data else "not a capture of a serial line"
         raise DataInvalid(str(path), problem, "name a .logr file, or another kind of log")
     chunks = list(_chunks(data, report))
+    if not chunks:
+        raise DataInvalid(str(path), "ends within its first record", "name another log; nothing can be played of it")
     report.use("chunks", len(chunks))
     report.use("bytes", sum(len(chunk.data) for chunk in chunks))
     return chunks

@@ -1,0 +1,65 @@
+"""Datagrams: what brings odometry and gyro readings, and what a client of the pose reads."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable
+
+from daemon.publish import registers
+from hal.clock import SystemClock
+from hal.errors import DataInvalid
+from hal.imu import RawImu
+from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, decode, encode
+from hal.inputs import InputPort
+from hal.odometry import RawOdometry
+from tests.daemon.publish.test_registers import snapshot
+
+MEGABYTES = 10
+PARSERS = ("hal/input_codec.py", "hal/inputs.py", "daemon/publish/registers.py")
+
+
+def seeds() -> list[bytes]:
+    readings = [
+        InputDatagram(ODOMETRY_MAGIC, 7, k, k % 2, 1000.0 + k, (0.1 * k, -0.2, 3.0)) for k in (0, 1, 2, 5, 2**32 - 1)
+    ]
+    gyro = [InputDatagram(IMU_MAGIC, 8, k, 1, 1000.0, (0.5,)) for k in (0, 3)]
+    return [*(encode(one) for one in (*readings, *gyro)), registers.encode_datagram(snapshot())]
+
+
+def mend(data: bytes) -> bytes:
+    """The length that there is, and the sum that belongs to it."""
+    if len(data) < 16:
+        return data
+    if data[:4] in (ODOMETRY_MAGIC, IMU_MAGIC):
+        data = data[:6] + struct.pack("<H", len(data) & 0xFFFF) + data[8:]
+    return data[:-4] + struct.pack("<I", zlib.crc32(data[:-4]))
+
+
+def feeder() -> Callable[[bytes], None]:
+    port, state = InputPort(SystemClock(), "127.0.0.1", 0), {"t": 1000.0, "fed": 0, "session": 9}
+    odometry: list[RawOdometry] = []
+    imu: list[RawImu] = []
+    port.send_odometry_to(odometry.append)
+    port.send_imu_to(imu.append)
+
+    def feed(data: bytes) -> None:
+        state["t"] += 0.01
+        state["fed"] += 1
+        port.take(data, state["t"])
+        counts = port.counts.values()
+        assert sum(c.received + c.late + c.duplicate + c.foreign for c in counts) + port.invalid == state["fed"]
+        for reading in (*odometry, *imu):
+            assert reading.t_rx - 1.0 <= reading.t_mono <= reading.t_rx
+        assert all(map(math.isfinite, (r.yaw_rate for r in imu)))
+        assert all(math.isfinite(v) for o in odometry for v in (o.x, o.y, o.yaw))
+        odometry.clear()
+        imu.clear()
+        for read, refusal in ((decode, DataInvalid), (registers.decode_datagram, ValueError)):
+            try:
+                read(data)
+            except refusal as error:
+                assert str(error)
+
+    return feed
