@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import sys
 import time
 from pathlib import Path
 
 import coverage
 
+from tests.fuzz.storm import say
 from tests.fuzz.targets import NAMES
 
 ROOT = Path(__file__).parents[2]
@@ -72,15 +72,14 @@ def one(name: str, share: float, seed: int) -> int:
         outcome = storm.run(feed, storm.Storm(kept, target.mend, seed), round(share * target.MEGABYTES * 1e6))
         took = time.thread_time() - begin
     except AssertionError as error:
-        print(f"{name}: FAILED (seed {seed})\n{error}", flush=True)
+        say(f"{name}: FAILED (seed {seed})\n{error}")
         return 1
     lines, reached = lines_of(counted, target.PARSERS)
     good = outcome.worst_s < storm.STALL_S and outcome.growth < storm.GROWTH
-    print(
-        f"{name}: {outcome.fed / 1e6:.2f} MB in {outcome.inputs} inputs, {took:.0f} s, longest {1e3 * outcome.worst_s:.0f}"
-        f" ms, {outcome.growth / 1e3:+.1f} kB kept, {len(kept)} in the corpus, {100.0 * reached / lines:.1f} %"
-        f" of {lines} lines{'' if good else ': FAILED'}",
-        flush=True,
+    say(
+        f"{name}: {outcome.fed / 1e6:.2f} MB in {outcome.inputs} inputs, {took:.0f} s, longest"
+        f" {1e3 * outcome.worst_s:.0f} ms, {outcome.growth / 1e3:+.1f} kB kept, {len(kept)} in the corpus,"
+        f" {100.0 * reached / lines:.1f} % of {lines} lines{'' if good else ': FAILED'}"
     )
     return int(not good)
 
@@ -92,7 +91,7 @@ def lines_of(counted: coverage.Coverage, files: tuple[str, ...]) -> tuple[int, i
         _, statements, _, missing, text = counted.analysis2(str(ROOT / file))
         lines, reached = lines + len(statements), reached + len(statements) - len(missing)
         if missing:
-            print(f"    {file}: not reached {text}", file=sys.stderr)
+            say(f"    {file}: not reached {text}")
     return lines, reached
 
 

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any, Final
 
 from tests.fuzz import storm
+from tests.fuzz.storm import say
 
 ROOT = Path(__file__).parents[2]
 MOST: Final = 4096
@@ -34,12 +35,11 @@ def grow(name: str, seconds: float) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     before = len(list(folder.iterdir()))
     guided = importlib.util.find_spec("atheris") is not None
-    print(f"{name}: {'atheris' if guided else 'lines watched by the interpreter'}, {seconds:.0f} s", flush=True)
+    say(f"{name}: {'atheris' if guided else 'lines watched by the interpreter'}, {seconds:.0f} s")
     failed = _with_atheris(name, seconds) if guided else _by_lines(name, seconds)
     kept = list(folder.iterdir())
-    print(
+    say(
         f"{name}: {before} inputs before, {len(kept)} now, {sum(f.stat().st_size for f in kept) / 1e3:.0f} kB",
-        flush=True,
     )
     return failed
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import random
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Sequence
@@ -145,3 +146,9 @@ def tell(feed: Callable[[bytes], None], data: bytes) -> None:
     except Exception as error:
         shown = data if len(data) < 2000 else data[:2000] + b"..."
         raise AssertionError(f"{type(error).__name__}: {error}\ninput of {len(data)} bytes: {shown!r}") from error
+
+
+def say(text: str) -> None:
+    """A line for people."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()

@@ -5,4 +5,18 @@ sums made right again, so that damage reaches what lies behind them. ``feeder()`
 anything but the parser's own refusal comes out, and where sound bytes after it are not understood.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
 NAMES = ("scip", "adc", "modbus", "udp", "stream", "toml", "map", "log")
+
+
+def refused(call: Callable[..., Any], *arguments: object, by: type[Exception] | tuple[type[Exception], ...]) -> str:
+    """What the refusal of a call says, by an exception of these kinds; empty: it was not refused."""
+    try:
+        call(*arguments)
+    except by as error:
+        return str(error) or repr(error)
+    return ""

@@ -16,6 +16,7 @@ from hal.photodiode.capability import Capability
 from hal.photodiode.judge import Judge
 from hal.photodiode.mcp3221 import CHIP
 from hal.photodiode.sampler import Sampler
+from tests.fuzz.targets import refused
 
 MEGABYTES = 10
 PARSERS = ("hal/photodiode/blocks.py", "hal/photodiode/sampler.py", "hal/photodiode/judge.py", "hal/i2c_frames.py")
@@ -73,14 +74,14 @@ def feeder() -> Callable[[bytes], None]:
         assert blemish != Blemish.NONE or 0 < words.min() <= words.max() < 4095
         block(data[:LENGTH])
         assert any(block(whole) for _ in range(2)), "a good block is not taken"
-        splitter = frames.Splitter()
-        try:
-            for kind, body in splitter.feed(data):
-                parse(kind, body)
-        except frames.BadFrame as error:
-            assert str(error)
+        refused(frames_of, data, by=frames.BadFrame)
 
     return feed
+
+
+def frames_of(data: bytes) -> None:
+    for kind, body in frames.Splitter().feed(data):
+        parse(kind, body)
 
 
 def parse(kind: int, body: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What Modbus clients send: datagrams, and streams cut anywhere."""
+"""What Modbus clients send: datagrams, streams cut anywhere, and the bytes of a serial line."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import asyncio
 import struct
 from collections.abc import Callable
 
-from daemon.publish import modbus, registers
+from daemon.publish import modbus, registers, rtu_frames
 from daemon.publish.requests import MAX_FRAME, frame_size
 from tests.daemon.publish.network import plugged
 from tests.daemon.publish.test_registers import snapshot
 from tests.fuzz.test_modbus import check_answer, framed, responder, whole_frames
 
 MEGABYTES = 10
-PARSERS = ("daemon/publish/requests.py", "daemon/publish/holding.py", "daemon/publish/modbus.py")
+PARSERS = ("daemon/publish/requests.py", "daemon/publish/holding.py", "daemon/publish/rtu_frames.py")
 
 READ = framed(1, 1, b"\x04\0\0\0\x40")
 
@@ -26,7 +26,18 @@ def seeds() -> list[bytes]:
               ((1000, 8), (1100, 8), (1000, 1), (1102, 12), (999, 3))]  # fmt: skip
     singles = [framed(7, 1, struct.pack(">BHH", 6, a, v)) for a, v in ((1000, 1), (1001, 4), (1100, 2), (5, 5))]
     others = [framed(8, 0, bytes([f, 0, 1, 0, 2])) for f in (1, 2, 5, 7, 8, 17, 22, 23, 43, 0x84)]
-    return [b"".join(reads), b"".join(writes), b"".join(singles), b"".join(others), *reads, *writes, *singles]
+    line = [rtu_frames.framed(unit, frame[7:]) for unit in (1, 0, 2) for frame in (*reads, *writes, *singles)]
+    return [
+        b"".join(line),
+        *line[::5],
+        b"".join(reads),
+        b"".join(writes),
+        b"".join(singles),
+        b"".join(others),
+        *reads,
+        *writes,
+        *singles,
+    ]
 
 
 def mend(data: bytes) -> bytes:
@@ -55,12 +66,20 @@ def feeder() -> Callable[[bytes], None]:
             await asyncio.sleep(0)
         await endpoint.close()
 
+    def serial(data: bytes) -> None:
+        line = rtu_frames.RtuFrames(1)
+        for unit, body in [*line.take(data[:99]), *line.take(data[99:])]:
+            assert unit in (0, 1)
+            check_answer(framed(1, unit, body), answering.answer(framed(1, unit, body)))
+        assert any(line.take(rtu_frames.framed(1, READ[7:])) == [(1, READ[7:])] for _ in range(2))
+
     def feed(data: bytes) -> None:
         size = frame_size(data)
         assert -1 <= size <= MAX_FRAME
         if size > 0 and size == len(data):
             check_answer(data, answering.answer(data))
         loop.run_until_complete(stream(data))
+        serial(data)
         assert answering.answer(READ)[9:] == registers.encode_block(snapshot()), "nothing may be written there"
 
     return feed

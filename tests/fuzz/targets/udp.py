@@ -1,4 +1,4 @@
-"""Datagrams: what brings odometry and gyro readings, and what a client of the pose reads."""
+"""Datagrams: what brings odometry and gyro readings, what asks for poses, and what a client of the pose reads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 import zlib
 from collections.abc import Callable
 
-from daemon.publish import registers
+from daemon.publish import registers, subscribe
 from hal.clock import SystemClock
 from hal.errors import DataInvalid
 from hal.imu import RawImu
@@ -15,9 +15,10 @@ from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, decode, en
 from hal.inputs import InputPort
 from hal.odometry import RawOdometry
 from tests.daemon.publish.test_registers import snapshot
+from tests.fuzz.targets import refused
 
 MEGABYTES = 10
-PARSERS = ("hal/input_codec.py", "hal/inputs.py", "daemon/publish/registers.py")
+PARSERS = ("hal/input_codec.py", "hal/inputs.py", "daemon/publish/subscribe.py")
 
 
 def seeds() -> list[bytes]:
@@ -25,7 +26,11 @@ def seeds() -> list[bytes]:
         InputDatagram(ODOMETRY_MAGIC, 7, k, k % 2, 1000.0 + k, (0.1 * k, -0.2, 3.0)) for k in (0, 1, 2, 5, 2**32 - 1)
     ]
     gyro = [InputDatagram(IMU_MAGIC, 8, k, 1, 1000.0, (0.5,)) for k in (0, 3)]
-    return [*(encode(one) for one in (*readings, *gyro)), registers.encode_datagram(snapshot())]
+    cookie = subscribe.Leases(bytes(32))._cookie(("192.0.2.1", subscribe.SIZE), 1000.0)
+    asked = [subscribe.Message(subscribe.Status(k), 60, (0, cookie)[k % 2]) for k in range(5)]
+    asked += [subscribe.Message(subscribe.Status.ASK, lease, cookie) for lease in (0, 1, 65535)]
+    sent = [*(encode(one) for one in (*readings, *gyro)), registers.encode_datagram(snapshot())]
+    return [*sent, *(subscribe.encode(one) for one in asked)]
 
 
 def mend(data: bytes) -> bytes:
@@ -38,7 +43,8 @@ def mend(data: bytes) -> bytes:
 
 
 def feeder() -> Callable[[bytes], None]:
-    port, state = InputPort(SystemClock(), "127.0.0.1", 0), {"t": 1000.0, "fed": 0, "session": 9}
+    port, state = InputPort(SystemClock(), "127.0.0.1", 0), {"t": 1000.0, "fed": 0}
+    leases = subscribe.Leases(bytes(32))
     odometry: list[RawOdometry] = []
     imu: list[RawImu] = []
     port.send_odometry_to(odometry.append)
@@ -56,10 +62,16 @@ def feeder() -> Callable[[bytes], None]:
         assert all(math.isfinite(v) for o in odometry for v in (o.x, o.y, o.yaw))
         odometry.clear()
         imu.clear()
-        for read, refusal in ((decode, DataInvalid), (registers.decode_datagram, ValueError)):
-            try:
-                read(data)
-            except refusal as error:
-                assert str(error)
+        refused(decode, data, by=DataInvalid)
+        refused(registers.decode_datagram, data, by=ValueError)
+        subscribing(data)
+
+    def subscribing(data: bytes) -> None:
+        asked: list[subscribe.Message] = []
+        refused(lambda: asked.append(subscribe.decode(data)), by=ValueError)
+        for message in asked:
+            answer = leases.answer(("192.0.2.1", len(data)), message, state["t"])
+            assert answer is None or len(subscribe.encode(answer)) <= len(data)
+            assert len(leases) <= subscribe.SUBSCRIBERS
 
     return feed
