@@ -76,7 +76,17 @@ def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
     for override in overrides:
         _lay_over(tree, override)
         _convert(tree, f"--set {override}", "")
+    _refuse_nul(tree, name)
     return _anchored(_convert(tree, name, text), file)
+
+
+def _refuse_nul(tree: dict[str, Any], name: str, parents: str = "") -> None:
+    """TOML can write the character that ends a name for the operating system; no path or address has it."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            _refuse_nul(value, name, f"{parents}{key}.")
+        elif "\0" in str(value):
+            raise ConfigError(f"{name}: `{parents}{key}` holds the character \\u0000; leave it out")
 
 
 def _anchored(config: Config, file: Path | None) -> Config:

@@ -80,7 +80,7 @@ def describe(path: Path, text: str) -> Description:
         if key not in fields:
             raise BadMapServer(f"{path}: has no `{key}`; map_server's files have one")
     image = fields["image"]
-    if not isinstance(image, str) or not image:
+    if not isinstance(image, str) or not image or "\0" in image:
         raise BadMapServer(f"{path}: `image` must be the name of a picture")
     resolution = _number(path, "resolution", fields["resolution"])
     if not 0.001 <= resolution <= 1.0:

@@ -207,6 +207,12 @@ class _Marks:
     missing: int = 0
 
 
+def _number(header: dict[str, Any], key: str) -> float:
+    """An entry of a header, 0 where it holds none that is a number."""
+    value = header.get(key, 0.0)
+    return float(value) if isinstance(value, float | int) and math.isfinite(value) else 0.0
+
+
 class RecordingSource(Source):
     """A recording of our own: bytes through the codec, cycles where they ran; see `daemon.record`."""
 
@@ -222,7 +228,7 @@ class RecordingSource(Source):
         super().__init__(path, LogReport(), self._codec.status, size)
         self.files = self._recording.segments
         self.header = self._recording.header
-        self._utc = float(self.header.get("t_utc", 0.0)) - float(self.header.get("t_mono", 0.0))
+        self._utc = _number(self.header, "t_utc") - _number(self.header, "t_mono")
         self._marks = _Marks()
         if state_beside(self._recording.segments[0]).exists() and self._recording.first > 0:
             self.begin = read_moment(state_beside(self._recording.segments[0]))

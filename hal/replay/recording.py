@@ -40,6 +40,7 @@ MARKER: Final = b"\xa5\x5a"
 LONGEST: Final = 1 << 20
 """No record is longer; a length beyond it is damage."""
 
+_SHORT: Final = 4096
 _START: Final = struct.Struct("<8sHI")
 _HEAD: Final = struct.Struct("<2sBBIdI")
 _SUMMED: Final = struct.Struct("<BBId")
@@ -267,7 +268,10 @@ def _read_head(data: bytes) -> tuple[dict[str, Any] | None, int]:
     end = _START.size + _START.unpack_from(data)[2]
     if len(data) < end + _CRC.size or _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
         return None, 0
-    header = json.loads(data[_START.size : end])
+    try:
+        header = json.loads(data[_START.size : end])
+    except ValueError:  # the sum is right, and yet it is no JSON: not ours
+        return None, 0
     return (header, end + _CRC.size) if isinstance(header, dict) else (None, 0)
 
 
@@ -298,10 +302,18 @@ def _frame_at(data: bytes, at: int) -> tuple[Frame | None, int]:
 
 
 def _next_frame(data: bytes, at: int) -> int:
-    """Where the next whole record begins, or the end of the data."""
+    """Where the next whole record begins, or the end of the data.
+
+    Of long ones only those are tried after which there is another one or nothing: the sums of all that may look like
+    one in some megabytes of markers and lengths would take hours.
+    """
     while (at := data.find(MARKER, at)) >= 0:
-        if _frame_at(data, at)[0] is not None:
-            return at
+        if len(data) >= at + _HEAD.size:
+            length = _HEAD.unpack_from(data, at)[3]
+            end = at + _HEAD.size + length
+            likely = length <= _SHORT or end == len(data) or data.startswith(MARKER, end)
+            if likely and _frame_at(data, at)[0] is not None:
+                return at
         at += 1
     return len(data)
 

@@ -285,3 +285,9 @@ def test_endpoints(text: str, expected: tuple[str, int]) -> None:
 def test_wrong_endpoints(text: str) -> None:
     with pytest.raises(ValueError, match="Expected"):
         parse_endpoint(text)
+
+
+def test_a_character_that_no_name_can_have_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('[lights]\nsurvey = "a\\u0000b"\n')
+    with pytest.raises(ConfigError, match=r"a\.toml: `lights\.survey` holds the character"):
+        load(tmp_path / "a.toml")

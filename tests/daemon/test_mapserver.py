@@ -161,3 +161,9 @@ def test_no_text_does_more_than_be_refused(text: str) -> None:
 def test_no_bytes_do_more_than_be_refused(head: bytes, data: bytes) -> None:
     with contextlib.suppress(BadPicture):
         assert read_picture(head + data, MOST).grey.max() <= 1.0
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_bytes(b"image: a\0b.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(BadMapServer, match="`image` must be the name of a picture"):
+        load(tmp_path / "a.yaml")

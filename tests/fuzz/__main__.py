@@ -42,6 +42,18 @@ def main() -> int:
             from tests.fuzz import grow
 
             failed |= grow.grow(name, options.grow)
+        elif len(names) > 1:  # each by itself, or the first one has loaded the others' lines
+            command = [
+                sys.executable,
+                "-m",
+                "tests.fuzz",
+                name,
+                "--share",
+                str(options.share),
+                "--seed",
+                str(options.seed),
+            ]
+            failed |= subprocess.run(command, cwd=ROOT, check=False).returncode
         else:
             failed |= one(name, options.share, options.seed)
     return failed

@@ -65,3 +65,9 @@ def test_the_real_dialogue_is_read_to_its_last_byte(log_root: Path) -> None:
         assert data.startswith(first)
         assert len(data) == path.stat().st_size - 12 * len(chunks)
         assert not report.skipped
+
+
+def test_a_capture_that_ends_within_its_first_record_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.logr").write_bytes(struct.pack(">QI", 1_000_000, 100) + b"too few")
+    with pytest.raises(DataInvalid, match="within its first record"):
+        read_capture(tmp_path / "a.logr", LogReport())

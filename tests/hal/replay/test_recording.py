@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import time
+import zlib
 from pathlib import Path
 
 import pytest
@@ -174,3 +176,20 @@ def test_frames_are_streamed(tmp_path: Path) -> None:
     (tmp_path / segment_name(1)).unlink()
     with pytest.raises(DeviceMissing):
         next(frames)
+
+
+def test_a_head_whose_sum_is_right_and_whose_text_is_not_json_is_damaged(tmp_path: Path) -> None:
+    text = b'{"recording": "\x8b"}'
+    start = struct.pack("<8sHI", b"LUMIREC\n", 2, len(text)) + text
+    (tmp_path / segment_name(0)).write_bytes(start + struct.pack("<I", zlib.crc32(start)))
+    with pytest.raises(DataInvalid):
+        open_recording(tmp_path / segment_name(0))
+
+
+def test_megabytes_of_what_looks_like_records_take_no_hours(tmp_path: Path) -> None:
+    lie = MARKER + bytes(2) + (LONGEST - 1).to_bytes(4, "little")
+    (tmp_path / segment_name(0)).write_bytes(head() + 400_000 * lie + pack(FRAMES[:3]))
+    begin = time.thread_time()
+    frames, _ = read(tmp_path / segment_name(0))
+    assert frames == FRAMES[:3]
+    assert time.thread_time() - begin < 40.0  # half a second on an idle machine; hours with every sum computed
