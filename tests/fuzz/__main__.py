@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import subprocess
+import sys
 import time
 from pathlib import Path
 

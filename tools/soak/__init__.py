@@ -1,0 +1,1 @@
+"""Runs for hours or simulated weeks, and whether anything grows: memory, files, threads, time."""

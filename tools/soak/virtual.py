@@ -1,0 +1,132 @@
+"""Simulated days: the daemon's own cycle with its sinks, its clock put forward by hand, one scan a second."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import math
+import os
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from daemon.bridge import ScanBridge
+from daemon.budget import FixedBudget
+from daemon.config import LidarConfig, Mount
+from daemon.cycle import Cycle, Parts
+from daemon.publish.modbus import ModbusPublisher
+from daemon.publish.snapshot import Snapshot, State
+from daemon.publish.udp import PoseSender
+from daemon.worker import CycleWorker
+from estimator import se2
+from estimator.light import LightsSetup
+from estimator.pipeline import new_state, step
+from estimator.records import Limits, Record
+from estimator.result import StepResult
+from hal.clock import SystemClock
+from hal.lidar import LidarStatus, Link
+from tools.soak.patrol import Patrol
+from tools.soak.watched import Watch
+
+BUILDING: Final = "paper_room"
+WINDOWS: Final = 96
+
+
+class Hands:
+    """A clock that is put forward by hand."""
+
+    t = 0.0
+
+    def now(self) -> float:
+        """See :class:`hal.clock.Clock`."""
+        return self.t
+
+    def utc(self) -> float:
+        """See :class:`hal.clock.Clock`."""
+        return 1.8e9 + self.t
+
+
+@dataclass(slots=True)
+class Days:
+    """What came of it: rows, share of cycles in TRACKING, median error in m; keyframes, submaps and loops kept."""
+
+    watch: Watch
+    tracking: float
+    error_m: float
+    kept: tuple[int, int, int]
+
+
+def run(days: float, seed: int = 0, say: Callable[[str], None] = lambda text: None) -> Days:
+    """Drive for so many days."""
+    return asyncio.run(_run(round(86400.0 * days), seed, say))
+
+
+async def _run(seconds: int, seed: int, say: Callable[[str], None]) -> Days:
+    patrol, clock = Patrol(BUILDING, seed), Hands()
+    state = new_state(lights=LightsSetup(patrol.survey, clock_ppm=0.0))
+    fresh: list[Record] = []
+
+    def with_light(records: tuple[Record, ...], limits: Limits) -> StepResult:
+        made = step(state, (*fresh, *records), limits)
+        fresh.clear()
+        return made
+
+    x, y, yaw = patrol.mount
+    scans = ScanBridge(LidarConfig(mount=Mount(float(x), float(y), float(np.degrees(yaw)))))
+    status = LidarStatus(link=Link.STREAMING)
+    cycle = Cycle(Parts(clock, with_light, scans, FixedBudget(), CycleWorker(), status, odometry=True))
+    modbus = ModbusPublisher(SystemClock())
+    await modbus.start("127.0.0.1", 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
+        sink.bind(("127.0.0.1", 0))  # and never reads: the kernel drops what does not fit
+        sender = PoseSender([f"127.0.0.1:{sink.getsockname()[1]}"])
+        await sender.start()
+        cycle.parts.sinks += [modbus.publish, sender.publish]
+        try:
+            watch, tracking, errors = await _drive(cycle, patrol, (seconds, clock, fresh), say)
+        finally:
+            await sender.close()
+            await modbus.close()
+    kept = len(state.keyframes), len(state.atlas.submaps), len(state.atlas.constraints.loop)
+    return Days(watch, tracking, float(np.median(errors)), kept)
+
+
+async def _drive(
+    cycle: Cycle, patrol: Patrol, given: tuple[int, Hands, list[Record]], say: Callable[[str], None]
+) -> tuple[Watch, float, list[float]]:
+    seconds, clock, fresh = given
+    watch, took, errors, tracking = Watch(), [], [], 0
+    window = max(seconds // WINDOWS, 1)
+    for number in range(1, seconds + 1):
+        scan = patrol.scan(number)
+        if (light := patrol.light(number)) is not None:
+            fresh.append(light)
+        for reading in patrol.wheels(scan.t_rx):
+            cycle.inbox.put_odometry(reading)
+        cycle.inbox.put_scan(scan)
+        clock.t = scan.t_rx
+        begin = time.thread_time()
+        snapshot = cycle.run()
+        took.append(1e3 * (time.thread_time() - begin))
+        tracking += snapshot.state is State.TRACKING
+        if number % 64 == 0:
+            errors.append(_error(snapshot, patrol))
+            await asyncio.sleep(0)
+        if number % window == 0:
+            gc.collect()
+            times = float(np.median(took)), float(np.percentile(took, 99)), max(took)
+            watch.take(number / 3600.0, os.getpid(), times)
+            took.clear()
+            say(watch.line())
+    return watch, tracking / seconds, errors
+
+
+def _error(snapshot: Snapshot, patrol: Patrol) -> float:
+    if snapshot.pose is None:
+        return math.inf
+    x, y, _ = se2.between(patrol.truth(snapshot.t_mono), np.array(snapshot.pose)).tolist()
+    return math.hypot(x, y)
