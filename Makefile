@@ -11,7 +11,7 @@ RUN    := $(BIN)/python -W default
 .DEFAULT_GOAL := help
 
 
-.PHONY: help venv demo test test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean
+.PHONY: help venv demo test test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean fuzz soak aarch64
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -71,6 +71,14 @@ bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against p
 
 bench-vm: venv  ## the package in an emulated Debian with real kernel interfaces (root for the first run; docs/bench.md)
 	$(RUN) -m tools.bench.vm $(ARGS)
+fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="log --share 1")
+	$(RUN) -m tests.fuzz $(ARGS)
+
+soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anything grow?
+	$(RUN) -m tools.soak $(ARGS)
+
+aarch64: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (qemu-user-static, mmdebstrap)
+	$(RUN) -m tools.bench.aarch64 $(ARGS)
 
 experiments: venv  ## what positions from light reach, in simulated rooms and on recordings (LUMILOOP_DATA)
 	$(RUN) -m tools.experiments lights $(ARGS)

@@ -1,0 +1,73 @@
+"""What counts as growing; a quarter of a simulated day in ``make test-system``, a whole one in ``make test-all``."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tools.soak.watched import ROWS, Watch, process
+
+ROOT = Path(__file__).parents[2]
+
+
+def watch(slope_mb_h: float, files: int = 10) -> Watch:
+    """Six hours: half an hour of start, then a slope; one file more at the end than at the begin, or as many."""
+    rows = []
+    for k in range(1, 61):
+        hours = 0.1 * k
+        memory = 300.0 + min(hours, 0.5) * 200.0 + slope_mb_h * hours
+        rows.append((hours, memory, float(10 if k < 50 else files), 2.0, 1.0, 2.0, 3.0))
+    return Watch(rows)
+
+
+def test_a_slope_after_the_start_is_told() -> None:
+    by_name = {row.name: row for row in watch(0.1).figures("x")}
+    assert by_name["memory, slope"].value == pytest.approx(0.1)
+    assert all(row.ok is not False for row in by_name.values())
+    assert {row.name: row for row in watch(0.7).figures("x")}["memory, slope"].ok is False
+
+
+def test_one_file_more_is_told() -> None:
+    assert {row.name: row for row in watch(0.0, files=11).figures("x")}["files, most less least"].ok is False
+
+
+def test_a_process_is_looked_at() -> None:
+    resident, files, threads = process(os.getpid())
+    assert 10.0 < resident < 10_000.0
+    assert files >= 3
+    assert threads >= 1
+    seen = Watch()
+    seen.take(0.5, os.getpid(), (1.0, 2.0, 3.0))
+    assert len(seen.rows[0]) == len(ROWS)
+    assert "threads" in seen.line()
+
+
+def test_the_graph_is_drawn(tmp_path: Path) -> None:
+    watch(0.1).draw(tmp_path / "out" / "a.png")
+    assert (tmp_path / "out" / "a.png").stat().st_size > 10_000
+
+
+def soak(days: str, out: Path) -> None:
+    command = [sys.executable, "-m", "tools.soak", "--days", days, "--out", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = {row["name"]: row["value"] for row in json.loads((out / "days.json").read_text())}
+    assert rows["cycles in TRACKING"] > 0.3
+    assert rows["position error, median"] < 0.3
+    assert (out / "days.png").exists()
+
+
+@pytest.mark.system
+def test_a_quarter_of_a_day(tmp_path: Path) -> None:
+    soak("0.25", tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_day(tmp_path: Path) -> None:
+    soak("1", tmp_path)
