@@ -7,10 +7,21 @@ anything but the parser's own refusal comes out, and where sound bytes after it 
 
 from __future__ import annotations
 
+import atexit
+import shutil
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 NAMES = ("scip", "adc", "modbus", "udp", "stream", "toml", "map", "log")
+
+
+def a_file(name: str) -> Path:
+    """Where an input can be written, in a folder of its own."""
+    folder = Path(tempfile.mkdtemp(prefix="lumiloop-fuzz-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder / name
 
 
 def refused(call: Callable[..., Any], *arguments: object, by: type[Exception] | tuple[type[Exception], ...]) -> str:

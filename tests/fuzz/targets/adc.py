@@ -43,8 +43,12 @@ def seeds() -> list[bytes]:
 
 
 def mend(data: bytes) -> bytes:
-    """A head that says the length that follows."""
-    return data if len(data) < 5 else struct.pack(">I", len(data) - 4) + data[4:]
+    """Of a frame, a head that says the length that follows; words have no sums."""
+    return (
+        data
+        if len(data) < 5 or data[4] not in range(1, 5) or len(data) == LENGTH
+        else struct.pack(">I", len(data) - 4) + data[4:]
+    )
 
 
 def feeder() -> Callable[[bytes], None]:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import struct
-import tempfile
 import zlib
 from collections.abc import Callable
 from itertools import islice
-from pathlib import Path
 
 from daemon.sources import open_log
 from hal.errors import HalError
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from hal.replay.recording import MARKER, Kind, pack_frame, pack_head, pack_imu, pack_odometry
-from tests.fuzz.targets import refused, scip
+from tests.fuzz.targets import a_file, refused, scip
 
 MEGABYTES = 3
 PARSERS = (
@@ -82,8 +80,7 @@ def mend(data: bytes) -> bytes:
 
 
 def feeder() -> Callable[[bytes], None]:
-    holder = tempfile.TemporaryDirectory(prefix="lumiloop-fuzz-")
-    file = Path(holder.name) / "a.log"
+    file = a_file("a.log")
 
     def play() -> None:
         source = open_log(file)
@@ -92,7 +89,6 @@ def feeder() -> Callable[[bytes], None]:
         source.report.sentences()
 
     def feed(data: bytes) -> None:
-        assert holder
         file.write_bytes(data)
         said = refused(play, by=HalError)
         assert not said or "a.log" in said

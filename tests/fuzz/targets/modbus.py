@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
+import weakref
 from collections.abc import Callable
 
 from daemon.publish import modbus, registers, rtu_frames
@@ -82,4 +83,5 @@ def feeder() -> Callable[[bytes], None]:
         serial(data)
         assert answering.answer(READ)[9:] == registers.encode_block(snapshot()), "nothing may be written there"
 
+    weakref.finalize(feed, loop.close)
     return feed

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 from daemon import configfile, mapserver, surveyfile
 from daemon.config import Config
 from tests.daemon.mapmaker import SURVEY
-from tests.fuzz.targets import refused
+from tests.fuzz.targets import a_file, refused
 
 MEGABYTES = 3
 PARSERS = ("daemon/configfile.py", "daemon/config.py", "daemon/surveyfile.py", "daemon/mapserver.py")
@@ -38,20 +36,18 @@ def mend(data: bytes) -> bytes:
 
 
 def feeder() -> Callable[[bytes], None]:
-    holder = tempfile.TemporaryDirectory(prefix="lumiloop-fuzz-")
-    file = Path(holder.name) / "a.toml"
+    file = a_file("a.toml")
 
     def configured() -> None:
         assert configfile.dump(configfile.load(file))
 
     def feed(data: bytes) -> None:
-        assert holder
         file.write_bytes(data)
         said = refused(configured, by=configfile.ConfigError)
         assert not said or "a.toml" in said
         said = refused(surveyfile.read_survey, file, by=surveyfile.SurveyError)
         assert not said or "a.toml" in said
         said = refused(mapserver.load, file, by=mapserver.BadMapServer)
-        assert not said or holder.name in said
+        assert not said or file.parent.name in said
 
     return feed
