@@ -71,6 +71,7 @@ bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against p
 
 bench-vm: venv  ## the package in an emulated Debian with real kernel interfaces (root for the first run; docs/bench.md)
 	$(RUN) -m tools.bench.vm $(ARGS)
+
 fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="log --share 1")
 	$(RUN) -m tests.fuzz $(ARGS)
 
