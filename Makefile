@@ -11,7 +11,7 @@ RUN    := $(BIN)/python -W default
 .DEFAULT_GOAL := help
 
 
-.PHONY: help venv demo test test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean fuzz soak aarch64
+.PHONY: help venv demo test test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -78,7 +78,7 @@ fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="lo
 soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anything grow?
 	$(RUN) -m tools.soak $(ARGS)
 
-aarch64: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (qemu-user-static, mmdebstrap)
+arm: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (qemu-user-static, mmdebstrap)
 	$(RUN) -m tools.bench.aarch64 $(ARGS)
 
 experiments: venv  ## what positions from light reach, in simulated rooms and on recordings (LUMILOOP_DATA)
