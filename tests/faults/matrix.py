@@ -166,6 +166,20 @@ class Outcome:
             judged += sights[0 if number == 0 and cell.time != "start" else at :]
         return judged
 
+    def lost(self, cell: Cell) -> str:
+        """What came to nothing: scans, blocks of light, or the time without odometry."""
+        spells = [[sight.snapshot for sight in sights] for sights, _ in self.spells() if sights]
+        if cell.device == "lidar":
+            return f"{sum(self._rose([s.missed for s in one]) for one in spells)} scans"
+        if cell.device == "adc":
+            return f"{sum(self._rose([s.light.blocks_lost if s.light else 0 for s in one]) for one in spells)} blocks"
+        gone = sum(not (s.odometry_ok or s.odometry_ok is None) for one in spells for s in one)
+        return f"{gone / max(1, sum(map(len, spells))):.0%} of the time"
+
+    @staticmethod
+    def _rose(counts: list[int]) -> int:
+        return max(counts) - counts[0]
+
     def error_m(self, cell: Cell) -> float:
         """The largest error of a pose."""
         return max((sight.error_m or 0.0 for sight in self.placed(cell)), default=0.0)

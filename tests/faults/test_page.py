@@ -1,0 +1,30 @@
+"""docs/faults.md says what was measured, of every cell, and the measurements say what the table of cells allows."""
+
+from __future__ import annotations
+
+from tests.faults.matrix import cells
+from tests.faults.report import PAGE, kept, page
+
+
+def test_the_page_is_what_was_measured() -> None:
+    assert PAGE.read_text() == page(kept()), "python -m tests.faults --render"
+
+
+def test_every_cell_was_measured_and_survived_unless_it_is_a_known_defect() -> None:
+    results = kept()
+    for cell in cells():
+        assert bool(results[cell.name]["objections"]) == bool(cell.defect), cell.name
+
+
+def test_what_was_measured_is_within_what_the_cell_allows() -> None:
+    results = kept()
+    for cell in cells():
+        if cell.defect:
+            continue
+        one = results[cell.name]
+        assert {str(code) for code in cell.codes} <= set(one["codes"]), cell.name
+        assert set(one["codes"]) <= {str(code) for code in (*cell.codes, *cell.also)}, cell.name
+        assert one["back"] is not None, cell.name
+        assert one["back"] <= cell.back + 0.05, cell.name
+        assert one["error_cm"] <= 10.0, cell.name
+        assert one["sigmas"] <= 3.0, cell.name
