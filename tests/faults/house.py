@@ -158,6 +158,7 @@ class House:
         self.daemon = Daemon(self.settings, self.world)
         for part in ("odometry", "imu"):  # their socket would wait in real time
             self.daemon.network.parts.pop(part)
+        self._port = InputPort(self.clock, "", _PORT)  # a new process has heard nothing yet
         self._port.send_odometry_to(self.daemon.cycle.inbox.put_odometry)
         self._stop, self._anchor = asyncio.Event(), None
         self._running = asyncio.create_task(self.daemon.run(self._stop))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
@@ -313,19 +314,27 @@ def _named(cell: Cell, out: Outcome) -> Iterator[str]:
 def _said(cell: Cell, out: Outcome) -> Iterator[str]:
     """One line each way for every fault that a daemon has named; it may stop before one is over."""
     for number, (sights, lines) in enumerate(out.spells()):
-        named = {fault for sight in sights for fault in sight.faults}
-        come = [line for line in lines if line.level >= logging.WARNING]
-        gone = [line for line in lines if line.text.startswith("over: ") or "works again" in line.text]
-        if len(come) != len(named):
-            yield f"{len(come)} lines say that a fault has come, {len(named)} expected: {_told(come, out)}"
-        if len(gone) > len(named) or (len(gone) < len(named) and not (cell.time == "stop" and number == 0)):
-            yield f"{len(gone)} lines say that a fault has gone, {len(named)} expected: {_told(gone, out)}"
+        named = {int(fault) for sight in sights for fault in sight.faults}
+        come = [_code(line) for line in lines if line.level >= logging.WARNING]
+        gone = [_code(line) for line in lines if line.text.startswith("over: ")]
+        stopped = cell.time == "stop" and number == 0
+        if len(come) != len(set(come)) or not named <= set(come) <= {*cell.codes, *cell.also}:
+            yield f"lines say that {come} have come, {sorted(named)} were named: {_told(lines, out)}"
+        if len(gone) != len(set(gone)) or not set(gone) <= set(come) or (set(gone) != set(come) and not stopped):
+            yield f"lines say that {gone} have gone, {come} had come: {_told(lines, out)}"
     if failed := [line.text for line in out.lines if line.level >= logging.ERROR]:
         yield f"errors: {failed}"
 
 
+def _code(line: Line) -> int:
+    """The fault that a line of the log tells of; 0: none."""
+    found = re.match(r"(?:over: )?fault (\d+): ", line.text)
+    return int(found[1]) if found else 0
+
+
 def _told(lines: list[Line], out: Outcome) -> str:
-    return "; ".join(f"{line.t - out.t_on:+.1f} s {line.text[:120]}" for line in lines)
+    told = [line for line in lines if line.level >= logging.WARNING or line.text.startswith("over: ")]
+    return "; ".join(f"{line.t - out.t_on:+.1f} s {line.text[:120]}" for line in told)
 
 
 def _placed(cell: Cell, out: Outcome) -> Iterator[str]:

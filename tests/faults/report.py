@@ -26,9 +26,9 @@ WORD: Final = {
 }
 TITLE: Final = {"lidar": "Lidar", "adc": "Photodiode (converter and its bus)", "odometry": "Wheel odometry"}
 TIME: Final = {
-    "start": f"there before the start, lifted {FAULT_S:g} s after it",
-    "run": f"while TRACKING at half a metre a second, for {FAULT_S:g} s",
-    "stop": "4 s before a stop, lifted 1 s after the next start",
+    "start": f"There before the start, lifted {FAULT_S:g} s after it",
+    "run": f"While TRACKING at half a metre a second, for {FAULT_S:g} s",
+    "stop": "From 4 s before a stop, until 1 s after the next start",
 }
 
 
@@ -77,7 +77,7 @@ def page(results: dict[str, Measured]) -> str:
             mine = [cell for cell in cells() if (cell.device, cell.time) == (device, time)]
             rows = [_row(cell, results[cell.name]) for cell in mine if cell.name in results]
             head = ("fault", "noticed in", "shown", "TRACKING after", "largest error", "lost")
-            parts.append(f"### {device} at {time}\n\n{TIME[time].capitalize()}.\n\n{_table(head, rows)}")
+            parts.append(f"### {device} at {time}\n\n{TIME[time]}.\n\n{_table(head, rows)}")
     parts.append(_defects())
     return "\n\n".join(parts) + "\n"
 
