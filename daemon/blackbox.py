@@ -99,7 +99,8 @@ class Line:
 
     def said(self) -> bytes:
         """All of it, as records."""
-        return b"".join((*self._opening, *(frame for frame, _ in self._latest)))
+        gap = [pack_frame(Kind.LOST, 0, 0.0, b"what is between is left out")] if self._latest else []
+        return b"".join((*self._opening, *gap, *(frame for frame, _ in self._latest)))
 
 
 class BlackBox:

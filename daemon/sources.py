@@ -223,7 +223,7 @@ class RecordingSource(Source):
         """Open it, at its beginning or at the last state before the instant ``until`` (t_mono); raises `HalError`."""
         whole = open_recording(path)
         self._recording: Recording = beginning(whole, until)
-        self._codec = PassiveHokuyo(device=str(path))
+        self._codec = PassiveHokuyo(device=str(path), untimed=self._recording.first > 0)
         size = sum(file.stat().st_size for file in self._recording.segments)
         super().__init__(path, LogReport(), self._codec.status, size)
         self.files = self._recording.segments

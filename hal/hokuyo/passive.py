@@ -26,10 +26,15 @@ class PassiveHokuyo:
         geometry: used until the bytes hold a PP reply.
         device: the port the bytes came through, as far as known (errors name it; its kind tells the line's speed).
         baud: rate of an RS-232 line in bit/s, 0 for any other.
+        untimed: a scan whose time cannot be told is given its arrival instead of being passed over: the times are known
+            from elsewhere, and what came before the bytes is not.
     """
 
-    def __init__(self, geometry: LidarGeometry | None = None, *, device: str = "capture", baud: int = 0) -> None:
+    def __init__(
+        self, geometry: LidarGeometry | None = None, *, device: str = "capture", baud: int = 0, untimed: bool = False
+    ) -> None:
         self._device = device
+        self._untimed = untimed
         self._baud = baud
         self._splitter = FrameSplitter()
         self._identity = None if geometry is None else _given(geometry)
@@ -99,7 +104,7 @@ class PassiveHokuyo:
             speed = line_speed(self._device, self._baud, self._identity.facts)
             stream = self._stream = ScanStream(self._identity, asked, self._status, speed)
         stream.request = asked  # a counted stream counts down in its echo
-        scan = stream.take(reply, t_rx, self._seq)
+        scan = stream.take(reply, t_rx, self._seq, self._untimed)
         self._seq += 1
         if scan is None:
             self._status.invalid += 1

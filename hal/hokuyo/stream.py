@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -52,8 +53,10 @@ class ScanStream:
         """Learned time between two scans of the stream, host seconds."""
         return self._clock.period_s
 
-    def take(self, reply: Reply, t_rx: float, seq: int) -> RawScan | None:
+    def take(self, reply: Reply, t_rx: float, seq: int, untimed: bool = False) -> RawScan | None:
         """Decode and time one data reply; None where its time cannot be told without guessing.
+
+        ``untimed``: such a scan is given its arrival for its time, with no end of doubt, for whoever knows better.
 
         Raises:
             BadFrame: the reply is damaged or of another request.
@@ -64,7 +67,9 @@ class ScanStream:
             self._status.clock_resets += self._clock.resets - self._resets_seen
             self._resets_seen = self._clock.resets
         if when is None:
-            return None
+            if not untimed:
+                return None
+            when = ScanTime(t_rx, math.inf, 1)
         self._status.missed += when.periods - 1
         return self._scan(data, when, t_rx, seq)
 

@@ -10,6 +10,7 @@ import pytest
 
 from daemon import cli
 from daemon.publish.snapshot import State
+from daemon.why import spans
 from tests.daemon.test_process import fake_lidar, running
 
 
@@ -29,6 +30,33 @@ def test_a_killed_run_is_repeated_to_the_last_bit(tmp_path: Path) -> None:
     assert compared["differ"] == 0, compared["first_difference"]
     assert compared["cycles"] > 3.0 / 0.025 / 4
     assert summary["config"]["lidar"]["device"] == str(link)
+
+
+@pytest.mark.realtime
+@pytest.mark.system
+def test_the_ring_of_a_killed_run_is_a_dump_after_the_next_start_and_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half a second of the run is lost at most."""
+    link, folder = tmp_path / "lidar", tmp_path / "ring"
+    with fake_lidar(link), running(link, "--record", str(folder), "--last", "1") as daemon:
+        daemon.until(30.0, "state", State.TRACKING)
+        time.sleep(33.0)  # past the first state
+        killed = time.time()
+        daemon.process.kill()
+        daemon.process.wait(10.0)
+    with fake_lidar(link), running(link, "--record", str(folder), "--last", "1") as daemon:
+        daemon.until(30.0, "state", State.TRACKING)
+    (dump,) = folder.glob("dump-*-died")
+    assert spans(dump)[0].end > killed - 0.5 - 0.1
+    state = sorted(dump.glob("*.lumistate"))[0]
+    for segment in dump.glob("*.lumirec"):
+        if segment.stem < state.stem:
+            segment.unlink()
+    assert cli.main(["replay", str(dump), "--out", str(tmp_path / "out")]) == cli.OK
+    compared = json.loads((tmp_path / "out" / "summary.json").read_text())["recorded_run"]
+    assert compared["differ"] == 0, compared["first_difference"]
+    assert compared["cycles"] > 20
 
 
 @pytest.mark.realtime
