@@ -164,6 +164,10 @@ def arrivals(scene: Scenario) -> Iterator[tuple[float, object]]:
     return merge(*streams, key=lambda arrived: arrived[0])
 
 
+ANYWHERE: Final = 1e6
+"""Variance that stands for none: the place is being looked for."""
+
+
 def run(scene: Scenario) -> Array:
     """(cycles, columns) track of one scenario, see :data:`COLUMNS`."""
     robot = robot_of(scene)
@@ -182,10 +186,9 @@ def run(scene: Scenario) -> Array:
 
 def _row(snapshot: Snapshot, true: Array) -> list[float]:
     assert snapshot.pose is not None
-    assert snapshot.covariance is not None
     e = np.array(snapshot.pose) - true
     e[2] = se2.wrap(float(e[2]))
-    xx, xy, yy, xt, yt, tt = snapshot.covariance
+    xx, xy, yy, xt, yt, tt = snapshot.covariance or (ANYWHERE, 0.0, ANYWHERE, 0.0, 0.0, ANYWHERE)
     P = np.array(((xx, xy, xt), (xy, yy, yt), (xt, yt, tt)))
     largest = np.sqrt(max(np.linalg.eigvalsh(P[:2, :2])[-1], 0.0))
     trust, light = snapshot.trust, snapshot.light
