@@ -1,0 +1,239 @@
+"""Faults of the computer and of what runs on it, on real processes: the same process all along, and TRACKING again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from daemon.health import Fault
+from daemon.publish.holding import CommandCode, Outcome
+from daemon.publish.snapshot import State
+from tests.daemon.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
+from tests.daemon.test_store_process import ask
+
+pytestmark = [pytest.mark.realtime, pytest.mark.system, pytest.mark.timeout(600)]
+
+READY_S, TRACKING_S = 3.0, 5.0
+"""From the end of a killed process to READY and TRACKING of the next, on an idle machine; here with fourfold slack."""
+
+
+def newest(daemon: Running) -> dict[str, object]:
+    """A datagram sent from now on."""
+    daemon.poses.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            daemon.poses.recv(2000)
+    return dict(daemon.reading())
+
+
+def tracking(daemon: Running, seconds: float = PATIENCE_S) -> None:
+    newest(daemon)
+    daemon.until(seconds, "state", State.TRACKING)
+
+
+def named(daemon: Running, fault: Fault, seconds: float) -> None:
+    newest(daemon)
+    daemon.until(seconds, "fault", int(fault))
+
+
+def over(daemon: Running, seconds: float) -> None:
+    newest(daemon)
+    daemon.until(seconds, "fault", 0)
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[Path]:
+    """A file system of its own with no room to speak of."""
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], check=False)
+    if mounted.returncode:
+        pytest.skip("file systems cannot be mounted here: run as root, in a container that may")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """Take all that is left."""
+    ballast = disk / "ballast"
+    with ballast.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    return ballast
+
+
+def disk_full(daemon: Running, disk: Path) -> None:
+    ballast = fill(disk)
+    assert ask(daemon, 11, CommandCode.SAVE_MAP) is Outcome.REFUSED
+    named(daemon, Fault.MAP_NOT_SAVED, 8.0)
+    ballast.unlink()
+    assert ask(daemon, 12, CommandCode.SAVE_MAP) is Outcome.DONE
+    over(daemon, 20.0)
+
+
+def read_only(daemon: Running, disk: Path) -> None:
+    """Another file system lies over the folder's, and may not be written."""
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "ro", "tmpfs", disk], check=True)
+    try:
+        assert ask(daemon, 13, CommandCode.SAVE_MAP) is Outcome.REFUSED
+        named(daemon, Fault.MAP_NOT_SAVED, 8.0)
+    finally:
+        subprocess.run(["umount", disk], check=True)
+    assert ask(daemon, 14, CommandCode.SAVE_MAP) is Outcome.DONE
+    over(daemon, 20.0)
+
+
+def stopped(daemon: Running, _disk: Path) -> None:
+    daemon.process.send_signal(signal.SIGSTOP)
+    time.sleep(3.0)
+    daemon.process.send_signal(signal.SIGCONT)
+    named(daemon, Fault.LOOP_STALLED, 5.0)
+    tracking(daemon)
+    over(daemon, 40.0)
+
+
+def stuck_clients(daemon: Running, _disk: Path) -> None:
+    """Half a request, and never a word read of what is answered to a thousand whole ones."""
+    lines = [socket.create_connection(("127.0.0.1", daemon.modbus), 5.0) for _ in range(4)]
+    try:
+        lines[0].sendall(b"\0\1\0\0\0\6\1")
+        for line in lines[1:]:
+            line.setblocking(False)
+            with contextlib.suppress(BlockingIOError, ConnectionError):
+                for _ in range(1000):
+                    line.send(struct.pack(">HHHBBHH", 1, 0, 6, 1, 4, 0, 100))
+        steady(daemon)
+    finally:
+        for line in lines:
+            line.close()
+
+
+def slow_listener(daemon: Running, disk: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        line.connect(str(disk.parent / "lumiloop" / "lumiloop.stream"))
+        steady(daemon)
+
+
+def steady(daemon: Running, seconds: float = 3.0) -> None:
+    """Poses go on coming, all of them of a robot that is TRACKING."""
+    first = newest(daemon)
+    time.sleep(seconds)
+    last = newest(daemon)
+    assert first["state"] == last["state"] == State.TRACKING
+    came = int(str(last["seq"])) - int(str(first["seq"]))
+    assert came > 40 * seconds / 4, f"{came} poses in {seconds} s"
+    assert last["fault"] in (0, Fault.LOOP_STALLED, Fault.OVERRUNS, Fault.LIDAR_GAPS), "a loaded machine, no more"
+
+
+CHAIN: list[Callable[[Running, Path], None]] = [stopped, stuck_clients, slow_listener, disk_full, read_only]
+
+
+def test_one_process_survives_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    link = tmp_path / "lidar"
+    with small_disk(tmp_path / "disk") as disk:
+        keys = ("--set", f"map.folder={disk / 'maps'}", "--set", "modbus.write=true")
+        with running(link, *keys) as daemon:
+            with fake_lidar(link):
+                tracking(daemon)
+                before = link.readlink()
+                for harm in CHAIN:
+                    harm(daemon, disk)
+                    tracking(daemon)
+                    assert daemon.process.poll() is None, harm.__name__
+            named(daemon, Fault.LIDAR_MISSING, 10.0)
+            other = os.openpty()  # takes the number that the lidar had
+            with fake_lidar(link):
+                assert link.readlink() != before, "the lidar has come back as another tty"
+                tracking(daemon)
+                over(daemon, 40.0)
+            for end in other:
+                os.close(end)
+            code, log, _ = daemon.stop()
+    assert code == 0, log
+    assert "Traceback" not in log
+    for fault in (Fault.LOOP_STALLED, Fault.MAP_NOT_SAVED, Fault.LIDAR_MISSING):
+        come, gone = log.count(f" fault {int(fault)}: "), log.count(f"over: fault {int(fault)}: ")
+        assert come - gone == gone >= 1, f"fault {int(fault)}: said {come - gone} times, over {gone} times"
+
+
+def test_killed_it_comes_back_with_its_map(tmp_path: Path) -> None:
+    link, maps = tmp_path / "lidar", tmp_path / "maps"
+    keys = ("--set", f"map.folder={maps}", "--set", "modbus.write=true")
+    with fake_lidar(link):
+        with running(link, *keys) as daemon:
+            tracking(daemon)
+            assert ask(daemon, 1, CommandCode.SAVE_MAP) is Outcome.DONE
+            map_id = newest(daemon)["map_id"]
+            daemon.process.kill()
+            daemon.process.wait()
+        with running(link, *keys) as again:
+            first = again.until(4 * READY_S, "state", *(state for state in State if state is not State.STARTING))
+            assert first["map_id"] == map_id
+            again.until(4 * (READY_S + TRACKING_S), "state", State.TRACKING)
+            again.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("harm", ["truncated", "garbage", "empty"])
+def test_a_map_that_is_damaged_is_named_and_left_aside(tmp_path: Path, harm: str) -> None:
+    link, maps = tmp_path / "lidar", tmp_path / "maps"
+    maps.mkdir()
+    whole = (ROOT / "tests" / "daemon" / "data" / "version-1.lumimap").read_bytes()
+    bad = {"truncated": whole[: len(whole) // 2], "garbage": os.urandom(len(whole)), "empty": b""}[harm]
+    (maps / "map-00001234-00000001.lumimap").write_bytes(bad)
+    with fake_lidar(link), running(link, "--set", f"map.folder={maps}") as daemon:
+        named(daemon, Fault.MAP_REFUSED, 20.0)
+        tracking(daemon)
+        code, log, _ = daemon.stop()
+    assert code == 0, log
+    assert "is refused" in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize(
+    "text", ["[lidar\ndevice = 'auto'", "[lidar]\ndevice = 'aut", "\0\1\2\3", "[lidar]\ndevise = 1"]
+)
+def test_a_configuration_that_is_damaged_is_refused_with_its_place(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    command = [sys.executable, "-m", "daemon", "run", "--config", str(path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60.0)
+    assert done.returncode == 2, done.stderr
+    assert "robot.toml" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_memory_that_cannot_be_had_stops_no_pose(tmp_path: Path) -> None:
+    """The process may grow by 4 MB and no more for some seconds; what it refuses is refused, poses go on."""
+    if shutil.which("prlimit") is None:
+        pytest.skip("prlimit is missing: apt-get install util-linux")
+    link = tmp_path / "lidar"
+    with fake_lidar(link), running(link, "--set", f"map.folder={tmp_path / 'maps'}") as daemon:
+        tracking(daemon)
+        pid = daemon.process.pid
+        size = int(Path(f"/proc/{pid}/statm").read_text().split()[0]) * resource.getpagesize()
+        before = resource.prlimit(pid, resource.RLIMIT_AS)
+        resource.prlimit(pid, resource.RLIMIT_AS, (size + (4 << 20), before[1]))
+        time.sleep(5.0)
+        resource.prlimit(pid, resource.RLIMIT_AS, before)
+        tracking(daemon)
+        assert daemon.process.poll() is None
+        code, log, _ = daemon.stop()
+    assert code == 0, log
