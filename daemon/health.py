@@ -78,7 +78,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "take load off the computer; look for a slow line, a USB hub or a network in between",
     ),
     Fault.LIDAR_MISFIT: (
-        "what the lidar measures does not fit the map where the robot must be",
+        "what the lidar measures does not fit the map where the robot must be, or anywhere after a start",
         "was the robot moved by hand? is the lidar covered, shifted on its mount, or does it measure wrongly?",
     ),
     Fault.ADC_BUS_MISSING: (

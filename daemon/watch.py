@@ -29,6 +29,10 @@ LEARNING: Final = 0.03
 """Weight of a window of readings in the usual rate: what lasts for a minute has become usual."""
 MISFIT_S: Final = 2.0
 """A laser that is at odds with the map for this long is told, once the place had been known."""
+NOWHERE_S: Final = 5.0
+"""The same after a start, where no place in the whole map fits; in a room a search takes 1.4 s of it."""
+FITS_S: Final = 1.5
+"""TRACKING has to last for this long to take it back: wrong ranges, too, now and then fit for a moment."""
 DISAGREE_S: Final = 1.0
 """Wheels and laser have to disagree for this long, as in the state machine."""
 ODD: Final = (State.RELOCATING, State.AMBIGUOUS, State.LOST)
@@ -51,6 +55,7 @@ class Watch:
         self._t_learned = 0.0
         self._known = False
         self._odd_since: float | None = None
+        self._fits_since: float | None = None
 
     def on_scan(self, scan: RawScan, period: float) -> None:
         """A scan has been taken."""
@@ -84,9 +89,19 @@ class Watch:
         """A cycle has judged; ``scans``: they arrive."""
         since = memory.disagree_since
         self.disagree = since is not None and t_mono - since >= DISAGREE_S
-        self._known |= memory.state is State.TRACKING
-        if memory.state is State.TRACKING or not scans or not self._known:
+        self.misfit = self._at_odds(t_mono, memory, scans)
+
+    def _at_odds(self, t_mono: float, memory: Memory, scans: bool) -> bool:
+        """Whether the laser has been at odds with the map for long enough to be told."""
+        fits = memory.state is State.TRACKING
+        self._known |= fits
+        self._fits_since = (t_mono if self._fits_since is None else self._fits_since) if fits else None
+        nowhere = memory.state is State.RELOCATING and memory.reason is Reason.SEARCHING
+        odd = (memory.reason is Reason.MATCH_FAILED or memory.state in ODD) if self._known else nowhere
+        settled = self._fits_since is not None and t_mono - self._fits_since >= FITS_S
+        if not scans or settled or not (self._known or nowhere):
             self._odd_since = None
-        elif self._odd_since is None and (memory.reason is Reason.MATCH_FAILED or memory.state in ODD):
+        elif self._odd_since is None and odd:
             self._odd_since = t_mono
-        self.misfit = self._odd_since is not None and t_mono - self._odd_since >= MISFIT_S
+        enough = MISFIT_S if self._known else NOWHERE_S
+        return self._odd_since is not None and t_mono - self._odd_since >= enough

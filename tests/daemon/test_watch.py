@@ -68,23 +68,46 @@ def test_late_scans_are_counted() -> None:
     assert watch.late == 1
 
 
+ODD = Memory(State.RELOCATING, Reason.SEARCHING)
+FIT = Memory(State.TRACKING, Reason.NONE)
+
+
+def judged(watch: Watch, begin: float, end: float, memory: Memory) -> bool:
+    """What is said after verdicts ten times a second."""
+    for k in range(round(10 * begin), round(10 * end) + 1):
+        watch.on_verdict(k / 10, memory, scans=True)
+    return watch.misfit
+
+
 def test_a_laser_at_odds_with_a_place_that_was_known() -> None:
-    watch, odd = Watch(), Memory(State.RELOCATING, Reason.SEARCHING)
-    for t in range(10):
-        watch.on_verdict(float(t), odd, scans=True)
-    assert not watch.misfit, "a place that is not known yet cannot be contradicted"
-    watch.on_verdict(10.0, Memory(State.TRACKING, Reason.NONE), scans=True)
-    watch.on_verdict(10.1, Memory(State.DEGRADED, Reason.MATCH_FAILED), scans=True)
-    watch.on_verdict(11.9, Memory(State.DEGRADED, Reason.CONFIRMING), scans=True)
-    assert not watch.misfit
-    watch.on_verdict(12.2, odd, scans=True)
-    assert watch.misfit
-    watch.on_verdict(12.3, odd, scans=False)
+    watch = Watch()
+    assert not judged(watch, 0.0, 3.0, FIT)
+    assert not judged(watch, 3.1, 3.1, Memory(State.DEGRADED, Reason.MATCH_FAILED))
+    assert not judged(watch, 3.2, 4.9, Memory(State.DEGRADED, Reason.CONFIRMING))
+    assert judged(watch, 5.0, 5.2, ODD)
+    watch.on_verdict(5.3, ODD, scans=False)
     assert not watch.misfit, "a laser that is silent says nothing"
-    watch.on_verdict(20.0, odd, scans=True)
-    watch.on_verdict(23.0, odd, scans=True)
-    watch.on_verdict(23.1, Memory(State.TRACKING, Reason.NONE), scans=True)
-    assert not watch.misfit
+    assert judged(watch, 6.0, 9.0, ODD)
+    assert not judged(watch, 9.1, 11.0, FIT)
+
+
+def test_wrong_ranges_that_fit_for_a_moment_are_wrong_all_the_same() -> None:
+    watch = Watch()
+    assert not judged(watch, 0.0, 3.0, FIT)
+    assert judged(watch, 3.1, 5.3, ODD)
+    assert judged(watch, 5.4, 6.4, FIT), "the heartbeat looks once a second"
+    assert judged(watch, 6.5, 7.0, ODD)
+    assert not judged(watch, 7.1, 9.0, FIT)
+    assert not judged(watch, 9.1, 10.0, ODD), "what has fitted for longer begins anew"
+
+
+def test_a_laser_that_fits_nowhere_in_the_map_after_a_start() -> None:
+    watch = Watch()
+    assert not judged(watch, 0.0, 4.5, ODD), "the place is being looked for"
+    assert not judged(watch, 4.6, 9.0, Memory(State.AMBIGUOUS, Reason.SEVERAL_PLACES)), "several fit"
+    assert not judged(watch, 9.1, 14.0, ODD)
+    assert judged(watch, 14.1, 14.2, ODD)
+    assert not judged(watch, 14.3, 14.3, Memory(State.MAPPING, Reason.UNPROVED))
 
 
 def test_disagreement_counts_whatever_else_is_said() -> None:

@@ -53,6 +53,7 @@ class Cell:
     states: tuple[str, ...] = ("TRACKING",)
     back: float = 0.0
     gone: float = 12.0
+    widened: str = ""
     defect: str = ""
 
     @property

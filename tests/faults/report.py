@@ -78,8 +78,8 @@ def page(results: dict[str, Measured]) -> str:
             rows = [_row(cell, results[cell.name]) for cell in mine if cell.name in results]
             head = ("fault", "noticed in", "shown", "TRACKING after", "largest error", "lost")
             parts.append(f"### {device} at {time}\n\n{TIME[time]}.\n\n{_table(head, rows)}")
-    parts.append(_defects())
-    return "\n\n".join(parts) + "\n"
+    parts += [_widened(), _defects()]
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def _row(cell: Cell, one: Measured) -> tuple[str, ...]:
@@ -92,6 +92,25 @@ def _row(cell: Cell, one: Measured) -> tuple[str, ...]:
     mark = " (defect, below)" if cell.defect else ""
     name = f"{cell.word}: {WORD[cell.word]}{mark}"
     return name, noticed + silent or "-", ", ".join(one["states"]), back or f"{one['back']:.1f} s", error, one["lost"]
+
+
+def _widened() -> str:
+    """What the table of cells demands less than was first wanted; once where it holds at every time."""
+    always = {(cell.device, cell.word): cell.widened for cell in cells() if cell.time == "run"}
+    rows: list[tuple[str, ...]] = []
+    for cell in cells():
+        common = cell.widened == always[cell.device, cell.word]
+        if cell.widened and (cell.time == "run" or not common):
+            name = f"{cell.device} {cell.word}" if common else cell.name
+            rows.append((name, f"{cell.noticed:g} s", f"{cell.back:g} s", f"{cell.gone:g} s", cell.widened))
+    if not rows:
+        return ""
+    told = (
+        "These bounds were written down before anything was measured, and moved afterwards to what this daemon does: "
+        "they hold it to that, and are no proof that it is good enough. Where no time is named, it is the run's."
+    )
+    head = ("fault", "noticed in", "TRACKING after", "over after", "what was first wanted, and why it is not so")
+    return f"## Bounds that were moved\n\n{told}\n\n{_table(head, rows)}"
 
 
 def _defects() -> str:
