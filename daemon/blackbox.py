@@ -47,6 +47,7 @@ CYCLE_PARTS: Final = (
     "alarm", "trust", "inbox", "paused", "watch", "_used",
 )  # fmt: skip
 """What a cycle remembers."""
+UNDER_WAY: Final = "another dump is just being made"
 QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
 """Faults that a dump cannot tell anything about."""
 
@@ -130,6 +131,7 @@ class BlackBox:
         self._present: frozenset[Fault] = frozenset()
         self._dumped: dict[Fault, float] = {}
         self._pending: tuple[float, Fault] | None = None
+        self._asked = False
 
     @property
     def failing(self) -> str:
@@ -170,13 +172,24 @@ class BlackBox:
                 self._due = now + self._every_s
 
     def dump(self, told: Told) -> None:
-        """Make a dump of what there is, now; ``told`` in this thread when it is there, or why not."""
+        """Make a dump of what there is, now; ``told`` in this thread when it is there, or why not.
+
+        One at a time: each holds a state until the disk has it.
+        """
+        if self._asked:
+            told(UNDER_WAY)
+            return
         loop = asyncio.get_running_loop()
 
+        def end(reason: str) -> None:
+            self._asked = False
+            told(reason)
+
         def back(reason: str) -> None:
-            loop.call_soon_threadsafe(told, reason)
+            loop.call_soon_threadsafe(end, reason)
 
         self._dump("asked", "somebody has asked for it", back)
+        self._asked = True
 
     def close(self, ended: bool) -> None:
         """Finish what is under way; after the disk."""

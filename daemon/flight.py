@@ -141,6 +141,7 @@ class Flight:
         segment = self._segments.setdefault(begun.number, _Segment())
         segment.t_mono = begun.t_mono
         if begun.taken is None:
+            self._prune(begun.t_mono)
             return
         from daemon.checkpoint import CannotTake
         from daemon.statefile import write_state
@@ -152,6 +153,7 @@ class Flight:
             )
         except (OSError, CannotTake) as error:
             self._fail("the state of the estimator", error)
+            self._prune(begun.t_mono)
             return
         segment.state = True
         segment.bytes += self.state_bytes
@@ -171,7 +173,11 @@ class Flight:
             self._segments.setdefault(number, _Segment()).bytes += path.stat().st_size
 
     def _prune(self, now: float) -> None:
-        """Take away what is older than asked for, and then what there is no room for."""
+        """Take away what is older than asked for, and then what there is no room for.
+
+        Where states cannot be had, a ring that holds twice what it may goes on without a beginning: it must not fill
+        the disk that the maps go to.
+        """
         starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
         old = [number for number in starts if self._segments[number].t_mono <= now - self._keep_s]
         if old:
@@ -179,9 +185,14 @@ class Flight:
         for start in starts:
             if start > min(self._segments) and self._too_much():
                 self._remove_before(start)
+        while len(self._segments) > 1 and self._bytes() > 2.0 * self._most:
+            self._remove_before(sorted(self._segments)[1])
+
+    def _bytes(self) -> int:
+        return sum(segment.bytes for segment in self._segments.values())
 
     def _too_much(self) -> bool:
-        if sum(segment.bytes for segment in self._segments.values()) > self._most:
+        if self._bytes() > self._most:
             return True
         try:
             room = shutil.disk_usage(self._folder).free
@@ -208,7 +219,7 @@ class Flight:
         name = f"{DUMP}{about['at']}-{about['reason']}"
         try:
             made = _linked(self._folder, self._names(begin), self._folder.parent / name, about)
-            _prune_dumps(self._folder.parent)
+            _prune_dumps(self._folder.parent, made)
         except OSError as error:
             self._fail("a dump", error)
             told(f"{self._folder.parent}: {error.strerror or error}")
@@ -268,8 +279,10 @@ def _free(path: Path) -> Path:
     return free
 
 
-def _prune_dumps(parent: Path) -> None:
-    for old in sorted(parent.glob(f"{DUMP}*"))[:-DUMPS]:
+def _prune_dumps(parent: Path, made: Path) -> None:
+    """Remove the oldest by their names, never the one just ``made``: the clock may not have been set yet."""
+    others = sorted(path for path in parent.glob(f"{DUMP}*") if path != made)
+    for old in others[: -(DUMPS - 1)]:
         shutil.rmtree(old, ignore_errors=True)
 
 
@@ -295,6 +308,6 @@ def _see_to(mark: Path) -> None:
         kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
         mark.parent.rename(kept)
         log.warning("the run before this one did not end as it should: what it recorded last is in %s", kept)
-        _prune_dumps(kept.parent)
+        _prune_dumps(kept.parent, kept)
     except OSError as error:
         log.warning("%s: the ring of an earlier run stays as it is: %s", mark.parent, error.strerror)

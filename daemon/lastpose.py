@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Final
 
 from daemon.publish.snapshot import Snapshot, State
+from daemon.wholefile import sync_folder
 
 log = logging.getLogger(__name__)
 
@@ -201,6 +202,7 @@ class LastPose:
         if self._file < 0:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            sync_folder(self.path.parent)
         os.pwrite(self._file, packed(told), _SLOT_BYTES * (told.number % 2))
         self._dirty = True
 

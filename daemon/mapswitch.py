@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from daemon.store import Judge, Start, Store, said
 from daemon.store_file import BadMap
@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
 Told = Callable[[str], None]
 NOTHING_TO_SAVE: Final = (DONE, NO_MAP, FIXED, ADRIFT)
 
@@ -88,10 +89,10 @@ class Maps:
     keep: Callable[[str, bytes], None] | None = None
 
 
-async def _in_thread(work: Callable[[], Switch]) -> Switch:
+async def _in_thread(work: Callable[[], T]) -> T:
     """What a thread of its own makes of it."""
     loop = asyncio.get_running_loop()
-    ended: asyncio.Future[Switch] = loop.create_future()
+    ended: asyncio.Future[T] = loop.create_future()
 
     def end(settle: Callable[[], None]) -> None:
         if not ended.done():
@@ -144,9 +145,13 @@ class MapSwitch:
             return NOT_LOADED
         if map_id == self._keeper.map_id:
             return IN_USE
-        if not any(one.map_id == map_id for one in store.generations()):
-            there = sorted({f"{one.map_id:08x}" for one in store.generations() if one.map_id >= 0})
-            return f"there is no map {map_id:08x} in {store.folder}; there are: {', '.join(there) or 'none'}"
+        try:
+            there = {one.map_id for one in await _in_thread(store.generations) if one.map_id >= 0}
+        except OSError as error:
+            return f"{store.folder}: {said(error)}"
+        if map_id not in there:
+            named = ", ".join(f"{one:08x}" for one in sorted(there)) or "none"
+            return f"there is no map {map_id:08x} in {store.folder}; there are: {named}"
         if (reason := await self._saved()) not in NOTHING_TO_SAVE:
             return f"the map in use cannot be saved: {reason}"
         try:

@@ -77,9 +77,12 @@ class MapTiles:
             self.version += 1
 
     def close(self) -> None:
-        """Stop drawing."""
-        if self._thread is not None:
-            self._thread.shutdown(wait=False, cancel_futures=True)
+        """Stop drawing, until it is followed again; idempotent."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.shutdown(wait=False, cancel_futures=True)
+            self._busy = False
+            self.forget()
 
     def since(self, shown: Shown) -> list[tuple[Shown, bytes]]:
         """The tiles that come after one in the order of their versions, and of their places in each."""
@@ -125,6 +128,8 @@ class MapTiles:
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "lumiloop-tiles", _step_back)
 
+        live = self._live
+
         def work() -> None:
             done: tuple[Progress, dict[Tile, bytes]] | None = None
             try:
@@ -133,19 +138,25 @@ class MapTiles:
             except Exception:  # what is shown of the map must not harm who drives by it; told in full
                 log.exception("the map cannot be drawn for the stream")
             try:
-                loop.call_soon_threadsafe(self._take, done, adrift, left, loop)
+                loop.call_soon_threadsafe(self._take, live, done, adrift, left, loop)
             except RuntimeError:
                 return  # the loop has closed: nobody waits any more
 
         self._thread.submit(work)
 
     def _take(
-        self, done: tuple[Progress, dict[Tile, bytes]] | None, adrift: float, left: int, loop: AbstractEventLoop
+        self,
+        live: LiveMap | None,
+        done: tuple[Progress, dict[Tile, bytes]] | None,
+        adrift: float,
+        left: int,
+        loop: AbstractEventLoop,
     ) -> None:
         """Take in what was drawn, and go on with it."""
-        live = self._live
+        if live is None or live is not self._live:
+            return  # it was closed meanwhile
         self._busy = False
-        if done is None or live is None:
+        if done is None:
             self.error = "it cannot be drawn, see the log"
             return
         progress, packed = done
@@ -180,9 +191,11 @@ def _adrift(state: State) -> float:
 
 def _stands(state: State, submap: Submap) -> bool:
     """Whether a submap is a part of the map: in the graph, or in another one's place."""
-    if state.atlas.submaps.get(submap.key) is submap:
-        return True
-    return submap.into is not None and _stands(state, submap.into[0])
+    while state.atlas.submaps.get(submap.key) is not submap:
+        if submap.into is None:
+            return False
+        submap = submap.into[0]
+    return True
 
 
 def _newer(state: State, seen: int) -> list[Any]:

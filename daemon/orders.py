@@ -24,6 +24,8 @@ Told = Callable[[str], None]
 """Told the end of something: empty, or why it came to nothing."""
 
 NOT_HERE: Final = "this run cannot do that"
+ASKED: Final = 8
+"""Requests that are waited for, the latest: a client hears of its last one only."""
 
 
 @dataclass(slots=True)
@@ -66,7 +68,8 @@ class Orders:
         order = Order[request.code.name]
         pose = np.array(request.pose) if order is Order.SET_POSE else None
         self._feeds.on_command(Command(self._clock.now(), order, pose))
-        self._asked.append(_Asked(request.number, placed=order not in (Order.PAUSE, Order.RESUME)))
+        asked = _Asked(request.number, placed=order not in (Order.PAUSE, Order.RESUME))
+        self._asked = [*self._asked, asked][-ASKED:]
 
     def published(self, snapshot: Snapshot) -> None:
         """The cycle that took the orders has published: they are done; a sink of the cycle."""

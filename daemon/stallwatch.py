@@ -86,8 +86,9 @@ class StallWatch:
     def close(self) -> None:
         """Stop watching; idempotent."""
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        if self._schedstat >= 0:
+        if signal.getsignal(signal.SIGALRM) == self._ring:
             signal.signal(signal.SIGALRM, self._before)
+        if self._schedstat >= 0:
             os.close(self._schedstat)
         self._schedstat = -1
 

@@ -23,6 +23,8 @@ SILENT_S: Final = 1.0
 WINDOW_S: Final = 2.0
 ENOUGH: Final = 20
 """Readings that a rate is judged by."""
+READINGS: Final = 2560
+"""Readings whose arrival is kept: of a window and more at 1 kHz."""
 FEWER: Final = 0.6
 """Part of the usual rate of readings below which they come more seldom than before."""
 LEARNING: Final = 0.03
@@ -33,6 +35,8 @@ NOWHERE_S: Final = 5.0
 """The same after a start, where no place in the whole map fits; in a room a search takes 1.4 s of it."""
 FITS_S: Final = 1.5
 """TRACKING has to last for this long to take it back: wrong ranges, too, now and then fit for a moment."""
+QUIET_S: Final = 10.0
+"""So long without a scan that did not fit takes it back too: where a witness is missing, TRACKING may not come for hours."""
 DISAGREE_S: Final = 1.0
 """Wheels and laser have to disagree for this long, as in the state machine."""
 ODD: Final = (State.RELOCATING, State.AMBIGUOUS, State.LOST)
@@ -50,11 +54,12 @@ class Watch:
     def __init__(self) -> None:
         self.late = self.readings = self.missed = self.old = 0
         self.misfit = self.disagree = False
-        self._arrived: deque[float] = deque(maxlen=512)
+        self._arrived: deque[float] = deque(maxlen=READINGS)
         self._usual_hz = 0.0
         self._t_learned = 0.0
         self._known = False
         self._odd_since: float | None = None
+        self._odd_last = 0.0
         self._fits_since: float | None = None
 
     def on_scan(self, scan: RawScan, period: float) -> None:
@@ -101,7 +106,10 @@ class Watch:
         settled = self._fits_since is not None and t_mono - self._fits_since >= FITS_S
         if not scans or settled or not (self._known or nowhere):
             self._odd_since = None
-        elif self._odd_since is None and odd:
-            self._odd_since = t_mono
+        elif odd:
+            self._odd_since = t_mono if self._odd_since is None else self._odd_since
+            self._odd_last = t_mono
+        elif t_mono - self._odd_last >= QUIET_S:
+            self._odd_since = None
         enough = MISFIT_S if self._known else NOWHERE_S
         return self._odd_since is not None and t_mono - self._odd_since >= enough

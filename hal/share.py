@@ -67,8 +67,11 @@ class Reader:
         self._loop.add_reader(fd, self._read)
 
     def close(self) -> None:
-        """Call back no more; idempotent."""
+        """Call back no more; idempotent: the number of a closed socket may be another one's by then."""
+        if self._fd < 0:
+            return
         self._loop.remove_reader(self._fd)
+        self._fd = -1
         if self._waiting is not None:
             self._waiting.cancel()
 

@@ -333,7 +333,7 @@ class Client(asyncio.Protocol):
     def _ask(self, body: bytes) -> None:
         try:
             wanted = _request(body).get("want")
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:  # a key that is no text is told by the latter
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # a key that is no text; too deep
             self._refuse(f"a request that is no msgpack map: {error}")
             return
         if not isinstance(wanted, list) or not all(isinstance(topic, str) for topic in wanted):

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from daemon.network import Feeds
-from daemon.orders import Orders
+from daemon.orders import ASKED, Orders
 from daemon.publish.holding import CommandCode, Outcome, Request
 from estimator.records import Command, Order
 from hal.clock import SystemClock
@@ -54,6 +54,15 @@ def test_a_pause_is_done_with_the_next_snapshot_pose_or_not() -> None:
     bench.orders.published(snapshot(pose=None))
     assert [command.order for command in bench.commands] == [Order.PAUSE, Order.RESUME, Order.RESET]
     assert bench.ended == [(3, Outcome.DONE), (4, Outcome.DONE)]
+
+
+def test_orders_that_wait_for_a_pose_do_not_pile_up() -> None:
+    bench = Bench()
+    for number in range(1, 1001):
+        bench.ask(number, CommandCode.RELOCALISE)
+    bench.orders.published(snapshot())
+    assert len(bench.ended) == ASKED
+    assert bench.ended[-1] == (1000, Outcome.DONE)
 
 
 def test_what_takes_long_is_done_when_it_says_so(caplog: pytest.LogCaptureFixture) -> None:

@@ -110,6 +110,19 @@ def test_a_laser_that_fits_nowhere_in_the_map_after_a_start() -> None:
     assert not judged(watch, 14.3, 14.3, Memory(State.MAPPING, Reason.UNPROVED))
 
 
+def test_scans_that_have_not_fitted_once_are_no_fault_for_ever() -> None:
+    watch = Watch()
+    watch.on_verdict(0.0, Memory(State.TRACKING, Reason.NONE), scans=True)
+    watch.on_verdict(0.1, Memory(State.DEGRADED, Reason.MATCH_FAILED), scans=True)
+    for k in range(1, 150):
+        watch.on_verdict(0.1 + 0.1 * k, Memory(State.DEGRADED, Reason.LIGHT_DARK), scans=True)
+    assert not watch.misfit
+
+
+def test_a_fast_sender_that_becomes_slow_is_noticed() -> None:
+    assert fed((20.0, 1000.0), (4.0, 100.0)).seldom(24.0, PERIOD)
+
+
 def test_disagreement_counts_whatever_else_is_said() -> None:
     watch = Watch()
     memory = Memory(State.DEGRADED, Reason.LIGHT_LOST, disagree_since=5.0)

@@ -182,6 +182,7 @@ def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest
         (b"\x01\x00\x00\x00\xc1", "no msgpack map"),
         (b"\x04\x00\x00\x00\x81\xa1\xff\xc0", "no msgpack map"),
         (b"\x01\x00\x00\x00\x80", "without `want`"),
+        ((4007).to_bytes(4, "little") + b"\x81\xa4want" + b"\x91" * 4000 + b"\xc0", "a request"),
         (b"\x08\x00\x00\x00\x81\xa4want\x91\xa0"[:12], None),
     ],
 )

@@ -152,6 +152,21 @@ def test_another_map_empties_the_tiles_of_the_one_before(tmp_path: Path) -> None
     run(tmp_path / "stream", body)
 
 
+def test_a_map_that_was_closed_is_drawn_anew_when_it_is_followed_again(tmp_path: Path) -> None:
+    async def body(server: StreamServer) -> None:
+        robot = Robot()
+        tiles = server.tiles = MapTiles(lambda: robot.state, server.on_tiles)
+        robot.drive(30)
+        tiles.follow(asyncio.get_running_loop())
+        tiles.close()  # in the middle of it
+        await drawn(server, tiles)
+        assert tiles.tiles
+        assert not tiles.error
+        tiles.close()
+
+    run(tmp_path / "stream", body)
+
+
 def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "BUFFER_BYTES", 1024)
     monkeypatch.setattr(stream, "TILE_BYTES", 1)

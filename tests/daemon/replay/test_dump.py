@@ -79,6 +79,9 @@ async def asked(bench: Bench) -> None:
     await long(bench)
     said: list[str] = []
     bench.recorder.box.dump(said.append)
+    refused: list[str] = []
+    bench.recorder.box.dump(refused.append)
+    assert refused == [blackbox.UNDER_WAY]
     for _ in range(100):
         await bench.drive(0.1)
         let_write(0.01)

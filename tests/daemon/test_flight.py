@@ -1,0 +1,69 @@
+"""The keeper of a recording's folder: what it takes away where states cannot be had, and which dumps it keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daemon import flight
+from daemon.flight import DUMP, DUMPS, Begun, Flight
+from hal.replay.recording import segment_name
+
+SEGMENT = 1000
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ring of five segments on a disk with room."""
+    monkeypatch.setattr(flight, "LEAST_BYTES", 5 * SEGMENT)
+    monkeypatch.setattr(flight, "MB_A_MINUTE", 0)
+    monkeypatch.setattr(flight, "RESERVE_BYTES", 0)
+
+
+def ring(folder: Path) -> Flight:
+    folder.mkdir(parents=True)
+    return Flight(folder, 60.0)
+
+
+def grow(keeper: Flight, folder: Path, segments: int) -> None:
+    """Segments that are complete, each followed by one for which no state could be taken."""
+    for number in range(segments):
+        path = folder / segment_name(number)
+        path.write_bytes(bytes(SEGMENT))
+        keeper.closed(number, path)
+        keeper.begun(Begun(number + 1, 10.0 * number, None, b"", {}))
+
+
+def test_a_ring_without_states_does_not_fill_the_disk(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    keeper = ring(folder)
+    grow(keeper, folder, 50)
+    keeper.close(ended=True)
+    left = sorted(folder.glob("*.lumirec"))
+    assert len(left) == 10
+    assert left[-1].name == segment_name(49)
+
+
+def test_a_ring_without_states_keeps_its_beginning_as_long_as_there_is_room(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    keeper = ring(folder)
+    grow(keeper, folder, 10)
+    keeper.close(ended=True)
+    assert len(list(folder.glob("*.lumirec"))) == 10
+
+
+def test_the_dump_just_made_stays_whatever_the_clock_says(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    for day in range(DUMPS):
+        (tmp_path / f"{DUMP}2026-11-{day + 1:02d}T00-00-00Z-asked").mkdir()
+    keeper = ring(folder)
+    grow(keeper, folder, 1)
+    told: list[str] = []
+    keeper.dump({"at": "1970-01-01T00-00-09Z", "reason": "asked", "why": "a test", "t_mono": 9.0}, told.append)
+    keeper.close(ended=True)
+    assert told == [""]
+    kept = sorted(path.name for path in tmp_path.glob(f"{DUMP}*"))
+    assert len(kept) == DUMPS
+    assert kept[0] == f"{DUMP}1970-01-01T00-00-09Z-asked"
+    assert kept[1].startswith(f"{DUMP}2026-11-02")
