@@ -36,7 +36,7 @@ NOWHERE_S: Final = 5.0
 FITS_S: Final = 1.5
 """TRACKING has to last for this long to take it back: wrong ranges, too, now and then fit for a moment."""
 QUIET_S: Final = 10.0
-"""So long without a scan that did not fit takes it back too: where a witness is missing, TRACKING may not come for hours."""
+"""As long without a scan that does not fit takes it back, too: without a witness TRACKING may not come for hours."""
 DISAGREE_S: Final = 1.0
 """Wheels and laser have to disagree for this long, as in the state machine."""
 ODD: Final = (State.RELOCATING, State.AMBIGUOUS, State.LOST)
