@@ -43,6 +43,10 @@ DUMP_S: Final = 600.0
 """What a dump of a recording that is kept as a whole reaches back."""
 MAP_SUFFIX: Final = ".lumimap"
 """Of the map that the run began with, and of those that it went on in."""
+SWITCHED: Final = f"switch-*{MAP_SUFFIX}"
+"""The latter; each is needed as long as the cycle is there that took it."""
+SWITCH_S: Final = 60.0
+"""From a map's file to the cycle that takes it, at most."""
 RING: Final = "ring"
 """File of a ring's folder, locked while somebody writes; empty until the run has ended as it should."""
 MB_A_MINUTE: Final = 24
@@ -208,11 +212,18 @@ class Flight:
         return room < RESERVE_BYTES
 
     def _remove_before(self, first: int) -> None:
+        ended = -math.inf
         for number in [number for number in self._segments if number < first]:
             del self._segments[number]
+            with contextlib.suppress(OSError):
+                ended = max(ended, (self._folder / segment_name(number)).stat().st_mtime)
             for name in (segment_name(number), state_name(number)):
                 with contextlib.suppress(OSError):
                     (self._folder / name).unlink(missing_ok=True)
+        for path in self._folder.glob(SWITCHED):  # a robot on a lift goes from map to map all day
+            with contextlib.suppress(OSError):
+                if path.stat().st_mtime < ended - SWITCH_S:
+                    path.unlink()
 
     def _dump(self, about: dict[str, Any], told: Told) -> None:
         begin = self._dump_from(float(about["t_mono"]))

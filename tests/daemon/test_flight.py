@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -51,6 +53,23 @@ def test_a_ring_without_states_keeps_its_beginning_as_long_as_there_is_room(tmp_
     grow(keeper, folder, 10)
     keeper.close(ended=True)
     assert len(list(folder.glob("*.lumirec"))) == 10
+
+
+def test_maps_that_were_switched_to_go_with_the_segments_that_took_them(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    keeper = ring(folder)
+    old, new = folder / "switch-0123456789abcdef.lumimap", folder / "switch-fedcba9876543210.lumimap"
+    for path, age_s in ((old, 3600.0), (new, 0.0)):
+        path.write_bytes(b"map")
+        os.utime(path, (time.time() - age_s, time.time() - age_s))
+    grow(keeper, folder, 9)
+    keeper.close(ended=True)
+    assert old.exists(), "nothing was taken away yet"
+    keeper = Flight(folder, 60.0)
+    grow(keeper, folder, 20)
+    keeper.close(ended=True)
+    assert not old.exists()
+    assert new.exists()
 
 
 def test_the_dump_just_made_stays_whatever_the_clock_says(tmp_path: Path) -> None:
