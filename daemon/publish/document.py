@@ -104,7 +104,15 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 {_pulse()}
 {_parts()}
 {_writing()}
-## Serial line (RTU)
+{_serial()}
+## Limits
+
+{_limits()}
+"""
+
+
+def _serial() -> str:
+    return f"""## Serial line (RTU)
 
 `modbus.serial = "/dev/ttyUSB1@115200#1"`: the line, its rate, our unit. Without a rate it is 19200 bit/s; characters
 are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2). An answer goes
@@ -113,10 +121,6 @@ given up. What is sent to unit 0 is carried out and not answered. Adapters that 
 `tools/clients/read_rtu.py`. Try it with
 `mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0` from the other end, and with
 `mbpoll -m tcp -p 1502 -t 3 -0 -r 0 -c 64 HOST` over the network.
-
-## Limits
-
-{_limits()}
 """
 
 
@@ -193,7 +197,7 @@ def _parts() -> str:
     first = parts.ADDRESS
     last = first + parts.BLOCK_WORDS - 1
     block = [
-        (str(first), "`magic`", "uint16", "", "", f"0x{parts.MAGIC:04X} (\"LP\")."),
+        (str(first), "`magic`", "uint16", "", "", f"0x{parts.MAGIC:04X} (\"LF\")."),
         (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {parts.VERSION}."),
         *layout_rows(parts.BLOCK, parts.BODY_ADDRESS, 1),
         (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),

@@ -43,7 +43,27 @@ later version of the program may append values under the same `version` number. 
 States, reasons, faults, the numbers of `light_fix` and the bits of `flags`, `devices` and `witnesses` are those of
 [Modbus](modbus.md), where every single link can be read too.
 
-## Subscribing
+{_subscribing()}
+## Odometry and IMU datagrams
+
+With `odometry.port` set, the daemon takes wheel odometry and gyro readings as datagrams on that port. Little-endian,
+CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
+
+{table(("byte", "type", "meaning"), _input_rows())}
+
+* Odometry is cumulative, so a lost datagram loses nothing; one that was overtaken is dropped, and so is a repeated one.
+* A sender that restarts draws a new `session` (or is silent for {inputs.SESSION_TIMEOUT_S:g} s) and may begin again
+  at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored
+  and counted.
+* The time of a reading is the kernel's time of arrival. A sender on the same computer does better: it sets bit 0 of
+  `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {MAX_AGE_S:g} s old is not
+  believed.
+* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped and counted.
+"""
+
+
+def _subscribing() -> str:
+    return f"""## Subscribing
 
 With `*:PORT` among `pose.receivers`, a program gets pose datagrams by asking for them on that port: {subscribe.SIZE}
 bytes, little-endian, both ways. A reference client is `tools/clients/subscribe_pose.py`.
@@ -61,22 +81,6 @@ Nobody can have datagrams sent to another's address, because only that one sees 
 than what asked for it. Addresses that are not in `allow` get none.
 
 {table(("`status`", "name", "meaning"), _status_rows())}
-
-## Odometry and IMU datagrams
-
-With `odometry.port` set, the daemon takes wheel odometry and gyro readings as datagrams on that port. Little-endian,
-CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
-
-{table(("byte", "type", "meaning"), _input_rows())}
-
-* Odometry is cumulative, so a lost datagram loses nothing; one that was overtaken is dropped, and so is a repeated one.
-* A sender that restarts draws a new `session` (or is silent for {inputs.SESSION_TIMEOUT_S:g} s) and may begin again
-  at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored
-  and counted.
-* The time of a reading is the kernel's time of arrival. A sender on the same computer does better: it sets bit 0 of
-  `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {MAX_AGE_S:g} s old is not
-  believed.
-* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped and counted.
 """
 
 

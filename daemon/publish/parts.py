@@ -16,7 +16,7 @@ from daemon.publish.points import U16, U32, Layout, Point, Rule, Value
 from daemon.publish.snapshot import NO_CONDITION, Condition, Part, Snapshot, Thread
 
 VERSION: Final = 1
-MAGIC: Final = 0x4C50  # "LP"
+MAGIC: Final = 0x4C46  # "LF": LP is the block of the protection level
 ADDRESS: Final = 400
 FAULTS: Final = 12
 """Faults that are named; more are only counted."""

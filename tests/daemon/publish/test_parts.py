@@ -31,7 +31,7 @@ CONDITION = Condition(
 def test_block_by_hand() -> None:
     """Numbers at places written down here, not taken from the table."""
     words = struct.unpack(">34H", parts.encode_parts(snapshot(condition=CONDITION)))
-    assert words[:7] == (0x4C50, 1, 1, 4464, 1, 4465, 3)
+    assert words[:7] == (0x4C46, 1, 1, 4464, 1, 4465, 3)
     assert words[7:19] == (104, 151, 201, *([0] * 9))
     assert words[19:30] == (1, 2, 0, 0, 0, 0, 1, 0, 0, 0, 9)
     assert words[30:32] == (0b10_0000_0001, 0b10_0000)
@@ -114,3 +114,9 @@ def test_status_tells_all_faults_and_what_was_restarted() -> None:
         assert words in table
     assert "running    70001 s" in table
     assert "down: LIDAR, MAP; hanging: I2C" in table
+
+
+def test_no_two_blocks_have_one_magic_number() -> None:
+    magic = [block.MAGIC for block in (integrity, lights, parts, pulse)]
+    assert len({registers.MODBUS_MAGIC, *magic}) == 1 + len(magic)
+    assert f'0x{parts.MAGIC:04X} ("{parts.MAGIC.to_bytes(2, "big").decode()}")' in document.modbus_page()
