@@ -202,7 +202,7 @@ class Daemon:
 
         def take_over() -> tuple[int, str]:
             self._estimator.take_over(switch)
-            asyncio.get_running_loop().call_soon(self.keeper.switched, switch.start)
+            self.keeper.switched(switch.map_id, switch.start)
             taken()
             return switch.map_id, switch.sha256
 

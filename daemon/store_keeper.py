@@ -116,10 +116,12 @@ class Keeper:
         """Identity of the map in use."""
         return self._map_id()
 
-    def switched(self, start: Start) -> None:
-        """The estimator goes on in another stored map, which need not be saved as it is."""
-        self._start, self._map_of, self._anew = start, self._map_id(), False
-        self.loaded()
+    def switched(self, map_id: int, start: Start) -> None:
+        """The estimator goes on in another stored map, ``map_id`` from now on, which need not be saved as it is."""
+        self._start, self._map_of, self._anew = start, map_id, False
+        if (state := self._state()) is not None:
+            _, news, closures = self._revision(state)
+            self._saved = map_id, news, closures
 
     def loaded(self) -> None:
         """The estimator has been loaded: what it begins with need not be saved."""

@@ -6,6 +6,7 @@ import asyncio
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from daemon.mapswitch import Maps, MapSwitch
 from daemon.publish.snapshot import Snapshot, State
 from daemon.record import Recorder
 from daemon.store import Store, started, unjudged
+from daemon.store_keeper import About, Keeper
 from daemon.worker import CycleWorker
 from estimator import se2
 from hal.clock import LoopClock, run_virtual
@@ -206,3 +208,34 @@ def test_a_defect_and_a_full_disk_change_nothing_and_are_told(tmp_path: Path, ca
     assert "No space left on device" in asyncio.run(go(keep=full))
     assert asyncio.run(go(make=defect)) == "ZeroDivisionError('a defect')"
     assert "the map cannot be switched" in caplog.text
+
+
+class _Later:
+    """A clock at which every save is due."""
+
+    def __init__(self) -> None:
+        self.t = 0.0
+
+    def now(self) -> float:
+        self.t += 1e6
+        return self.t
+
+
+def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> None:
+    """Else it would be saved at once, without its name and without what a person has surveyed of it."""
+    atlas = SimpleNamespace(adrift=None, closures=3)
+    state: Any = SimpleNamespace(atlas=atlas, next_key=9, light=None, keyframes={1: None})
+    used, start = [1], SimpleNamespace()
+    saved: list[object] = []
+
+    async def body() -> None:
+        clock: Any = _Later()
+        keeper = Keeper(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
+        keeper._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
+        keeper.switched(2, start)  # type: ignore[arg-type]  # only kept
+        used[0] = 2
+        keeper._go_on()
+        assert saved == []
+        assert keeper._start is start
+
+    asyncio.run(body())
