@@ -1,5 +1,5 @@
 """``python -m tests.faults [WORDS...]``: play the cells that have all words in their name, keep what was measured, and
-write docs/faults.md from it. Without words all of them are played (a quarter of an hour); ``--render`` plays none.
+write docs/faults.md from it. Without words all of them are played (six minutes of one core); ``--render`` plays none.
 """
 
 from __future__ import annotations
