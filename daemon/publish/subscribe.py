@@ -35,6 +35,8 @@ _BODY: Final = struct.Struct("<4sHHHHQ")
 _CRC: Final = struct.Struct("<I")
 SIZE: Final = _BODY.size + _CRC.size
 _PER_TURN: Final = 8
+_SAY_S: Final = 10.0
+"""Who comes and goes is told this often at most: one who does so all the time must not fill the log."""
 
 log = logging.getLogger(__name__)
 
@@ -143,6 +145,7 @@ class Subscriptions:
         self._allowed = allowed
         self._sock: socket.socket | None = None
         self._reader: Reader | None = None
+        self._say_at = 0.0
 
     @property
     def port(self) -> int:
@@ -203,5 +206,6 @@ class Subscriptions:
             before = len(self.leases)
             if (answer := self.leases.answer(peer, message, now)) is not None:
                 self._send(sock, encode(answer), peer)
-            if len(self.leases) != before:
+            if len(self.leases) != before and now >= self._say_at:
+                self._say_at = now + _SAY_S
                 log.info("pose datagrams: %d subscribers, last heard of %s:%d", len(self.leases), *peer[:2])

@@ -254,3 +254,34 @@ def test_an_interface_that_has_gone_is_said(caplog: pytest.LogCaptureFixture) ->
     (receiver,) = asyncio.run(run()).receivers
     assert receiver.dropped == 1
     assert "239.255.76.77:5000: Cannot assign requested address" in caplog.text
+
+
+class _Fickle:
+    """A socket of one who subscribes and ends it, again and again."""
+
+    def __init__(self, times: int) -> None:
+        self._left = 2 * times
+        self._cookie = 0
+
+    def recvfrom(self, _: int) -> tuple[bytes, tuple[str, int]]:
+        if not self._left:
+            raise BlockingIOError
+        self._left -= 1
+        return encode(Message(Status.ASK, 10 * (self._left % 2), self._cookie)), PEER
+
+    def sendto(self, data: bytes, _: object) -> None:
+        self._cookie = decode(data).cookie
+
+
+def test_one_who_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    async def body() -> None:
+        subscriptions, sock = Subscriptions("127.0.0.1", 0, lambda _: True), _Fickle(100)
+        await asyncio.sleep(1.0)
+        while sock._left:
+            subscriptions._serve(sock)  # type: ignore[arg-type]  # all that is asked of a socket
+
+    caplog.set_level("INFO")
+    run_virtual(body())
+    assert [record.message for record in caplog.records] == [
+        "pose datagrams: 1 subscribers, last heard of 192.0.2.7:4000"
+    ]
