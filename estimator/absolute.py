@@ -317,6 +317,10 @@ def pose_at(state: State, t_mono: float) -> Array:
     """T_odom_base at an instant of the last second, at constant twist between two predictions; the ends are held."""
     assert state.absolute is not None
     after = state.fused.t_mono, state.fused.T_odom_base
+    if state.absolute.poses and state.absolute.poses[-1][0] > after[0]:  # at a late scan, the pose is taken back
+        after = state.absolute.poses[-1]
+        if t_mono >= after[0]:
+            return after[1]
     for t, T in reversed(state.absolute.poses):
         if t <= t_mono < after[0]:
             twist = se2.log(se2.between(T, after[1]))

@@ -15,6 +15,7 @@ import numpy as np
 from estimator import se2
 from estimator.linear3 import invert3
 from estimator.records import Array, Imu, Odometry
+from estimator.trail import Trail
 
 LONGEST_CARRY_S = 0.5
 """Beyond this a velocity says nothing any more; the pose is held and the uncertainty grows instead."""
@@ -98,7 +99,7 @@ class Motion:
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
         t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
         ahead: motion already applied beyond the last odometry. odometry: whether any has arrived; t_odometry: its end.
-        doubt: factor on the noise's variance, learned. gyro: sums and bias.
+        doubt: factor on the noise's variance, learned. gyro: sums and bias. trail: the way of the last two seconds.
     """
 
     t_mono: float = -math.inf
@@ -113,6 +114,7 @@ class Motion:
     t_odometry: float = -math.inf
     doubt: float = 1.0
     gyro: Gyro = field(default_factory=Gyro)
+    trail: Trail = field(default_factory=Trail)
 
 
 def move(motion: Motion, delta: Array, variance: Array) -> None:
@@ -142,6 +144,11 @@ def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
     follows = abs(record.t_begin - motion.t_odometry) < 1e-6 and dt < LONGEST_CARRY_S
     made = se2.between(motion.ahead, delta) if follows else remainder(delta, record, motion.t_mono)
     move(motion, made, variance)
+    if follows:
+        motion.trail.take_back(record.t_begin)
+        motion.trail.add(record.t_begin, record.t_end, delta, motion.doubt * variance)
+    else:
+        motion.trail.add(max(motion.t_mono, record.t_begin), record.t_end, made, motion.doubt * variance)
     feel(motion, delta, (record.t_begin, record.t_end), motion.doubt * variance, noise)
     motion.ahead, motion.odometry, motion.t_odometry = se2.identity(), True, record.t_end
     motion.t_mono = max(motion.t_mono, record.t_end)
@@ -215,7 +222,9 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
         delta = se2.exp(motion.velocity * dt)
         variance = (motion.velocity_variance + np.array(noise.acceleration_variance()) * (dt * dt)) * (dt * dt)
         move(motion, delta, variance)
+        motion.trail.add(motion.t_mono, t_mono, delta, motion.doubt * variance)
         if unseen > 0.0:
+            motion.trail.forget(t_mono)
             motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono

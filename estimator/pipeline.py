@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, adrift, closing, livemap, matchers, matching, motion, protection, se2
+from estimator import absolute, adrift, closing, lateness, livemap, matchers, matching, motion, protection, se2
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
@@ -63,18 +63,14 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
             close_loops(state, record)
             lap("map")
         if isinstance(record, Scan):
-            why = why or passed_over(limits)
-            points = nothing_of(record) if why else virtual_frame(state, record)
-            walk(state)
-            match = match_scan(state, record, points, limits, why)
-            fuse(state, match)
-            lap("match")
-            if limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match):
-                if match.ok:
-                    learn_alike(state, oriented(points, limits.points))
-                keyframe = lay_keyframe(state, record, points)
-                update_map(state, record, points)
-                lap("map")
+            why = why or passed_over(state, record, limits)
+            if why is not None or not lateness.late(state, record):
+                match, laid = see(state, record, limits, why, lap)
+            else:
+                ahead = lateness.go_back(state, record)
+                match, laid = see(state, record, limits, why, lap)
+                lateness.come_again(state, ahead)
+            keyframe = max(keyframe, laid)
     lap("step")
     look_for_lamps(state, limits)
     lap("search")
@@ -82,9 +78,28 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
     return report(state, match, keyframe, limits)
 
 
-def passed_over(limits: Limits) -> Reason | None:
-    """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose."""
-    return Reason.PASSED_OVER if limits.rung >= Rung.CARRIED else None
+def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
+    """Match a scan at the pose, take in what it says, and keep it where one is due; the match, and the ID or -1."""
+    points = nothing_of(scan) if why else virtual_frame(state, scan)
+    walk(state)
+    match = match_scan(state, scan, points, limits, why)
+    fuse(state, match)
+    lap("match")
+    if not (limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match)):
+        return match, -1
+    if match.ok:
+        learn_alike(state, oriented(points, limits.points))
+    keyframe = lay_keyframe(state, scan, points)
+    update_map(state, scan, points)
+    lap("map")
+    return match, keyframe
+
+
+def passed_over(state: State, scan: Scan, limits: Limits) -> Reason | None:
+    """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose, or it is too old."""
+    if limits.rung >= Rung.CARRIED:
+        return Reason.PASSED_OVER
+    return Reason.LATE if lateness.too_old(state, scan) else None
 
 
 def order(record: Record) -> tuple[float, bool]:

@@ -34,7 +34,7 @@ class Reason(Enum):
     NO_MAP = "nothing to match against yet"
     REJECTED = "residual or correction implausible"
     MALFORMED = "not a scan: lengths, bearings, times, mount or noise cannot be those of a sweep"
-    LATE = "older than the scan before it"
+    LATE = "older than the scan before it, or than the way that is remembered"
     PASSED_OVER = "not matched: no time for it, or a person has said pause"
 
 

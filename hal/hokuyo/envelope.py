@@ -13,7 +13,9 @@ from typing import Final
 
 SLOPE_LIMIT: Final = 1.5e-3  # of sensor clock against host clock; quartz does 50e-6, accept much worse
 LAG_S: Final = 0.020
-_LAG_LASTS_S: Final = 3.0  # a queue is gone by then: what still lags by LAG_S is a clock that has moved
+_LAG_LASTS_S: Final = 3.0  # a lag that came slowly and still lasts: the sensor's clock has moved
+_QUEUE_LASTS_S: Final = 600.0  # a lag that came at once: by then the rate's error (3e-5) has added up to a lag's worth
+_AT_ONCE_S: Final = 1.0  # from a quarter of LAG_S to all of it: ten times faster than a clock may be off (SLOPE_LIMIT)
 _BIN_S: Final = 0.25
 _WINDOW_S: Final = 30.0
 _LOOK_BACK_S: Final = 2.0
@@ -40,6 +42,8 @@ class Envelope:
         self._base = 0.0
         self._x0 = 0.0
         self._lagging_since = math.inf
+        self._queued = False
+        self._t_prompt = -math.inf
         self._t_last = -math.inf
 
     @property
@@ -49,8 +53,13 @@ class Envelope:
 
     @property
     def lag_lasts(self) -> bool:
-        """True when everything in three seconds came late: no queue lasts that long, the sensor's clock has moved."""
-        return self._t_last - self._lagging_since > _LAG_LASTS_S
+        """True when all has come late for so long that it is not the way of the data but the sensor's clock.
+
+        A clock is off by a rate, or it is set: then the stamps break their rhythm, which is found before. It does not
+        lose a tenth of a second from one scan to the next while the motor goes on in step; what comes at once is the
+        line, or the computer, and it holds up the data for as long as it likes.
+        """
+        return self._t_last - self._lagging_since > (_QUEUE_LASTS_S if self._queued else _LAG_LASTS_S)
 
     def age(self, x: float) -> float:
         """Sensor seconds since a point has last told anything about the edge."""
@@ -67,9 +76,13 @@ class Envelope:
         excess = delay - self.delay(x)
         self._t_last = x + delay
         if excess > LAG_S:  # says nothing about the edge
-            self._lagging_since = min(self._lagging_since, self._t_last)
+            if math.isinf(self._lagging_since):
+                self._lagging_since = self._t_last
+                self._queued = self._t_last - excess - self._t_prompt < _AT_ONCE_S
             return excess
         self._lagging_since = math.inf
+        if excess < 0.25 * LAG_S:
+            self._t_prompt = self._t_last - excess
         if x >= self._bin_end:
             self._open_bin(x, delay)
         elif excess < self._bins[-1][1] - self.delay(self._bins[-1][0]):
