@@ -16,6 +16,7 @@ LAG_S: Final = 0.020
 _LAG_LASTS_S: Final = 3.0  # a lag that came slowly and still lasts: the sensor's clock has moved
 _QUEUE_LASTS_S: Final = 600.0  # a lag that came at once: by then the rate's error (3e-5) has added up to a lag's worth
 _AT_ONCE_S: Final = 1.0  # from a quarter of LAG_S to all of it: ten times faster than a clock may be off (SLOPE_LIMIT)
+_BRIDGED: Final = 1e-4  # of the time without an edge: what its slope may have been off by
 _BIN_S: Final = 0.25
 _WINDOW_S: Final = 30.0
 _LOOK_BACK_S: Final = 2.0
@@ -75,7 +76,7 @@ class Envelope:
             self._x0, self._base = x, delay
         excess = delay - self.delay(x)
         self._t_last = x + delay
-        if excess > LAG_S:  # says nothing about the edge
+        if excess > self._lag(x):  # says nothing about the edge
             if math.isinf(self._lagging_since):
                 self._lagging_since = self._t_last
                 self._queued = self._t_last - excess - self._t_prompt < _AT_ONCE_S
@@ -91,6 +92,11 @@ class Envelope:
             self._base += excess
             self._fit()
         return max(0.0, delay - self.delay(x))
+
+    def _lag(self, x: float) -> float:
+        """Excess from which on a point is late; the last ones of a queue that runs dry are no edge either."""
+        over = LAG_S if math.isinf(self._lagging_since) else 0.25 * LAG_S + _BRIDGED * self.age(x)
+        return min(over, LAG_S)
 
     def shift(self, seconds: float) -> None:
         """Sensor times before now turn out to have been too late by this: the delays they gave were too short."""

@@ -213,18 +213,33 @@ def test_a_long_silence_keeps_the_clock(silence_s: float) -> None:
     check(times, rest)
 
 
-def test_a_lag_that_lasts_is_a_clock_that_moved() -> None:
-    """A jump by exactly two revolutions leaves no trace in the stamps' rhythm; the arrival tells."""
-    s = sensor(seconds=60)
-    s.stamps[600:] -= 100
-    s.stamps[600:604] = s.stamps[600:604] + 100
-    keep = np.ones(len(s.true), bool)
-    keep[600:604] = False
-    moved = Sensor(s.true[keep], s.stamps[keep], s.arrival[keep])
-    clock = moved.clock(0.025)
-    times = feed(clock, moved)
-    assert clock.resets == 1
-    assert np.abs(errors_ms(times, moved)[-800:]).max() < 1.0
+@pytest.mark.parametrize("delay_s", [0.05, 0.3, 2.0])
+@pytest.mark.parametrize("ppm", [-300, 50])
+def test_a_lag_that_comes_at_once_is_a_queue_however_long_it_lasts(delay_s: float, ppm: float) -> None:
+    """The motor goes on in step: a clock that was set would have broken its rhythm. It says how unsure it becomes."""
+    s = sensor(seconds=120, ppm=ppm)
+    s.arrival[(s.true > s.true[0] + 30) & (s.true < s.true[0] + 90)] += delay_s
+    s.arrival[:] = np.maximum.accumulate(s.arrival)  # what was held up comes first
+    clock = s.clock(0.025)
+    times = feed(clock, s)
+    assert clock.resets == 0
+    assert None not in times
+    errors = errors_ms(times, s)
+    sigmas = np.array([1e3 * when.t_sigma for when in times if when is not None])
+    assert (np.abs(errors) < np.maximum(1.0, 3 * sigmas)).all()
+    assert np.abs(errors).max() < 6.0  # the rate, unseen for a minute
+    assert np.abs(errors[-1000:]).max() < 1.0
+
+
+@pytest.mark.parametrize("slow", [0.005, 0.015])
+def test_a_lag_that_comes_slowly_is_a_clock(slow: float) -> None:
+    """A rate beyond all that a clock may be off is followed by beginning anew, and not taken for a queue."""
+    s = sensor(seconds=60, ppm=-1e6 * slow)
+    clock = s.clock(0.025)
+    times = feed(clock, s)
+    assert clock.resets >= 1
+    errors = np.array([when.t_mono - t for when, t in zip(times, s.true, strict=True) if when is not None])
+    assert np.abs(errors).max() < 0.02 + 4.0 * slow + 0.01
 
 
 @pytest.mark.parametrize("factor", [0.8, 0.9, 0.99, 1.01, 1.1, 1.5])
