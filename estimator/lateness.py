@@ -13,12 +13,12 @@ from estimator import se2
 from estimator.linear3 import swing
 from estimator.records import Array, Scan
 from estimator.state import State
-from estimator.trail import LATE_S, Ahead, made, positive, turned
+from estimator.trail import ANOTHER_CLOCK_S, LATE_S, Ahead, made, positive, turned
 
 
 def late(state: State, scan: Scan) -> bool:
     """Whether the pose has been carried on beyond the end of a scan by more than stamps are uneven."""
-    return scan.t_end < state.fused.t_mono - LATE_S
+    return LATE_S < state.fused.t_mono - scan.t_end < ANOTHER_CLOCK_S
 
 
 def too_old(state: State, scan: Scan) -> bool:

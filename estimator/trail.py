@@ -22,6 +22,9 @@ LATE_S = 0.05
 devices are no more even than that."""
 KEPT_S = 2.0
 """How far back the way is known: a scan that is older is not matched."""
+ANOTHER_CLOCK_S = 10.0
+"""No scan is held up for so long: its clock has been set back, or the pose has once been carried to a wrong instant. It
+is matched at the present pose, which is all that is known."""
 STRETCH_S = 0.02
 """Motions are put together up to this length; readings may come a thousand times a second."""
 
