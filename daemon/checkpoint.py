@@ -305,7 +305,8 @@ KNOWN: Final = {
     "numpy._core.numeric": {"_frombuffer"},
     "copyreg": {"_reconstructor", "__newobj__", "__newobj_ex__"},
 }
-"""What may be made besides classes of our own and functions of the estimator: a dump may come from anywhere."""
+"""What may be made besides classes of our own and functions of the estimator: nothing that reaches the system. It is no
+protection of these classes themselves, whose attributes a forged state can set."""
 HERE: Final = {one.__name__: one for one in (_weak, _blank, _fill, _function)}
 
 
