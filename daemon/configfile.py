@@ -219,6 +219,7 @@ def _explain(message: str, name: str, text: str) -> str:
         if path in MOVED:
             message = f"`{path}` is now part of `lidar.device`: {MOVED[path]}"
     else:
+        message = message.replace("Expected `array`, got", 'Expected `array`, a list in brackets as in ["..."], got')
         if inner := re.search(r"`([a-z_.]+)(\[\d+\])?`(, got|$| -)", message):
             candidate = f"{path}.{inner[1]}".lstrip(".")
             path = candidate if candidate in _descriptions() else path

@@ -18,7 +18,7 @@ from daemon.cli import FAILED, OK, fail
 from daemon.health import FAULTS
 from daemon.publish import holding, integrity, lights, parts, pulse, registers
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
-from daemon.publish.points import Layout
+from daemon.publish.points import Layout, Point
 from daemon.reasons import REASONS
 
 _BLOCKS: Final = (
@@ -66,13 +66,19 @@ def main(args: argparse.Namespace) -> int:
     everything = list(entries())
     found = find(asked, everything)
     if not found:
-        near = difflib.get_close_matches(asked.lower(), {entry.name.lower() for entry in everything}, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else "ask for a key, a state, a fault, a reason, a register"
-        return fail(f"{asked}: nothing of that name or number; {hint}", FAILED)
+        return fail(f"{asked}: nothing of that name or number; {_hint(asked, everything)}", FAILED)
     sys.stdout.write("\n\n".join(str(entry) for entry in found[:_MOST]) + "\n")
     if len(found) > _MOST:
         sys.stdout.write(f"\nand {len(found) - _MOST} more; ask more exactly\n")
     return OK
+
+
+def _hint(asked: str, everything: Sequence[Entry]) -> str:
+    names = {entry.name.lower() for entry in everything}
+    near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.6)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    return "ask for a key, a state, a fault, a reason, a command, a register or a bit, as in: fault 302, TRACKING, bind"
 
 
 def entries() -> Iterator[Entry]:
@@ -115,8 +121,15 @@ def _registers() -> Iterator[Entry]:
 def _points(kind: str, start: int, layout: Layout) -> Iterator[Entry]:
     for offset, point in zip(layout.offsets, layout.points, strict=True):
         step = f", steps of 1/{point.per_unit} {point.unit}" if point.per_unit > 1 else ""
-        text = f"{point.label}. {point.text}".strip().rstrip(".") + f" ({point.wire.name}{step})"
+        text = f"{point.label}. {_elsewhere(point)}".strip().rstrip(".") + f" ({point.wire.name}{step})"
         yield Entry(kind, point.name, range(start + offset, start + offset + point.wire.words), text)
+
+
+def _elsewhere(point: Point) -> str:
+    """The point's text, with what to ask where the documents point to a table below."""
+    kind = "link use" if point.name.endswith("_use") else point.name
+    text = point.text.replace("Bits, see below", "Bits; what each means: lumiloop explain bit NUMBER")
+    return text.replace("See below", f"What each means: lumiloop explain {kind} NUMBER")
 
 
 def _one(code: IntEnum) -> range:

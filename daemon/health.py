@@ -69,7 +69,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "the lidar's port may not be used",
         "join the group dialout, close other programs that use it, or name another `lidar.device`",
     ),
-    Fault.LIDAR_BROKEN: ("the lidar reports a fault of its own", "power it off and on; if it comes back, replace it"),
+    Fault.LIDAR_BROKEN: (
+        "the lidar reports a fault of its own, or its port is open and nothing answers",
+        "check its power and cable, power it off and on; if it comes back, replace it",
+    ),
     Fault.LIDAR_SILENT: ("the lidar is connected and sends no valid scan", "power it off and on; check the cable"),
     Fault.LIDAR_GARBLED: ("more than 5 % of the lidar's frames are damaged", "check cable, shielding and USB hub"),
     Fault.LIDAR_GAPS: ("more than 2 % of the lidar's scans are missing", "check the computer's load and the line rate"),

@@ -35,7 +35,7 @@ class Reason(IntEnum):
 
 REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.NONE: ("the pose is confirmed", ""),
-    Reason.WARMING_UP: ("starting up", "wait; the first start ever compiles for up to a minute"),
+    Reason.WARMING_UP: ("starting up", "wait; the first start of a version compiles for a minute or two"),
     Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
     Reason.LIDAR_SILENT: ("no valid scan for three scan periods", "check the lidar's power and cable"),

@@ -163,7 +163,7 @@ def _load_locked(begun: float, lights: Lights | None) -> Warmth:
         cold = not mark.exists()
         if cold:
             count = kernel_count(lights is not None)
-            log.info("first start of this version: compiling %d kernels, which takes up to a minute", count)
+            log.info("first start of this version: compiling %d kernels, which takes a minute or two", count)
         _exercise()
         code_us = 0.0 if lights is None else _exercise_lights(lights)
         mark.touch()

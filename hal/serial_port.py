@@ -23,6 +23,7 @@ from hal.port import OnData, OnLost
 
 _READ_SIZE = 65536  # a tty hands out at most 4095 bytes at once
 _GONE = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ETIMEDOUT})
+NOT_SERIAL = "not a serial port"
 _UNPLUGGED = "plug it in again, or check its cable and power; it is reopened by itself"
 
 
@@ -177,7 +178,7 @@ def explain_open_error(device: str, baud: int, error: BaseException) -> HalError
     if number in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(device, "in use by another program", f"find it with: fuser -v {device}")
     if number in (errno.ENOTTY, errno.EISDIR, errno.EINVAL) or not _is_character_device(path):
-        return DeviceRefused(device, "not a serial port", "name the sensor's own device file, such as /dev/ttyACM0")
+        return DeviceRefused(device, NOT_SERIAL, "name the sensor's own device file, such as /dev/ttyACM0")
     if isinstance(error, ValueError):
         return DeviceRefused(device, f"cannot do {baud} bit/s", "choose another line rate")
     return DeviceRefused(device, f"cannot be opened: {error}", "look into the kernel log: dmesg | tail")

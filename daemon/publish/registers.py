@@ -124,11 +124,11 @@ FLAGS: Final[tuple[Bit, ...]] = (
 )
 DEVICES: Final[tuple[Bit, ...]] = (
     ("lidar_fitted", "a lidar is configured", lambda s: s.lidar_ok is not None),
-    ("lidar_ok", "and delivers valid scans", lambda s: bool(s.lidar_ok)),
+    ("lidar_ok", "the lidar is configured and delivers valid scans", lambda s: bool(s.lidar_ok)),
     ("adc_fitted", "a photodiode converter is configured", lambda s: s.adc_ok is not None),
-    ("adc_ok", "and delivers valid samples", lambda s: bool(s.adc_ok)),
+    ("adc_ok", "the converter is configured and delivers valid samples", lambda s: bool(s.adc_ok)),
     ("odometry_fitted", "an odometry input is configured", lambda s: s.odometry_ok is not None),
-    ("odometry_ok", "and delivers valid readings", lambda s: bool(s.odometry_ok)),
+    ("odometry_ok", "odometry is configured and delivers valid readings", lambda s: bool(s.odometry_ok)),
 )
 
 

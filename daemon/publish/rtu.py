@@ -14,7 +14,7 @@ from typing import Final, Protocol
 
 from daemon.endpoints import RtuLine
 from daemon.publish.rtu_frames import BROADCAST, RtuFrames, framed
-from hal.errors import DeviceMissing, HalError
+from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.port import Port
 
 SILENCE_S: Final = 0.05
@@ -39,13 +39,18 @@ class LineOpener(Protocol):
 
 async def open_line(device: str, baud: int, *, style: str) -> Port:
     """A real line; pyserial is imported only here. Raises `DeviceMissing`, `DeviceRefused`."""
-    from hal.serial_port import open_serial_port
+    from hal.serial_port import NOT_SERIAL, open_serial_port
 
     try:
         return await open_serial_port(device, baud, style=style)
     except DeviceMissing as error:
         remedy = "plug the adapter in, or correct `modbus.serial`; it is opened by itself once it is there"
         raise DeviceMissing(device, error.problem, remedy) from error
+    except DeviceRefused as error:
+        if error.problem != NOT_SERIAL:
+            raise
+        remedy = "name the adapter's own device file in `modbus.serial`, such as /dev/ttyUSB1"
+        raise DeviceRefused(device, error.problem, remedy) from error
 
 
 class RtuServer:

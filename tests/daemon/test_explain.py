@@ -68,6 +68,12 @@ def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str])
     assert "ask for" in capsys.readouterr().err
 
 
+def test_what_the_documents_show_below_is_named_by_what_to_ask(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "lumiloop explain bit NUMBER" in _told(capsys, "flags")
+    assert "lumiloop explain link use NUMBER" in _told(capsys, "link_1_use")
+    assert not any("see below" in entry.text.lower() for entry in entries())
+
+
 def test_every_published_number_has_its_words() -> None:
     assert set(STATES) == set(State)
     assert set(FIXES) == set(LightFix)

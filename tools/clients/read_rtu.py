@@ -85,7 +85,10 @@ def decode(block: bytes) -> dict[str, float | int | str | None]:
 
 if __name__ == "__main__":
     words = sys.argv[1:] or sys.exit(__doc__)
-    line = Line(words[0], *map(int, words[1:3]))
+    try:
+        line = Line(words[0], *map(int, words[1:3]))
+    except (OSError, termios.error) as error:
+        sys.exit(f"{words[0]}: {error}")
     while True:
         try:
             print(line.read())

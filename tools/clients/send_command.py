@@ -1,6 +1,6 @@
 """Give an order over Modbus UDP and wait for its end, with nothing but the standard library.
 
-    python send_command.py save_map [HOST [PORT]]
+    python send_command.py save_map [HOST [PORT]]                 any of the commands, in either case
     python send_command.py set_pose X Y YAW [HOST [PORT]]         m, m, rad
     python send_command.py switch_map 1a2b3c4d [HOST [PORT]]      as `lumiloop map info` names it
 
@@ -9,6 +9,7 @@ Needs `modbus.write = true`. Written from docs/modbus.md alone: it shares no cod
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import sys
@@ -72,14 +73,27 @@ class Commander:
         raise TimeoutError("no answer")
 
 
+def main(words: list[str]) -> str:
+    """Run the command line; returns how the order ended. Raises ValueError or OSError with what is wrong."""
+    try:
+        name = COMMANDS[COMMANDS.index(words[0].lower())]
+        count = {"set_pose": 3, "switch_map": 1}.get(name, 0)
+        given, where = words[1 : 1 + count], words[1 + count :]
+        place = (float(given[0]), float(given[1]), float(given[2])) if count == 3 else (0.0, 0.0, 0.0)
+        map_id = int(given[0], 16) if count == 1 else 0
+        host, port = where[0] if where else "127.0.0.1", int(" ".join(where[1:]) or 1502)
+    except (IndexError, ValueError):
+        raise ValueError(f"{__doc__}\nCommands: {', '.join(COMMANDS)}") from None
+    with contextlib.closing(Commander(host, port)) as commander:
+        return commander.wait(commander.order(name, place, map_id))
+
+
 if __name__ == "__main__":
-    words = sys.argv[1:]
-    if not words or words[0] not in COMMANDS:
-        sys.exit(__doc__)
-    count = {"set_pose": 3, "switch_map": 1}.get(words[0], 0)
-    given, where = words[1 : 1 + count], words[1 + count :]
-    commander = Commander(where[0] if where else "127.0.0.1", int(where[1]) if len(where) > 1 else 1502)
-    place = (float(given[0]), float(given[1]), float(given[2])) if count == 3 else (0.0, 0.0, 0.0)
-    result = commander.wait(commander.order(words[0], place, int(given[0], 16) if count == 1 else 0))
-    print(result)
+    try:
+        result = main(sys.argv[1:])
+    except ValueError as error:
+        sys.exit(str(error))
+    except OSError as error:
+        sys.exit(f"{error}: is lumiloop running, and do `bind` and `allow` admit this machine?")
+    print("refused: the daemon's log says why" if result == "refused" else result)
     sys.exit(result != "done")

@@ -34,10 +34,15 @@ class Subscription:
     def poses(self) -> Iterator[dict[str, float | int | str | None]]:
         """Poses as they come; without end. Raises ConnectionRefusedError where nobody listens."""
         while True:
-            if time.monotonic() >= self._ask_at:
-                self._ask(LEASE_S)
             try:
+                if time.monotonic() >= self._ask_at:
+                    self._ask(LEASE_S)
                 data = self._sock.recv(1024)
+            except ConnectionRefusedError:
+                print("nobody listens there: is lumiloop running, with `*:PORT` in `pose.receivers`?", file=sys.stderr)
+                time.sleep(1.0)
+                self._ask_at = 0.0
+                continue
             except TimeoutError:
                 self._ask_at = 0.0  # the daemon was restarted, or an answer was lost
                 continue
@@ -84,5 +89,8 @@ def decode(data: bytes) -> dict[str, float | int | str | None] | None:
 
 if __name__ == "__main__":
     words = sys.argv[1:]
-    for pose in Subscription(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 5601).poses():
-        print(pose, flush=True)
+    try:
+        for pose in Subscription(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 5601).poses():
+            print(pose, flush=True)
+    except KeyboardInterrupt:
+        sys.exit(130)

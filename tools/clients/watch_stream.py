@@ -69,5 +69,7 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
+    except (FileNotFoundError, ConnectionRefusedError):
+        sys.exit(f"{sys.argv[1]}: nobody listens there; the start of the daemon's log names its stream")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -6,6 +6,7 @@ import asyncio
 import shutil
 import socket
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -204,6 +205,25 @@ def test_commander_where_writing_is_not_allowed() -> None:
             commander.close()
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    "words", ["", "fly", "switch_map", "switch_map xyz", "set_pose 1 2", "set_pose 1 2 here", "save_map ::1 1502 x"]
+)
+def test_commander_says_what_it_cannot_read(words: str) -> None:
+    with pytest.raises(ValueError, match="Commands: set_pose, reset"):
+        send_command.main(words.split())
+
+
+def test_commander_where_nobody_listens() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    command = [sys.executable, send_command.__file__, "SAVE_MAP", "127.0.0.1", str(port)]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert told.stderr.endswith("is lumiloop running, and do `bind` and `allow` admit this machine?\n")
+    assert "Traceback" not in told.stderr
 
 
 def test_the_commander_knows_every_name_of_the_document() -> None:

@@ -316,3 +316,8 @@ def test_mbpoll_reads_tcp_and_rtu() -> None:
                 return tcp, await asyncio.to_thread(polled, *options)
 
     assert asyncio.run(run()) == (words, words)
+
+
+def test_a_path_that_is_no_serial_port_is_named_with_its_key() -> None:
+    with pytest.raises(DeviceRefused, match=r"not a serial port \(name .* in `modbus\.serial`"):
+        asyncio.run(rtu.open_line("/dev/null", 19200, style="8E1"))
