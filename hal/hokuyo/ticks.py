@@ -273,7 +273,7 @@ class TickClock:
             return None
         self._count += 1
         t_mono = x + self._envelope.delay(x) - self._line_s
-        if t_mono <= self._t_last:
+        if not self._t_last < t_mono <= t_rx:  # a scan that has come cannot be yet to come
             return None
         self._t_last = t_mono
         return ScanTime(t_mono, self._sigma(x), max(1, periods))

@@ -87,6 +87,7 @@ def feeder() -> Callable[[bytes], None]:
         assert any(read(frame) for k in range(2) for frame in splitter.feed(good(k))), "not within two frames"
         for scan in listener.feed(data, t):
             assert math.isfinite(scan.t_mono)
+            assert scan.t_mono <= scan.t_rx, f"{scan.t_mono - scan.t_rx:.3f} s ahead"
             assert len(scan.ranges) == len(scan.code)
         listener.feed(b"\n\n" + GREETING, t)  # a sensor of another name may have spoken
         found = [scan for k in range(8) for scan in listener.feed(good(5000 + 25 * k), t + 0.1 + 0.025 * k)]
