@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from daemon import logs
-from daemon.health import FAULTS, Fault
-from daemon.heartbeat import Heartbeat
+from daemon.health import FAULTS, Fault, Vitals
+from daemon.heartbeat import OVER_S, Heartbeat
 
 CATALOG = Path(__file__).parents[2] / "systemd" / "lumiloop.catalog"
 
@@ -142,8 +142,8 @@ def test_only_the_journals_own_stream_is_answered_with_entries(
 def test_the_heartbeat_tells_faults_with_their_fields(caplog: pytest.LogCaptureFixture) -> None:
     heartbeat = Heartbeat(lambda lateness: pytest.fail("not asked"), str)
     with caplog.at_level(logging.INFO):
-        heartbeat._tell((Fault.OVERRUNS,))
-        heartbeat._tell(())
+        heartbeat._tell(Vitals(0.0), (Fault.OVERRUNS,))
+        heartbeat._tell(Vitals(OVER_S), ())
     came, over = (record.__dict__["fields"] for record in caplog.records)
     assert (came["MESSAGE_ID"], over["MESSAGE_ID"]) == (logs.FAULT_ID, logs.OVER_ID)
     assert came["LUMILOOP_FAULT_NAME"] == over["LUMILOOP_FAULT_NAME"] == "OVERRUNS"
