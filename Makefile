@@ -35,20 +35,22 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff check --quiet .
 	$(BIN)/mypy
 
-# Two rows of tests side by side, one a core: the estimator's, without a compiler and then with it; and all others.
+# Two rows of tests side by side, one a core: the estimator's, without a compiler and then with it, with logs and tools;
+# and all others.
 # The first row is silent until the second has ended. With ARGS, a row in which nothing is selected is no failure.
 QUICK := not slow and not system
+FIRST := tests/estimator tests/logs tests/tools
 PYTEST := $(BIN)/python -m coverage run --data-file
 test: check  ## everything quick (no root, <= 12 minutes)
 	@mkdir -p out; rm -f .coverage .coverage.*
 	@( NUMBA_DISABLE_JIT=1 $(PYTEST)=.coverage.plain -m pytest -q -p no:cacheprovider -m "not jit and $(QUICK)" \
 		tests/estimator; plain=$$?; \
-	$(PYTEST)=.coverage.estimator -m pytest -q -p no:cacheprovider -m "$(QUICK)" tests/estimator $(ARGS); compiled=$$?; \
+	$(PYTEST)=.coverage.estimator -m pytest -q -p no:cacheprovider -m "$(QUICK)" $(FIRST) $(ARGS); compiled=$$?; \
 	[ $$compiled = 5 ] && [ -n '$(ARGS)' ] && compiled=0; exit $$(( plain || compiled )) ) > out/estimator.txt 2>&1 & \
 	estimator=$$!; trap "kill $$estimator" INT TERM; \
-	$(PYTEST)=.coverage.others -m pytest -q -m "$(QUICK)" --ignore=tests/estimator $(ARGS); others=$$?; \
+	$(PYTEST)=.coverage.others -m pytest -q -m "$(QUICK)" $(FIRST:%=--ignore=%) $(ARGS); others=$$?; \
 	[ $$others = 5 ] && [ -n '$(ARGS)' ] && others=0; \
-	wait $$estimator; failed=$$?; echo "the estimator, without a compiler and with it:"; \
+	wait $$estimator; failed=$$?; echo "the estimator without a compiler; with it, and logs and tools:"; \
 	if [ $$failed = 0 ]; then grep -h " passed" out/estimator.txt; else cat out/estimator.txt; fi; \
 	exit $$(( others || failed ))
 	@$(BIN)/python -m coverage combine -q
