@@ -35,11 +35,11 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff check --quiet .
 	$(BIN)/mypy
 
-# Two rows of tests side by side, one a core: the estimator's, without a compiler and then with it, with logs and tools;
+# Two rows of tests side by side, one a core: the estimator's, without a compiler and then with it, with faults, fuzz, logs, tools;
 # and all others.
 # The first row is silent until the second has ended. With ARGS, a row in which nothing is selected is no failure.
 QUICK := not slow and not system
-FIRST := tests/estimator tests/logs tests/tools
+FIRST := tests/estimator tests/faults tests/fuzz tests/logs tests/tools
 PYTEST := $(BIN)/python -m coverage run --data-file
 test: check  ## everything quick (no root, <= 12 minutes)
 	@mkdir -p out; rm -f .coverage .coverage.*
@@ -50,7 +50,7 @@ test: check  ## everything quick (no root, <= 12 minutes)
 	estimator=$$!; trap "kill $$estimator" INT TERM; \
 	$(PYTEST)=.coverage.others -m pytest -q -m "$(QUICK)" $(FIRST:%=--ignore=%) $(ARGS); others=$$?; \
 	[ $$others = 5 ] && [ -n '$(ARGS)' ] && others=0; \
-	wait $$estimator; failed=$$?; echo "the estimator without a compiler; with it, and logs and tools:"; \
+	wait $$estimator; failed=$$?; echo "the estimator without a compiler; with it, and faults, fuzz, logs, tools:"; \
 	if [ $$failed = 0 ]; then grep -h " passed" out/estimator.txt; else cat out/estimator.txt; fi; \
 	exit $$(( others || failed ))
 	@$(BIN)/python -m coverage combine -q
