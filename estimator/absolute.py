@@ -21,16 +21,18 @@ import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Virtual
-from estimator.linear3 import add_turned, det3, invert3, largest_of, positive_part, swing
-from estimator.mapframe import move_map, shift_map
+from estimator.linear3 import add_turned, det3, invert3, largest_of, positive_part
+from estimator.mapframe import move_map, rehang, shift_map
+from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
 from estimator.state import State
+from estimator.trail import KEPT_S
 
 FRESH_M, FRESH_S = 0.7, 60.0
 """Way and time after which the error of the light model (walls, floor, lamps) is another one."""
 
-DRIFT = np.array((5e-5, 5e-5, 2e-6))
+DRIFT = (5e-5, 5e-5, 2e-6)
 """Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of: some
 7 mm and 0.08 deg by the root of the way."""
 
@@ -78,13 +80,15 @@ class Absolute:
         P, X: see above, both 3x3, odom-aligned axes.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
-        elsewhere_since: since when what is received does not fit the place.
+        elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
+            itself has had the robot elsewhere.
         way, way_young: driven so far, and when light last began to find the place. way_start: of the `lights` filter,
             the start that has led to the place on which the two last agreed.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
         since: ID of the first keyframe laid after the pose was known for the last time.
         t_match: instant of the latest match; scan_s: what had passed since the scan before it.
         poses: T_odom_base of the last second, each with its instant.
+        mended: when light has mended the pose in the last seconds, and what part (3x3, odom axes) of its error is left.
     """
 
     placed: bool = False
@@ -95,6 +99,7 @@ class Absolute:
     gap: float | None = None
     odd_since: float | None = None
     elsewhere_since: float | None = None
+    aside_since: float | None = None
     way: float = 0.0
     way_young: float = 0.0
     way_start: float = -math.inf
@@ -103,6 +108,7 @@ class Absolute:
     t_match: float = -math.inf
     scan_s: float = 0.0
     poses: deque[tuple[float, Array]] = field(default_factory=deque)
+    mended: deque[tuple[float, Array]] = field(default_factory=deque)
 
 
 def on_motion(state: State, T_before: Array, P_before: Array, t_before: float) -> None:
@@ -112,12 +118,9 @@ def on_motion(state: State, T_before: Array, P_before: Array, t_before: float) -
         return
     x, y, _ = (moving.T_odom_base - T_before).tolist()
     way, dt = math.hypot(x, y), moving.t_mono - t_before
-    carried, P, X = P_before.copy(), tie.P.copy(), tie.X.copy()
-    for covariance in (carried, P, X):
-        swing(x, y, covariance)
-    Q = moving.P - carried
-    tie.P, tie.X = P + Q, X + Q
-    tie.P.flat[::4] += DRIFT * way
+    both = np.empty((2, 3, 3))
+    grow_tie(tie.P, tie.X, P_before, moving.P, np.array((x, y, DRIFT[0] * way, DRIFT[1] * way, DRIFT[2] * way)), both)
+    tie.P, tie.X = both[0], both[1]
     tie.way += way
     tie.fresh = min(1.0, tie.fresh + way / FRESH_M + (dt / FRESH_S if math.isfinite(dt) else 0.0))
     tie.poses.append((moving.t_mono, moving.T_odom_base))
@@ -125,7 +128,7 @@ def on_motion(state: State, T_before: Array, P_before: Array, t_before: float) -
         tie.poses.popleft()
 
 
-def on_match(state: State, T_before: Array, P_before: Array, inflated: float) -> None:
+def on_match(state: State, T_before: Array, P_before: Array, lacked: Array) -> None:
     """Mend T_map_base by as much of the match's correction of T_odom_base as was its own error too."""
     tie, moving = state.absolute, state.fused
     if tie is None:
@@ -135,15 +138,12 @@ def on_match(state: State, T_before: Array, P_before: Array, inflated: float) ->
     tie.scan_s = min(moving.t_mono - state.t_scan, SLOWEST_S)
     if not tie.placed:
         return
-    more = (inflated - 1.0) * P_before
-    P_odom, P, X = P_before + more, tie.P + more, tie.X + more
-    share = X @ invert3(P_odom)
+    mended = np.empty((3, 3, 3))
+    mend_tie(tie.P, tie.X, lacked, P_before, moving.P, mended)
+    tie.P, tie.X, share = mended[0], mended[1], mended[2]
     made = moving.T_odom_base - T_before
     made[2] = se2.wrap(made[2])
-    R = se2.rotation(state.T_map_odom[2])
-    T_map_base = se2.compose(state.T_map_odom, T_before) + R @ share @ made
-    tie.P = _symmetric(P - share @ (P_odom - moving.P) @ share.T)
-    tie.X = share @ moving.P
+    T_map_base = se2.compose(state.T_map_odom, T_before) + se2.rotation(state.T_map_odom[2]) @ (share @ made)
     move_map(state, se2.compose(T_map_base, se2.inverse(moving.T_odom_base)))
 
 
@@ -152,7 +152,7 @@ def on_lights(state: State, lights: LightsResult) -> None:
     tie = state.absolute
     assert tie is not None
     tie.gap = None
-    if lights.fix is not Fix.GOOD:
+    if begun_anew(state, lights):
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
@@ -191,7 +191,8 @@ def on_order(state: State, command: Command) -> None:
         state.light.place(T_map_base, SAID)
         state.frozen.forget()
         R = se2.rotation(state.T_map_odom[2])
-        tie.P, tie.X = R.T @ SAID @ R, np.zeros((3, 3))
+        tie.P = R.T @ SAID @ R
+        leave(state, np.zeros((3, 3)))
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0
         tie.broken, tie.way_start = False, state.light.filter.way_start
 
@@ -215,9 +216,12 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     L_before = invert3(before)
     after = _symmetric(invert3(L_before + positive_part(G)))
     keep = R.T @ after @ L_before @ R
-    tie.P, tie.X = R.T @ after @ R, keep @ tie.X
+    tie.P = R.T @ after @ R
+    leave(state, keep)
     correct(state, se2.compose(state.T_map_odom, T_odom_base) + after @ told, T_odom_base)
     if np.all(np.diag(after) < KNOWN):
+        if tie.since == 0 and state.atlas.kept:  # a stored map has come along for the last time
+            rehang(state, 0)
         tie.since = state.next_key
 
 
@@ -228,8 +232,28 @@ def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     state.frozen.forget()
     correct(state, lights.T_map_base, T_odom_base)
     R = se2.rotation(state.T_map_odom[2])
-    tie.P, tie.X = R.T @ lights.covariance @ R, np.zeros((3, 3))
+    tie.P = R.T @ lights.covariance @ R
+    leave(state, np.zeros((3, 3)))
     tie.placed, tie.odd_since, tie.fresh = True, None, 0.0
+
+
+def hang_on_anchor(state: State) -> None:
+    """The pose is as sure as its anchor, swung out to here, and the way since: the map has told it, not light."""
+    tie, moving, P = state.absolute, state.fused, np.empty((3, 3))
+    assert tie is not None
+    hang(state.T_odom_anchor, moving.T_odom_base, state.P_anchor, moving.P, 0.0, P)
+    tie.P, tie.X = P, moving.P.copy()
+    tie.mended.clear()
+
+
+def leave(state: State, keep: Array) -> None:
+    """Of the tie's error, and so of what it shares with the pose's, ``keep`` (3x3, odom-aligned axes) is left."""
+    tie, now = state.absolute, state.fused.t_mono
+    assert tie is not None
+    tie.X = keep @ tie.X
+    tie.mended.append((now, keep))
+    while now - tie.mended[0][0] > KEPT_S:
+        tie.mended.popleft()
 
 
 def correct(state: State, T_map_base: Array, T_odom_base: Array) -> None:
@@ -251,13 +275,36 @@ def virtual(state: State) -> Virtual | None:
     return Virtual(se2.compose(lights.T_map_base, moved), lights.covariance, lights.accepted)
 
 
+def begun_anew(state: State, lights: LightsResult) -> bool:
+    """Whether light is only just finding its place, so that gains are not known yet.
+
+    A heading that has become vague since, as that of a robot that stands where no wheels say so, and a stretch between
+    two lamps leave the gains known.
+    """
+    assert state.light is not None
+    if lights.fix in (Fix.GOOD, Fix.HELD):
+        return False
+    known = lights.fix is Fix.STARTING and len(state.light.filter.tracks) == 1 and not state.light.filter.lost
+    return not (known and lights.covariance[0, 0] + lights.covariance[1, 1] < KNOWN[0] + KNOWN[1])
+
+
 def doubted(tie: Absolute, lights: LightsResult, wheels: bool = True) -> LightsResult:
     """The lights' result with less trust in it; no heading is less certain than one that may be any."""
+    P, factor = doubted_covariance(tie, lights, wheels)
+    return replace(lights, covariance=P, gained=lights.gained / factor)
+
+
+def doubted_covariance(tie: Absolute, lights: LightsResult, wheels: bool = True) -> tuple[Array, float]:
+    """Its covariance alone, and by how much it has been raised."""
     factor = TRUST + YOUNG * math.exp((tie.way_young - tie.way) / YOUNG_M)
     factor *= 1.0 if wheels else UNGUIDED
     P = lights.covariance * factor
-    most = np.array((1.0, 1.0, math.sqrt(min(1.0, ANY_HEADING / max(float(P[2, 2]), 1e-12)))))
-    return replace(lights, covariance=P * most * most[:, None], gained=lights.gained / factor)
+    heading = float(P[2, 2])
+    if heading > ANY_HEADING:
+        most = math.sqrt(ANY_HEADING / heading)
+        P[2] *= most
+        P[:, 2] *= most
+    return P, factor
 
 
 def holds_heading(state: State) -> bool:
@@ -293,7 +340,8 @@ def across_the_row(state: State, lights: LightsResult) -> LightsResult:
     P = lights.covariance.copy()
     add_turned(angle, np.array((ACROSS_M**2 * wide, ACROSS_M**2 * narrow, ACROSS_RAD**2 * narrow)), P)
     keep = invert3(P) @ lights.covariance
-    return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T))
+    made = keep.T @ lights.gained_by  # what is told must go with what it weighs: else each wander across adds up
+    return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T), gained_by=made)
 
 
 def _spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:

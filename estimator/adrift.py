@@ -19,10 +19,10 @@ from estimator.atlas import LOOK, Atlas
 from estimator.closing import join
 from estimator.globalsearch import Around
 from estimator.hypotheses import WATCH_M, Hypothesis, Seek, Watch
-from estimator.keyframe import Keyframe, square_of
+from estimator.keyframe import Keyframe
 from estimator.linear3 import invert3
 from estimator.loop import Found
-from estimator.mapframe import move_map, shift_map
+from estimator.mapframe import move_map, rehang, shift_map, unlist
 from estimator.records import Array
 from estimator.relocate import Looked, Piece, Query, look
 from estimator.result import Fix, LoopReason
@@ -37,18 +37,27 @@ PATIENCE_S: Final = 1.0
 ELSEWHERE_S, UNFIT = 3.0, 2
 """Light that has the robot elsewhere for so long is believed that it was carried off; and at once when so many scans in
 a row did not fit."""
+ASIDE_S: Final = 0.3
+"""And so soon where the laser has lost the place since light last agreed, and epoch after epoch, each read by itself,
+has the robot elsewhere: it may have been carried on while a new local map was begun."""
 ALONE_M: Final = 5.0
 """Way after which light alone, if it is good and agrees, is believed where the map knows nothing of the place."""
 STALE: Final = 5
 """Scans after which a keyframe that was found nowhere is laid anew, where light says that it must be here."""
+YOUNG: Final = 2
+"""Keyframes of a map in which a robot can be looked for."""
 SURPRISE: Final = 16.3
 """Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
 
 
 def begin(state: State) -> bool:
-    """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in."""
+    """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in.
+
+    A map of one submap that is not finished will do: the robot begins another one, and that one is finished then.
+    """
     atlas = state.atlas
-    if not atlas.settled() or state.settings.loops is None:
+    young = atlas.adrift is None and len(atlas.frames) >= YOUNG
+    if state.settings.loops is None or not (young or atlas.settled()):
         return False
     if atlas.adrift is not None:
         forget_adrift(state)
@@ -91,12 +100,6 @@ def disown(state: State, watch: Watch) -> None:
     """
     state.atlas.adrift, state.atlas.since, state.atlas.stale = watch.first, watch.since, True
     livemap.forget(state, watch.first)
-
-
-def unlist(state: State, since: int) -> None:
-    """Take the keyframes from ``since`` on off the lists by place, and lists that are empty then."""
-    kept = {place: [key for key in keys if key < since] for place, keys in state.places.items()}
-    state.places = {place: keys for place, keys in kept.items() if keys}
 
 
 def places(state: State) -> int | None:
@@ -190,24 +193,29 @@ def doubt(state: State) -> None:
     """Say that the robot was carried off where light says so: at once if scans fit no more, else after a while.
 
     The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here. Where
-    light once proved the place, it must also receive a lamp that cannot be received here: the filter itself can be
-    led astray by wheels, and a robot that the laser holds is not set adrift for that.
+    light once proved the place, it must also receive a lamp that cannot be received here, or, where scans do not fit or
+    did not, epochs read by themselves must have the robot elsewhere: the filter itself can be led astray by wheels, and
+    a robot that the laser holds is not set adrift for that.
     """
     from estimator import relocate_light
 
     tie = state.absolute
     assert tie is not None
     if not relocate_light.disputed(state):
-        tie.elsewhere_since = None
+        tie.elsewhere_since = tie.aside_since = None
         return
     now = state.fused.t_mono
     tie.elsewhere_since = now if tie.elsewhere_since is None else tie.elsewhere_since
     here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    if tie.proved and not relocate_light.out_of_place(state, here):
+    unfit = state.failures >= UNFIT
+    aside = (unfit or tie.broken) and relocate_light.glimpsed_elsewhere(state, here)
+    tie.aside_since = (now if tie.aside_since is None else tie.aside_since) if aside else None
+    aside = tie.aside_since is not None and (unfit or now - tie.aside_since >= ASIDE_S)
+    if tie.proved and not aside and not relocate_light.out_of_place(state, here):
         return
     sure = now - tie.elsewhere_since >= ELSEWHERE_S and relocate_light.elsewhere(state, here)
-    if (sure or state.failures >= UNFIT) and afresh(state):
-        tie.elsewhere_since, tie.broken = None, True
+    if (sure or unfit or aside) and afresh(state):
+        tie.elsewhere_since, tie.aside_since, tie.broken = None, None, True
 
 
 def afresh(state: State) -> bool:
@@ -344,16 +352,11 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
         return
     from estimator.relocate_light import told
 
-    if tie.placed or told(state):  # the map's frame is the survey's
-        tie.P, tie.X = state.P_anchor + state.fused.P, state.fused.P.copy()
+    if atlas.foreign:  # map and robot are one again: light takes both into the survey's frame, as after a first start
+        tie.placed, tie.proved, tie.since, atlas.foreign = False, False, 0, False
+        tie.gap, tie.odd_since = None, None
+    elif tie.placed or told(state):  # the map's frame is the survey's
+        absolute.hang_on_anchor(state)
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start
-
-
-def rehang(state: State, since: int) -> None:
-    """List the keyframes that were adrift by the places that they have come to."""
-    unlist(state, since)
-    for key, frame in state.keyframes.items():
-        if key >= since:
-            state.places.setdefault(square_of(frame.T_map_keyframe), []).append(key)

@@ -148,7 +148,8 @@ class Atlas:
             T_submap_adrift and its covariance in the latter's axes. seek: the search for the place; watch: of one
             that was found.
         kept: ID of this session's first keyframe, where the map is one that was restored; else 0. held: that map is
-            only used; see `Settings.localise`.
+            only used; see `Settings.localise`. foreign: that map does not lie in the light survey's frame, and the
+            robot's place in it has not been found yet.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
@@ -178,6 +179,7 @@ class Atlas:
     watch: Watch | None = None
     kept: int = 0
     held: bool = False
+    foreign: bool = False
     closures: int = 0
     news: Loop | None = None
 
@@ -362,8 +364,6 @@ class Atlas:
             own = [submap for submap in self.submaps.values() if not self.is_held(submap)]
             for submap in own[:-OWN]:
                 self.let_go(submap)
-            stored = [submap.key for submap in self.submaps.values() if self.is_held(submap)]
-            self.constraints.keep(np.asarray(~np.isin(self.constraints.between, stored).all(axis=1)))
 
     def is_held(self, submap: Submap) -> bool:
         """Whether a submap is one of a restored map that is only used."""

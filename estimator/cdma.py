@@ -108,6 +108,7 @@ def search(decoder: Decoder, codes: int) -> None:
     What else there is to do counts as so many codes, or has a call of its own. While nothing speaks for further lamps,
     a small part of the effort is used: estimator/cdma_watch.py.
     """
+    decoder.shape.renew()
     allowed = decoder.watch.allow(codes)
     decoder.watch.spend(allowed - _search(decoder, allowed))
 

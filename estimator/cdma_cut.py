@@ -134,3 +134,23 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
         unit_var[r] = max(normal[r, r], 1e-12)
     noise_var: float = max(power, 1e-30) / max(size - mains - free, 1)
     return noise_var
+
+
+@kernel("void(f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1])")
+def compare_shifts(waves: F8, bounds: I8, light: F8, residual: F8, score: F8) -> None:
+    """How well one lamp's light fits at several shifts: sum over code periods of |correlation|.
+
+    Args:
+        waves: (S, N) its waveform at each shift, the first being where the fit has it; signs 1.
+        bounds: (P + 1,) first sample of each period, by the first shift.
+        light: (P,) its amplitude with the sign of each period: what the fit has taken out.
+        residual: (N,) what that has left.
+        score: (S,) out.
+    """
+    for s in range(waves.shape[0]):
+        score[s] = 0.0
+        for p in range(light.shape[0]):
+            total = 0.0
+            for n in range(bounds[p], bounds[p + 1]):
+                total += waves[s, n] * (residual[n] + light[p] * waves[0, n])
+            score[s] += abs(total)

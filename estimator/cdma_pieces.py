@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma_block import Fit, Prior, Sampled
-from estimator.cdma_cut import TAIL_CHIPS, cut, lay_out, solve_rows
+from estimator.cdma_block import Fit, Prior, Sampled, rows_of
+from estimator.cdma_cut import TAIL_CHIPS, compare_shifts, cut, lay_out, solve_rows
 from estimator.cdma_kernels import columns, mixed
 from estimator.cdma_newton import REACH
 
@@ -74,7 +74,7 @@ def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     periods = int(span / length) + 4  # a tail in front, and one spare for corrections of the clock
     tail = int(TAIL_CHIPS / (block.x[1] - block.x[0]))
     bounds, index = np.empty((n_lamps, periods + 1), np.int64), np.empty((4, n_lamps * periods), np.int64)
-    samples, lamps = np.stack([block.x, block.mask, block.clean]), prior.lamps()
+    samples, lamps = rows_of(block.x, block.mask, block.clean), prior.lamps()
     k = lay_out(prior.chips, lamps, samples, tail, bounds, index)
     stack = stacked(block, k + 2)
     drive = np.where(prior.amplitude > LEADER * np.max(prior.amplitude), prior.amplitude, 0.0)
@@ -141,12 +141,10 @@ SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])
 def side_lobe(block: Sampled, prior: Prior, fit: Fit, lamp: int, table: Array) -> float:
     """Chips by which one lamp of a fit sits beside its correlation peak: 0, or one of the side lobes' distances."""
     few = len(SHIFTS)
-    waves, signs = np.empty((2, few, len(block.x))), np.ones((few, fit.soft.shape[1]))
+    waves, signs, score = np.empty((2, few, len(block.x))), np.ones((few, fit.soft.shape[1])), np.empty(few)
     phase = prior.phase[lamp] + SHIFTS + fit.phase[lamp] + fit.lag
-    lamps = np.stack([phase, np.full(few, prior.rate[lamp] * (1.0 + fit.clock))])
-    bounds = columns(np.repeat(prior.chips[[lamp]], few, axis=0), lamps, block.samples, signs, table, waves)
-    cut = bounds[0]
-    bits = np.repeat(np.where(fit.soft[lamp] < 0, -1.0, 1.0), np.diff(cut))
-    target = fit.residual + fit.amplitude[lamp] * bits * waves[0, 0]
-    score = np.array([np.abs(np.add.reduceat(row * target, cut[:-1][np.diff(cut) > 0])).sum() for row in waves[0]])
-    return float(SHIFTS[np.argmax(score)])
+    lamps = rows_of(phase, np.full(few, prior.rate[lamp] * (1.0 + fit.clock)))
+    bounds = columns(prior.chips[[lamp] * few], lamps, block.samples, signs, table, waves)
+    bits = np.where(fit.soft[lamp] < 0, -1.0, 1.0) * fit.amplitude[lamp]
+    compare_shifts(waves[0], bounds[0], bits, fit.residual, score)
+    return float(SHIFTS[score.argmax()])

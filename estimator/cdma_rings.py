@@ -27,10 +27,19 @@ class BitRings:
     """Soft bits of all tracked lamps, folded on the frame's length, so that weak lamps gain by repetition."""
 
     def __init__(self, capacity: int) -> None:
-        self._rings: Array = np.zeros((2, capacity, FRAME_BITS))
-        self._sum, self._weight = self._rings
+        self._rings: Array = np.zeros((2, capacity, FRAME_BITS))  # sums and weights
         self._last: Index = np.full((capacity, FRAME_BITS), -1)
         self._due: Index = np.zeros(capacity, np.int64)
+
+    @property
+    def _sum(self) -> Array:
+        view: Array = self._rings[0]  # no attribute: a view that is kept and pickled becomes an array of its own
+        return view
+
+    @property
+    def _weight(self) -> Array:
+        view: Array = self._rings[1]
+        return view
 
     def forget(self, slot: int) -> None:
         """Start anew in a slot that another lamp takes."""

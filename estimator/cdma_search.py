@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma_block import Prior, Sampled
+from estimator.cdma_block import Prior, Sampled, rows_of
 from estimator.cdma_kernels import align, columns, detect
 from estimator.cdma_pieces import without
 from estimator.cdma_profile import Profile
@@ -199,7 +199,8 @@ class Search:
         out = np.empty((last - first, 4))
         detect(correlation, n, period, np.empty(int(period) + 3, np.float32), out)
         whole = correlation[:, : max(n - int(period), 1)]  # the period lies inside the block
-        noise = np.sqrt(np.median(np.einsum("ij,ij->i", whole, whole)) / (whole.shape[1] * period))
+        power = np.sort(np.einsum("ij,ij->i", whole, whole))  # its median; `np.median` takes ten times as long
+        noise = np.sqrt(0.5 * (power[(len(power) - 1) // 2] + power[len(power) // 2]) / (whole.shape[1] * period))
         energy = self._energy * n
         z = out[:, 1] / (np.sqrt(n) * max(float(noise), 1e-9))
         amplitude = out[:, 1] / energy
@@ -222,7 +223,7 @@ class Search:
         period = self._profile.length * spc
         half = int(np.ceil(2 * window * spc)) + 1
         score = np.empty(2 * half + 1)
-        align(correlation, np.stack([(0.5 * (n - 1) - phase * spc) % period, amplitude]), n, period, score)
+        align(correlation, rows_of((0.5 * (n - 1) - phase * spc) % period, amplitude), n, period, score)
         best = min(max(int(score.argmax()), 1), 2 * half - 1)
         before, there, behind = score[best - 1 : best + 2].tolist()
         fine = 0.25 * (behind - before) / max(2 * there - before - behind, 1e-9)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -81,7 +82,7 @@ class Mended:
 
 def judge(block: Sampled, fit: Fit, usual_noise: float) -> Verdict:
     """Compare the phases of parts of the block, and what is left over with the usual (ADC steps; 0 if not known)."""
-    edges = np.linspace(0, len(block.y), PARTS + 1).astype(int)[:-1]
+    edges = _edges(len(block.y))
     slope = fit.mixed_slope
     energy = np.maximum(np.add.reduceat(slope * slope, edges), 1e-12)
     overlap = np.add.reduceat(slope * fit.residual, edges)
@@ -91,6 +92,12 @@ def judge(block: Sampled, fit: Fit, usual_noise: float) -> Verdict:
     bent = explained / PARTS > BENT * rest and float(np.max(np.abs(overlap / energy))) > SMALLEST
     loud = usual_noise > 0.0 and fit.noise_var > (LOUD * usual_noise) ** 2
     return Verdict(bent, loud, loud and _slow_energy(fit.residual) > SMOOTH * left)
+
+
+@lru_cache(maxsize=64)
+def _edges(size: int) -> npt.NDArray[np.int64]:
+    """First samples of the parts of a block."""
+    return np.linspace(0, size, PARTS + 1).astype(np.int64)[:-1]
 
 
 def _slow_energy(row: Array) -> float:

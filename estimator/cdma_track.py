@@ -48,6 +48,9 @@ APART: Final = 1.0
 ASTRAY: Final = 0.15
 """Chips: a phase that is not known better (after a long pause) is forgotten; to search for it anew takes 0.2 s."""
 
+LONGEST_S: Final = 1e6
+"""No pause counts for more: nothing is known any more of any phase, and squares stay numbers."""
+
 UNTRIED: Final = 1.5e-4
 """One sigma of a sample clock that is stored (good to 200 ppm) or comes from a search."""
 
@@ -157,7 +160,7 @@ class Tracks:
 
     def predict(self, t: float) -> float:
         """Advance all phases to time ``t``; returns the seconds passed (0 at the first call)."""
-        dt = t - self.t if np.isfinite(self.t) else 0.0
+        dt = min(max(t - self.t, -LONGEST_S), LONGEST_S) if np.isfinite(self.t) else 0.0
         self.t = t
         chips = dt * self._chip_rate
         self.phase += (1.0 + self.rate) * chips

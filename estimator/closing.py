@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator import livemap, se2
+from estimator import absolute, livemap, se2
 from estimator.atlas import LOOK, SOLVE, Atlas, Ints, Waiting
 from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
@@ -21,7 +21,7 @@ from estimator.loop import Candidate, Found, LoopSettings, look, told_by_light
 from estimator.mapframe import move_map
 from estimator.posegraph import UPPER, Graph, Solution, optimise
 from estimator.records import Answer, Array
-from estimator.result import Loop, LoopReason
+from estimator.result import SURPRISE, Loop, LoopReason
 from estimator.state import State
 from estimator.tied import tied
 
@@ -35,6 +35,9 @@ TOGETHER: Final = 60
 
 TURNED: Final = 1.05
 """Turned by so much (rad), a lidar that sees half the horizon sees another part of the surroundings."""
+
+TREMBLE: Final = np.diag((0.005**2, 0.005**2, 0.003**2))
+"""What a correction of the map is uneven by."""
 
 APART: Final = 4.0
 """By how much the variance of what light said is raised: its errors hang together over several submaps."""
@@ -76,10 +79,15 @@ def look_back(state: State, told: LoopSettings, frame: Keyframe) -> None:
 def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
     """The nearest submaps that may be where the keyframe is, and were not left only just now."""
     T, atlas = frame.T_map_keyframe, state.atlas
-    near = []
+    here_x, here_y, _ = T.tolist()
+    near, left_before, most_m = [], atlas.way_m - told.recent_m, told.most_m
     for submap in atlas.of_part(frame.submap):
         settled = submap.settled
-        if settled is None or atlas.way_m - submap.way_m <= told.recent_m:
+        if settled is None or submap.way_m >= left_before:
+            continue
+        x, y, _ = submap.T_map_submap.tolist()  # most of a large map is passed over here, so it is done by hand
+        u, v, _ = settled.witness.T_odom_keyframe.tolist()
+        if math.hypot(x - here_x, y - here_y) >= most_m + math.hypot(u, v):
             continue
         middle = se2.compose(submap.T_map_submap, settled.witness.T_odom_keyframe)
         x, y, yaw = se2.between(middle, T).tolist()
@@ -290,13 +298,29 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
     for submap in atlas.submaps.values():
         if submap.key > last.key:
             submap.T_map_submap = se2.compose(moved, submap.T_map_submap)
+    before_map = state.T_map_odom
     move_map(state, se2.compose(newest.T_map_submap, se2.inverse(newest.T_odom_submap)))
     if newest is last:
         R = se2.rotation(-state.T_map_odom[2])
         atlas.marginal = R @ solution.covariance @ R.T
-        state.P_anchor = atlas.spread(state.T_odom_anchor)
+        state.P_anchor = surer(state, atlas.spread(state.T_odom_anchor), before_map)
         if state.absolute is not None and atlas.held:
-            state.absolute.P, state.absolute.X = state.P_anchor + state.fused.P, state.fused.P.copy()
+            absolute.hang_on_anchor(state)
     else:
         atlas.stale = True  # the newest one's certainty is not known yet
     return True
+
+
+def surer(state: State, P_graph: Array, T_map_odom_before: Array) -> Array:
+    """Covariance (odom axes) of the newest keyframe's place in the map after the graph has moved it.
+
+    The graph reckons with what real rooms bend a stretch by at worst, so that its loops may be believed. A loop takes
+    nothing from what matching itself knew of the place, unless it finds it elsewhere than that allows.
+    """
+    T_anchor = state.T_odom_anchor
+    off = se2.compose(state.T_map_odom, T_anchor) - se2.compose(T_map_odom_before, T_anchor)
+    off[2] = se2.wrap(float(off[2]))
+    off = se2.rotation(-state.T_map_odom[2]) @ off
+    P_way = state.P_anchor
+    fits = float(off @ invert3(P_way + TREMBLE) @ off) <= SURPRISE
+    return P_way if fits and np.trace(P_way) < np.trace(P_graph) else P_graph

@@ -171,7 +171,7 @@ def walk(
     return row, d2, e2, down, up
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], b1[::1], Tuple((i8[::1], f8[::1], i8[::1])))")
+@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], b1[::1], Tuple((i8[::1], f8[::1], i8[::1])))", aside=True)
 def walk_all(
     rows: Array, virtual: Array, below: Ints, kept: npt.NDArray[np.bool_], out: tuple[Ints, Array, Ints]
 ) -> None:
@@ -378,7 +378,9 @@ def nearest(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2:
     return row, d2, e2
 
 
-@kernel("void(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, Tuple((i8[::1], f8[::1], f8[::1], i8[::1])))")
+@kernel(
+    "void(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, Tuple((i8[::1], f8[::1], f8[::1], i8[::1])))", aside=True
+)
 def nearest_all(
     rows: Array, start: Ints, rays: Array, queries: Array, bound2: float, out: tuple[Ints, Array, Array, Ints]
 ) -> None:

@@ -18,7 +18,7 @@ Ints = npt.NDArray[np.int64]
 NONE = -1
 
 
-@kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1])")
+@kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1])", aside=True)
 def adjacency(n: int, edges: Ints) -> tuple[Ints, Ints]:
     """Neighbours of each of ``n`` poses, both ways, without repetition: start (n + 1,) and list."""
     start = np.zeros(n + 1, np.int64)
@@ -176,7 +176,7 @@ def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[
     return bound
 
 
-@kernel("Tuple((i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1])")
+@kernel("Tuple((i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1])", aside=True)
 def minimum_degree(first: Ints, near: Ints) -> tuple[Ints, Ints, Ints]:
     """Order of elimination (n,), and per pose eliminated: start (n + 1,) of the poses it fills in, by old number.
 
@@ -218,7 +218,7 @@ def minimum_degree(first: Ints, near: Ints) -> tuple[Ints, Ints, Ints]:
     return order, start, fill[: start[n]].copy()
 
 
-@kernel("Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1], i8[::1])")
+@kernel("Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1], i8[::1])", aside=True)
 def columns(order: Ints, start: Ints, fill: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     """The factor's pattern in the new order, sorted: column start and rows; row start and columns."""
     n, total = len(order), len(fill)

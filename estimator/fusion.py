@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator import absolute, motion, se2
 from estimator.alike import agreement, beams_each
-from estimator.linear3 import invert3
+from estimator.moving import hang, informed, turn
 from estimator.records import Array, Scan
 from estimator.result import MatchResult, Reason
 from estimator.state import State
@@ -34,13 +34,13 @@ def fuse(state: State, match: MatchResult) -> None:
         learn_noise(state, match)
         T_pred, P_pred = moving.T_odom_base, moving.P
         moving.T_odom_base = match.T_odom_base
-        inflated = motion.learn(moving, match.correction, match.information, bool(match.known_axes.all()))
-        moving.P = updated(P_pred * inflated, match.information, moving.odometry)
-        absolute.on_match(state, T_pred, P_pred, inflated)
+        lacked = motion.learn(moving, match.correction, match.information, bool(match.known_axes.all()))
+        moving.P = updated(P_pred + lacked, match.information, moving.odometry)
+        absolute.on_match(state, T_pred, P_pred, lacked)
         if state.t_scan > -np.inf:
             made = se2.between(state.T_odom_scan, moving.T_odom_base)
             moving.gyro.learn(float(made[2]), moving.t_mono - state.t_scan)
-            motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * np.diag(moving.P), state.settings.noise)
+            motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * moving.P.diagonal(), state.settings.noise)
             guess(state, match.information, moving.t_mono - state.t_scan)
     elif match.reason is not Reason.NO_MAP:
         state.failures += match.reason not in BLIND  # who sees nothing contradicts nothing
@@ -56,7 +56,8 @@ def updated(P: Array, H: Array, odometry: bool) -> Array:
     hair from scan to scan; a tenth of a degree between two of them, forty times a second, would add up to centimetres
     along an axis of which none has seen anything. Without ``odometry`` there is nothing else either: see :func:`guess`.
     """
-    after = invert3(invert3(P) + H)
+    after = np.empty((3, 3))
+    informed(P, H, after)
     loose = loose_direction(H) if odometry else None
     if loose is not None:
         lost = float(loose @ (P[:2, :2] - after[:2, :2]) @ loose)
@@ -68,10 +69,12 @@ def updated(P: Array, H: Array, odometry: bool) -> Array:
 
 def loose_direction(H: Array) -> Array | None:
     """Unit vector (x, y) along which information ``H`` (3, 3) does not hold the place, None where it holds all."""
-    S = H[:2, :2] - np.outer(H[:2, 2], H[:2, 2]) / max(float(H[2, 2]), 1e-9)
-    half = 0.5 * math.atan2(2.0 * float(S[0, 1]), float(S[0, 0] - S[1, 1]))
-    loose = np.array((-math.sin(half), math.cos(half)))
-    return loose if float(loose @ S @ loose) < HELD else None
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = H.tolist()
+    tt = max(tt, 1e-9)
+    xx, xy, yy = xx - xt * xt / tt, xy - xt * yt / tt, yy - yt * yt / tt
+    half = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    x, y = -math.sin(half), math.cos(half)
+    return np.array((x, y)) if x * x * xx + 2.0 * x * y * xy + y * y * yy < HELD else None
 
 
 def guess(state: State, H: Array, dt: float) -> None:
@@ -125,11 +128,9 @@ def covariance(state: State) -> Array:
 
     Once light has told where the map lies it is that of the place in the survey's frame instead.
     """
-    away = se2.between(state.T_odom_anchor, state.fused.T_odom_base)
-    tie = state.absolute
+    out, yaw, tie, moving = np.empty((3, 3)), float(state.T_map_odom[2]), state.absolute, state.fused
     if tie is not None and tie.placed:
-        P = tie.P
+        turn(tie.P, yaw, out)
     else:
-        P = se2.carry(state.T_odom_anchor, away, state.P_anchor) + state.fused.P
-    R = se2.rotation(state.T_map_odom[2])
-    return np.asarray(R @ P @ R.T)
+        hang(state.T_odom_anchor, moving.T_odom_base, state.P_anchor, moving.P, yaw, out)
+    return out

@@ -99,7 +99,7 @@ def field_of(
     return Field(pyramid, low, resolution)
 
 
-@kernel("void(f8[:, ::1], f8[::1], f8[::1], u1[:, ::1])")
+@kernel("void(f8[:, ::1], f8[::1], f8[::1], u1[:, ::1])", aside=True)
 def spread(points: Array, origin: Array, how: Array, field: Bytes) -> None:
     """Gaussian of the distance to the nearest point, cut off at SPREAD deviations. ``how``: resolution, sigma (m)."""
     resolution, sigma = how[0], how[1]
@@ -115,7 +115,7 @@ def spread(points: Array, origin: Array, how: Array, field: Bytes) -> None:
                     field[r, c] = max(field[r, c], int(255.0 * np.exp(-0.5 * d2) + 0.5))
 
 
-@kernel("void(u1[:, :, ::1])")
+@kernel("void(u1[:, :, ::1])", aside=True)
 def widen(pyramid: Bytes) -> None:
     """Fill the levels above the first: each the maximum of four windows half as wide."""
     levels, rows, columns = pyramid.shape
@@ -206,7 +206,7 @@ def near_hit(found: Array, hits: int, node: Node, headings: int, how: Array) -> 
     return False
 
 
-@kernel("Tuple((i8, i8, b1))(u1[:, :, ::1], i4[:, :, ::1], i8[::1], f8[::1], f8[:, ::1])")
+@kernel("Tuple((i8, i8, b1))(u1[:, :, ::1], i4[:, :, ::1], i8[::1], f8[::1], f8[:, ::1])", aside=True)
 def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -> tuple[int, int, bool]:
     """Best-first search: number of hits, nodes opened, whether it is complete.
 

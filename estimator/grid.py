@@ -46,7 +46,7 @@ class Grid:
         return np.asarray(1.0 / (1.0 + np.exp(-self.log_odds)), dtype=np.float32)
 
 
-@kernel("void(f4[:, ::1], f8[::1], f8[::1], Tuple((f8[::1], f8[::1], u1[::1])))")
+@kernel("void(f4[:, ::1], f8[::1], f8[::1], Tuple((f8[::1], f8[::1], u1[::1])))", aside=True)
 def cast_beams(
     cells: npt.NDArray[np.float32],
     frame: Array,

@@ -272,7 +272,8 @@ def see_across(points: Array, reference: Reference, T: Array, scale: float, out:
 
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
-    " Tuple((f8[:, ::1], f8[::1], f8[:, ::1])))"
+    " Tuple((f8[:, ::1], f8[::1], f8[:, ::1])))",
+    aside=True,
 )
 def iterate(
     points: Array, reference: Reference, T: Array, L1: Array, how: Array, out: tuple[Array, Array, Array]

@@ -3,7 +3,8 @@
 Every hot function is written as a plain Python function and decorated with :func:`kernel`:
 
 * an explicit signature: it compiles when imported, never inside a cycle, and a wrong dtype is a ``TypeError``;
-* ``nogil``: the worker may run it beside the event loop;
+* with the interpreter held, but where ``aside`` says otherwise: letting it go and taking it back costs as much as the
+  arithmetic of a small kernel, and while a background job runs Python, whoever has let go waits for it every time;
 * NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
 * ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
 * cached on disk under a directory named by a hash of *all* kernel sources and of the compiler's versions. numba's own
@@ -137,10 +138,11 @@ CACHE_DIR: Final = _choose_cache()
 _numba_config.CACHE_DIR = str(CACHE_DIR)
 
 
-def kernel(signature: str, inline: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def kernel(signature: str, inline: bool = False, aside: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
 
     ``inline`` writes its body into the kernels that call it: handing over three arrays costs as much as ten points.
+    ``aside`` lets other threads run Python meanwhile: for what takes longer than some 50 us in background jobs.
 
     The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage. With
     ``NUMBA_DISABLE_JIT=1`` nothing is compiled and every kernel is its own ``.py_func``.
@@ -149,7 +151,7 @@ def kernel(signature: str, inline: bool = False) -> Callable[[Callable[P, R]], C
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         compiled: Any = numba.njit(
             signature,
-            nogil=True,
+            nogil=aside,
             cache=True,
             fastmath=FASTMATH,
             error_model="numpy",

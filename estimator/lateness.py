@@ -2,7 +2,7 @@
 
 Of the pose's covariance ``P_now = F P_then F' + Q`` the part that the way since has added is taken out and put back, so
 it is neither counted twice nor forgotten; the covariance ``X`` of the tie's error with the pose's has grown by the same
-``Q`` (`estimator.absolute`). What a match corrects then, it corrects now.
+``Q``, less what light has mended since (`estimator.absolute`). What a match corrects then, it corrects now.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator import se2
+from estimator.atlas import swing as lever
 from estimator.linear3 import swing
 from estimator.records import Array, Scan
 from estimator.state import State
@@ -37,11 +38,20 @@ def go_back(state: State, scan: Scan) -> Ahead:
     Q_odom = turned(Q, then[2])
     P = swung(x, y, moving.P - Q_odom)
     known = positive(P)
-    ahead = Ahead(moving.t_mono, delta, Q, known, moving.velocity.copy(), moving.velocity_variance.copy())
+    both = shared(state, scan.t_end, Q_odom) if known else Q_odom
+    ahead = Ahead(
+        moving.t_mono,
+        delta,
+        Q,
+        turned(both, -then[2]),
+        known,
+        moving.velocity.copy(),
+        moving.velocity_variance.copy(),
+    )
     moving.P = P if known else swung(x, y, moving.P)
     if tie is not None:
         tie.P = swung(x, y, tie.P)
-        tie.X = swung(x, y, tie.X - Q_odom if known else tie.X)
+        tie.X = swung(x, y, tie.X - both if known else tie.X)
     moving.T_odom_base, moving.t_mono = then, scan.t_end
     return ahead
 
@@ -56,10 +66,34 @@ def come_again(state: State, ahead: Ahead) -> None:
     moving.P = swung(x, y, moving.P) + Q_odom
     if tie is not None:
         tie.P = swung(x, y, tie.P) + (0.0 if ahead.known else Q_odom)
-        tie.X = swung(x, y, tie.X) + Q_odom
+        tie.X = swung(x, y, tie.X) + turned(ahead.shared, then[2])
     moving.T_odom_base, moving.t_mono = now, ahead.t_mono
     if moving.odometry:
         moving.velocity, moving.velocity_variance = ahead.velocity, ahead.velocity_variance
+
+
+def shared(state: State, t_mono: float, Q: Array) -> Array:
+    """Covariance of the tie's error with ``Q``, what the way since an instant has added to the pose's.
+
+    All of it, but for what light has mended on the way. Taken out whole where a robot had light and no scans for a
+    second, it left a pose of then that had to move the map against each of its own corrections.
+
+    Args:
+        state: all of the estimator.
+        t_mono: the instant.
+        Q: 3x3, odom axes, about the place of now.
+    """
+    moving, tie = state.fused, state.absolute
+    both, rest = np.zeros((3, 3)), Q
+    for t_light, keep in () if tie is None else tie.mended:
+        way = moving.trail.since(t_light) if t_light > t_mono else None
+        if way is None:
+            continue
+        delta, Q_later = made(way)
+        there = se2.compose(moving.T_odom_base, se2.inverse(delta))
+        later, away = turned(Q_later, there[2]), moving.T_odom_base - there
+        both, rest = lever(away) @ keep @ lever(-away) @ (both + rest - later), later
+    return both + rest
 
 
 def swung(x: float, y: float, P: Array) -> Array:

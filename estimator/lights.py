@@ -18,7 +18,7 @@ from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
-from estimator.lights_links import Sight, distrust, forget, judge, relearn, sights, table, view_of
+from estimator.lights_links import Learned, Sight, distrust, forget, judge, relearn, sights, table, view_of
 from estimator.lights_memory import fresh_gains
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places, rule_out
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
@@ -148,9 +148,8 @@ def update(lights: Lights, epoch: LightEpoch) -> LightsResult:
     lights.t_epoch = max(lights.t_epoch, epoch.t_end)
     forget(lights)
     best = lights.tracks[0] if lights.tracks else None
-    lights.result = describe(lights, [sight.link(best) for sight in seen], epoch)
-    if lights.result.fix is not Fix.LOST:
-        lights.result = replace(lights.result, gained=gained, gained_by=gained_by)
+    learned = Learned(best)
+    lights.result = describe(lights, [sight.link(learned) for sight in seen], epoch, (gained, gained_by))
     return lights.result
 
 
@@ -288,8 +287,13 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
         lights.lost = True
 
 
-def describe(lights: Lights, links: list[Link], epoch: LightEpoch | None) -> LightsResult:
-    """Put the state into words."""
+NOTHING_GAINED = (np.zeros((3, 3)), np.zeros(3))
+
+
+def describe(
+    lights: Lights, links: list[Link], epoch: LightEpoch | None, news: tuple[Array, Array] = NOTHING_GAINED
+) -> LightsResult:
+    """Put the state into words; ``news``: the outcome of :func:`gain`, which a place that is lost does not have."""
     pose, P, floor = np.zeros(3), np.zeros((3, 3)), 0.0
     if lights.tracks:
         pose, P = mixture(lights.tracks)
@@ -299,6 +303,7 @@ def describe(lights: Lights, links: list[Link], epoch: LightEpoch | None) -> Lig
         lights.lost = False
     if epoch is not None:
         links = absent(lights, links, pose, fix)
+    gained, gained_by = NOTHING_GAINED if fix is Fix.LOST else news
     return LightsResult(
         t_mono=lights.t_epoch,
         fix=fix,
@@ -306,8 +311,8 @@ def describe(lights: Lights, links: list[Link], epoch: LightEpoch | None) -> Lig
         covariance=0.5 * (P + P.T),
         links=tuple(links),
         accepted=frozenset(k.lamp_id for k in links if k.state is LinkState.ACCEPTED and k.lamp_id is not None),
-        gained=np.zeros((3, 3)),
-        gained_by=np.zeros(3),
+        gained=gained,
+        gained_by=gained_by,
         floor=floor,
         block=epoch.block if epoch is not None else BlockFlag.NONE,
         clock_ppm=epoch.clock_ppm if epoch is not None else None,

@@ -51,6 +51,7 @@ class Catalogue:
         by_id, by_code: the lamps. surveyed: numbers of those that the survey names. rows: by number, for the kernels.
         rims: by number, what each gives at the very edge of view of a level receiver, A.
         heard: by number, when each that the survey does not name was last heard, longest ago first.
+        told: by number, the frame and code last learned, the lamp they were of, and whether the survey says otherwise.
     """
 
     depth: float
@@ -61,6 +62,7 @@ class Catalogue:
     rows: dict[int, Array] = field(default_factory=dict)
     rims: dict[int, float] = field(default_factory=dict)
     heard: dict[int, float] = field(default_factory=dict)
+    told: dict[int, tuple[LampFrame, int, Lamp, bool]] = field(default_factory=dict)
 
     def add(self, lamp: Lamp) -> None:
         """Take a lamp in; one of the same number is replaced."""
@@ -83,15 +85,21 @@ class Catalogue:
         lamp = self.by_id.pop(lamp_id)
         self.by_code[lamp.code].remove(lamp)
         del self.rows[lamp_id], self.rims[lamp_id], self.heard[lamp_id]
+        self.told.pop(lamp_id, None)
 
     def learn(self, frame: LampFrame, code: int, t_mono: float) -> tuple[Lamp, bool]:
         """The lamp that says this of itself, and whether the survey (which wins) knows it otherwise."""
-        known = self.by_id.get(frame.lamp_id)
+        known, told = self.by_id.get(frame.lamp_id), self.told.get(frame.lamp_id)
+        if told is not None and told[0] is frame and told[1] == code and told[2] is known:  # as in the block before
+            self.touch(frame.lamp_id, t_mono)
+            return known, told[3]
         if known is None or (frame.lamp_id not in self.surveyed and contradicts(frame, code, known)):
             self.add(lamp_of(frame, code))
             known = self.by_id[frame.lamp_id]
         self.touch(frame.lamp_id, t_mono)
-        return known, frame.lamp_id in self.surveyed and contradicts(frame, code, known)
+        contradicted = frame.lamp_id in self.surveyed and contradicts(frame, code, known)
+        self.told[frame.lamp_id] = frame, code, known, contradicted
+        return known, contradicted
 
     def candidates(self, code: int) -> list[Lamp]:
         """All lamps of a code."""

@@ -71,18 +71,33 @@ class Sight:
     residual: float | None = None
     sigma: float | None = None
 
-    def link(self, track: Track | None) -> Link:
+    def link(self, learned: Learned) -> Link:
         """As others are told."""
         known = self.lamp is not None and self.state is not TWIN
         link_id = self.lamp.lamp_id if self.lamp is not None and known else None
-        gain, spread = 0.0, 0.0
-        if track is not None and self.slot >= 0:
-            at = ekf.FIRST + ekf.OWN * self.slot
-            gain = float(track.x[at] + track.x[ekf.COMMON])
-            spread = float(track.P[at, at] + track.P[ekf.COMMON, ekf.COMMON] + 2.0 * track.P[at, ekf.COMMON])
+        gain, spread = learned.gain(self.slot)
         sigma = math.sqrt(max(spread, 0.0))
         residual, of_it = self.residual, self.sigma
         return Link(self.code, link_id, self.state, self.amplitude, residual, of_it, gain, sigma, self.contradicted)
+
+
+class Learned:
+    """What a hypothesis has learned of the lamps in its slots; None: there is no hypothesis."""
+
+    def __init__(self, track: Track | None) -> None:
+        """Take it out of the arrays at once: one number at a time costs as much as all of them."""
+        self._x: list[float] = []
+        if track is not None:  # with slots that are not in use: it may be younger than the sights
+            self._x = track.x.tolist()
+            self._variance, self._common = track.P.diagonal().tolist(), track.P[ekf.COMMON].tolist()
+
+    def gain(self, slot: int) -> tuple[float, float]:
+        """Of the lamp in a slot (-1: none), common part included: ln gain and its variance."""
+        if slot < 0 or not self._x:
+            return 0.0, 0.0
+        at = ekf.FIRST + ekf.OWN * slot
+        spread = self._variance[at] + self._variance[ekf.COMMON] + 2.0 * self._common[at]
+        return self._x[at] + self._x[ekf.COMMON], spread
 
 
 def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
@@ -186,7 +201,7 @@ def occupy(lights: Lights, track: Track, lamp: Lamp, slot: int) -> None:
 
 def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight], Array]:
     """The sights that can be compared with a hypothesis, and their rows for the kernels."""
-    rows, kept, busy = [], [], set[int]()
+    kept, busy = list[Sight](), set[int]()
     for sight in seen:
         if sight.lamp is None or sight.state is not ACCEPTED:
             continue
@@ -195,9 +210,12 @@ def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight],
             continue
         busy.add(slot)
         sight.slot = slot
-        rows.append((slot, math.log(sight.amplitude), sight.variance / sight.amplitude**2, 0.0, -1.0, 0.0, 0.0))
         kept.append(sight)
-    links = np.array(rows, dtype=np.float64).reshape(len(rows), ekf_links.LINK_COLUMNS)
+    links = np.zeros((len(kept), ekf_links.LINK_COLUMNS))
+    links[:, ekf_links.SLOT] = [sight.slot for sight in kept]
+    links[:, ekf_links.LN] = [math.log(sight.amplitude) for sight in kept]
+    links[:, ekf_links.NOISE] = [sight.variance / sight.amplitude**2 for sight in kept]
+    links[:, ekf_links.SIGMA] = -1.0
     if lights.corrections is not None and kept:
         ids = [sight.lamp.lamp_id for sight in kept if sight.lamp is not None]
         links[:, ekf_links.SHIFT :] = lights.corrections.at(ids, track.x[:3])
@@ -276,7 +294,9 @@ def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:
     if sight.lamp is None or sight.residual is None or sight.sigma is None:
         return RIM
     r, sigma = sight.residual, sight.sigma
-    watch = track.watches.setdefault(sight.lamp.lamp_id, Watch())
+    watch = track.watches.get(sight.lamp.lamp_id)
+    if watch is None:
+        watch = track.watches[sight.lamp.lamp_id] = Watch()
     step, watch.way_seen = min(way - watch.way_seen, STRIDE_M), way
     if watch.moved:
         parole(watch, abs(r) < PAROLE * sigma, step)
@@ -321,11 +341,11 @@ def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
 
 def distrust(lights: Lights, track: Track) -> None:
     """A lamp whose strengths can only be explained by a lean that no lamp has hangs elsewhere: it is not used again."""
-    limit = MOVED_LEANS * lights.settings.model.lean
+    limit, n = MOVED_LEANS * lights.settings.model.lean, track.n
+    x, variance = track.x[:n].tolist(), track.P.diagonal()[:n].tolist()
     for lamp_id, slot in track.slots.items():
         at = ekf.FIRST + ekf.OWN * slot + ekf.TILT_X
-        spread = float(track.P[at, at] + track.P[at + 1, at + 1])
-        if math.hypot(track.x[at], track.x[at + 1]) < limit + 2.0 * math.sqrt(max(spread, 0.0)):
+        if math.hypot(x[at], x[at + 1]) < limit + 2.0 * math.sqrt(max(variance[at] + variance[at + 1], 0.0)):
             continue
         watch = track.watches.setdefault(lamp_id, Watch())
         watch.moved, watch.fitted = True, 0.0

@@ -34,9 +34,10 @@ FASTEST: Final = 20.0
 def on_odometry(lights: Lights, record: Odometry) -> None:
     """Move by what the wheels say, less what was carried ahead; turn by the gyro where that covers the stretch."""
     course, noise = lights.course, lights.settings.motion
-    delta = np.asarray(record.delta, dtype=np.float64)
+    delta = np.array(record.delta, dtype=np.float64)
     dt = record.t_end - record.t_begin
-    if not (np.isfinite(delta).all() and np.abs(delta).max() < FASTEST and record.t_end > course.t_odometry):
+    largest = max([abs(part) if math.isfinite(part) else math.inf for part in delta.tolist()])
+    if not (largest < FASTEST and record.t_end > course.t_odometry):
         return
     if not course.wheels:
         settle(lights)
@@ -45,18 +46,21 @@ def on_odometry(lights: Lights, record: Odometry) -> None:
         delta = np.array((delta[0], delta[1], course.gyro_turned * dt / course.gyro_span))
     follows = abs(record.t_begin - course.t_odometry) < 1e-6 and dt < CARRY_S
     made = se2.between(course.ahead, delta) if follows else rest(delta, record, course.t_mono)
-    way, turn = abs(float(made[0])), 0.0 if by_gyro else abs(float(made[2]))
+    ahead, _, turned = made.tolist()
+    way, turn = abs(ahead), 0.0 if by_gyro else abs(turned)
     idle = min(max(dt, 0.0), CARRY_S)
-    skid = noise.skid**2 * abs(float(made[2]))
+    skid = noise.skid**2 * abs(turned)
     q = (
         noise.slip**2 * way + skid + noise.idle_m**2 * idle,
         noise.side**2 * way + skid + noise.idle_m**2 * idle,
         noise.turn**2 * turn + (0.0 if by_gyro else noise.wander**2 * way) + noise.idle_rad**2 * idle,
     )
-    blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else made[2], 0.0 if by_gyro else made[0], 0.0, 1.0)
+    blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else turned, 0.0 if by_gyro else ahead, 0.0, 1.0)
     if 1e-3 < dt < CARRY_S:
         velocity = se2.log(delta) / dt
-        course.velocity = velocity if (np.abs(velocity) <= AT_MOST).all() else course.velocity
+        vx, vy, rate = velocity.tolist()
+        possible = abs(vx) <= AT_MOST[0] and abs(vy) <= AT_MOST[1] and abs(rate) <= AT_MOST[2]
+        course.velocity = velocity if possible else course.velocity
     course.gyro_turned = course.gyro_span = 0.0
     course.t_odometry = record.t_end
     move_all(lights, made, np.array(blame), np.array(q), max(course.t_mono, record.t_end))
@@ -126,9 +130,9 @@ def glide(lights: Lights, t_mono: float, turn: float | None, spread: float) -> N
     drift = -dt if by_gyro else 0.0
     push, spin = (UNSEEN * unseen) ** 2, min(UNSEEN * unseen, math.pi) ** 2
     if course.wheels:
-        speed = course.velocity[:2] * dt
-        delta = np.array((speed[0], speed[1], turn or 0.0))
-        blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else delta[2], 0.0 if by_gyro else delta[0], drift, 1.0)
+        ahead, side = float(course.velocity[0]) * dt, float(course.velocity[1]) * dt
+        delta = np.array((ahead, side, turn or 0.0))
+        blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else turn or 0.0, 0.0 if by_gyro else ahead, drift, 1.0)
         spread = spread if by_gyro else 0.0
         course.ahead = se2.compose(course.ahead, delta)
     else:
@@ -147,13 +151,13 @@ def move_all(lights: Lights, delta: Array, blame: Array, q: Array, t_mono: float
     made = delta
     for k, track in enumerate(lights.tracks):
         if k == 0:
-            speed = track.x[ekf.SPEED : ekf.TURN + 1] * blame[:3]
-            made = delta + speed
-        ekf.move(track.x, track.P, track.n, np.ascontiguousarray(delta), blame, q)
+            made = delta + track.x[ekf.SPEED : ekf.TURN + 1] * blame[:3]
+        ekf.move(track.x, track.P, track.n, delta, blame, q)
     course.T = se2.compose(course.T, made)
-    way = math.hypot(float(made[0]), float(made[1]))
+    x, y, turned = made.tolist()
+    way = math.hypot(x, y)
     course.way += way if course.wheels else max(0.0, way - STILL * float(blame[0]))
-    course.turned += abs(float(made[2]))
+    course.turned += abs(turned)
     course.t_mono = max(course.t_mono, t_mono)
     course.trail.append((course.t_mono, course.T))
     while course.trail[0][0] < course.t_mono - TRAIL_S:

@@ -123,7 +123,7 @@ def measure_runs(lines: Array, count: int) -> None:
         begin = i
 
 
-@kernel("i8(f8[:, ::1], f8[::1], f8, f8[:, ::1])")
+@kernel("i8(f8[:, ::1], f8[::1], f8, f8[:, ::1])", aside=True)
 def fit_lines(xy: Array, eye: Array, sigma: float, lines: Array) -> int:
     """A line through the surroundings of each point, left out where they are none; the number found.
 

@@ -75,7 +75,8 @@ class LocalMap:
 
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], i8[::1], f8[:, ::1])), f8[::1], f8[:, ::1],"
-    " Tuple((f8, f8, f8, f8, f8)), i8)"
+    " Tuple((f8, f8, f8, f8, f8)), i8)",
+    aside=True,
 )
 def absorb(
     elements: Array,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from estimator import se2
+from estimator.keyframe import square_of
 from estimator.records import Array
 from estimator.state import State
 
@@ -32,3 +33,17 @@ def shift_map(state: State, moved: Array, since: int) -> None:
         driven = submap is newest and (adrift is None or submap.key >= adrift)
         if submap.first >= since or driven:
             submap.T_map_submap = se2.compose(moved, submap.T_map_submap)
+
+
+def unlist(state: State, since: int) -> None:
+    """Take the keyframes from ``since`` on off the lists by place, and lists that are empty then."""
+    kept = {place: [key for key in keys if key < since] for place, keys in state.places.items()}
+    state.places = {place: keys for place, keys in kept.items() if keys}
+
+
+def rehang(state: State, since: int) -> None:
+    """List the keyframes from ``since`` on, 0 being all, by the places that they have come to."""
+    unlist(state, since)
+    for key, frame in state.keyframes.items():
+        if key >= since:
+            state.places.setdefault(square_of(frame.T_map_keyframe), []).append(key)

@@ -206,6 +206,8 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
         submap = atlas.submaps[hung.submap]
         T_odom = se2.compose(submap.T_odom_submap, hung.T_submap_keyframe)
         frame = replace(hung.frame, submap=submap, T_odom_keyframe=T_odom)
+        if frame.virtual is not None:
+            submap.lamps |= frame.virtual.accepted
         state.keyframes[frame.key] = frame
         state.places.setdefault(square_of(frame.T_map_keyframe), []).append(frame.key)
     livemap.begin(state)
@@ -215,6 +217,7 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
     atlas.held = state.settings.localise
     if state.absolute is not None:
         state.absolute.since = state.next_key
+        atlas.foreign = not (image.identity.surveyed or any(piece.light is not None for piece in image.submaps))
     return state
 
 

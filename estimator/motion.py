@@ -14,6 +14,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.linear3 import invert3
+from estimator.moving import carry_on, feel_axes
 from estimator.records import Array, Imu, Odometry
 from estimator.trail import Trail
 
@@ -59,9 +60,9 @@ class MotionNoise:
     acceleration: float = 1.0
     angular_acceleration: float = 2.0
 
-    def acceleration_variance(self) -> tuple[float, float, float]:
+    def acceleration_variance(self) -> Array:
         """Variance of the acceleration (x, y, yaw)."""
-        return self.acceleration**2, self.acceleration**2, self.angular_acceleration**2
+        return np.array((self.acceleration**2, self.acceleration**2, self.angular_acceleration**2))
 
 
 @dataclass(slots=True)
@@ -119,10 +120,9 @@ class Motion:
 
 def move(motion: Motion, delta: Array, variance: Array) -> None:
     """Move the pose by ``delta`` in the base frame, with noise of ``variance`` (x, y, yaw; base-aligned)."""
-    T = motion.T_odom_base
-    R = se2.rotation(T[2] + 0.5 * delta[2])
-    motion.P = se2.carry(T, delta, motion.P) + (R * (motion.doubt * variance)) @ R.T
-    motion.T_odom_base = se2.compose(T, delta)
+    T, P = np.empty(3), np.empty((3, 3))  # others may hold on to the pose before
+    carry_on(motion.T_odom_base, delta, variance, motion.P, T, P)
+    motion.T_odom_base, motion.P = T, P
 
 
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
@@ -133,23 +133,25 @@ def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
     sender switched on late) or bridges a silence adds what lies after the present instant: until then the pose has been
     held by others.
     """
-    if not np.isfinite(record.delta).all():
+    if not all(map(math.isfinite, record.delta.tolist())):
         return
     dt = record.t_end - record.t_begin
-    delta, variance = record.delta, odometry_variance(record.delta, dt, noise)
+    delta = np.array(record.delta, dtype=np.float64)  # a kernel takes no view of something else
+    variance = odometry_variance(delta, dt, noise)
     if dt > 0.0 and abs(motion.gyro.span_s - dt) < 0.3 * dt:
         delta = np.array((delta[0], delta[1], motion.gyro.turned_rad * dt / motion.gyro.span_s))
         variance[2] = min(float(variance[2]), GYRO_RAD**2)
+    variance *= motion.doubt
     motion.gyro.turned_rad = motion.gyro.span_s = 0.0
     follows = abs(record.t_begin - motion.t_odometry) < 1e-6 and dt < LONGEST_CARRY_S
     made = se2.between(motion.ahead, delta) if follows else remainder(delta, record, motion.t_mono)
     move(motion, made, variance)
     if follows:
         motion.trail.take_back(record.t_begin)
-        motion.trail.add(record.t_begin, record.t_end, delta, motion.doubt * variance)
+        motion.trail.add(record.t_begin, record.t_end, delta, variance)
     else:
-        motion.trail.add(max(motion.t_mono, record.t_begin), record.t_end, made, motion.doubt * variance)
-    feel(motion, delta, (record.t_begin, record.t_end), motion.doubt * variance, noise)
+        motion.trail.add(max(motion.t_mono, record.t_begin), record.t_end, made, variance)
+    feel(motion, delta, (record.t_begin, record.t_end), variance, noise)
     motion.ahead, motion.odometry, motion.t_odometry = se2.identity(), True, record.t_end
     motion.t_mono = max(motion.t_mono, record.t_end)
 
@@ -182,12 +184,8 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
     if not 1e-3 < dt < LONGEST_CARRY_S:
         return
     late = min(max(0.0, end - motion.t_felt), LONGEST_CARRY_S)
-    made = se2.log(delta)
-    for axis, unknown in enumerate(noise.acceleration_variance()):
-        P = float(motion.velocity_variance[axis]) + unknown * late * late
-        gain = P / (P + float(variance[axis]) / (dt * dt) + unknown * (0.25 * dt * dt))
-        motion.velocity[axis] += gain * (float(made[axis]) / dt - float(motion.velocity[axis]))
-        motion.velocity_variance[axis] = (1.0 - gain) * P
+    spread, unknown = motion.velocity_variance, noise.acceleration_variance()
+    feel_axes(motion.velocity, spread, se2.log(delta), variance, unknown, (dt, late))
     motion.t_felt = max(motion.t_felt, end)
 
 
@@ -220,9 +218,10 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
     if math.isfinite(dt):
         unseen, dt = max(0.0, dt - LONGEST_CARRY_S), min(dt, LONGEST_CARRY_S)
         delta = se2.exp(motion.velocity * dt)
-        variance = (motion.velocity_variance + np.array(noise.acceleration_variance()) * (dt * dt)) * (dt * dt)
+        square = dt * dt
+        variance = (motion.velocity_variance + noise.acceleration_variance() * square) * (motion.doubt * square)
         move(motion, delta, variance)
-        motion.trail.add(motion.t_mono, t_mono, delta, motion.doubt * variance)
+        motion.trail.add(motion.t_mono, t_mono, delta, variance)
         if unseen > 0.0:
             motion.trail.forget(t_mono)
             motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
@@ -230,13 +229,15 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
     motion.t_mono = t_mono
 
 
-def learn(motion: Motion, correction: Array, H: Array, known: bool) -> float:
-    """Learn from a match how far the prediction can be trusted; returns the factor by which this one's was too sure.
+def learn(motion: Motion, correction: Array, H: Array, known: bool) -> Array:
+    """Learn from a match how far the prediction can be trusted; returns the covariance (3, 3) that this one's lacked.
 
     Noise figures are those of a good robot. Where wheels slip or stamps jitter, matches keep correcting the prediction
     by more than its deviation says, and ``doubt`` scales the noise of the predictions to come. Of a prediction's own
     variance, a match with the information ``H`` (3, 3) corrects the part ``(L + H)^-1 H``; the square that it should
-    have is that much.
+    have is that much. A correction beyond three deviations makes them a third of itself, along itself alone: across it
+    nothing was wrong, and an axis that no match holds would be blown up by every surprise along the other one, without
+    end.
     """
     L = invert3(motion.P)
     square = float(correction @ L @ correction)
@@ -244,4 +245,4 @@ def learn(motion: Motion, correction: Array, H: Array, known: bool) -> float:
         expected = float((invert3(L + H) * H).sum())  # trace of the product of two symmetric matrices
         seen = motion.doubt * min(square / max(expected, LEAST_EXPECTED), SURPRISE_CAP)
         motion.doubt = min(max(DOUBT_LEAST, motion.doubt + DOUBT_LEARNING * (seen - motion.doubt)), DOUBT_CAP)
-    return max(1.0, square / 9.0)
+    return max(0.0, 1.0 / 9.0 - 1.0 / max(square, 9.0)) * np.outer(correction, correction)

@@ -109,7 +109,7 @@ def shortened(beams: Beams) -> Beams:
     return bearing, np.where(far, REACH_M, distance), np.where(far, np.uint8(Beam.FREE), kind).astype(np.uint8)
 
 
-@kernel("i8(i2[:, ::1], i2[:, ::1], i1[:, ::1], f8[::1])")
+@kernel("i8(i2[:, ::1], i2[:, ::1], i1[:, ::1], f8[::1])", aside=True)
 def lay_under(said: Shorts, heard: Shorts, cells: Cells, how: Array) -> int:
     """Add an older patch to a tile, as far as its cells have not heard enough; how much of its words counted.
 

@@ -196,7 +196,8 @@ def sum_up(points: Array, reference: Reference, T: Array, P: Array, how: Array, 
 
 @kernel(
     "i8(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
-    " Tuple((f8[:, ::1], f8[::1], f8[:, ::1])))"
+    " Tuple((f8[:, ::1], f8[::1], f8[:, ::1])))",
+    aside=True,
 )
 def iterate(
     points: Array, reference: Reference, T: Array, P: Array, how: Array, out: tuple[Array, Array, Array]

@@ -192,14 +192,14 @@ def light_first(state: State, prior: Prior) -> First:
 
 def report(state: State, match: MatchResult | None, keyframe: int, limits: Limits = UNLIMITED) -> StepResult:
     """The estimate after this step; jobs wait for one that has the time."""
-    moving = state.fused
+    moving, P = state.fused, covariance(state)
     return StepResult(
         t_mono=moving.t_mono,
         T_odom_base=moving.T_odom_base,
         T_map_odom=state.T_map_odom,
-        covariance=covariance(state) + FLOOR,
+        covariance=P + FLOOR,
         velocity=moving.velocity.copy(),
-        known_axes=known_axes(state, match),
+        known_axes=known_axes(state, match, P),
         match=match,
         keyframe=keyframe,
         loop=state.atlas.take_news(),
@@ -212,17 +212,17 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         places=adrift.places(state),
         jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
         anew=state.anew,
-        protection=protection.bound(state),
+        protection=protection.bound(state, P),
     )
 
 
-def known_axes(state: State, match: MatchResult | None) -> Array:
-    """The axes known in the map frame: in the survey by the pose's own deviation, else those that the match shows.
+def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
+    """The axes known in the map frame: in the survey by the pose's covariance ``P``, else those that the match shows.
 
     A corridor along x of the odom frame may run along y of the map.
     """
     if state.absolute is not None and state.absolute.placed:
-        return np.asarray(np.diag(covariance(state)) < absolute.KNOWN, dtype=np.float64)
+        return np.asarray(P.diagonal() < absolute.KNOWN, dtype=np.float64)
     if match is None or not match.ok:
         return np.ones(3) if match is None else match.known_axes
     R = se2.rotation(state.T_map_odom[2])

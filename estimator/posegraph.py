@@ -144,7 +144,7 @@ def check(graph: Graph) -> None:
             raise ValueError(f"{name}: not finite in row {int(np.argwhere(~np.isfinite(values))[0][0])}")
 
 
-@kernel("i8[::1](i8, i8[:, ::1])")
+@kernel("i8[::1](i8, i8[:, ::1])", aside=True)
 def parts_of(n: int, edges: Ints) -> Ints:
     """For each pose the lowest number among those it is joined with."""
     root = np.arange(n)
@@ -216,7 +216,7 @@ ABSOLUTE = "Tuple((i8[::1], f8[:, ::1], f8[:, ::1]))"
 PATTERN = "Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))"
 
 
-@kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE}, f8[::1], f8)")
+@kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE}, f8[::1], f8)", aside=True)
 def cost(poses: Array, given: Given, absolute: Absolute, trust: Array, phi: float) -> float:
     """chi2 as weighted, and the ``trust`` in each edge.
 
@@ -236,7 +236,7 @@ def cost(poses: Array, given: Given, absolute: Absolute, trust: Array, phi: floa
     return total
 
 
-@kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE})")
+@kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE})", aside=True)
 def worst(poses: Array, given: Given, absolute: Absolute) -> float:
     """Largest chi2 of a constraint that may be false."""
     edges, between, information, doubtful = given
@@ -271,7 +271,7 @@ def subtract(A: Array, v: Array, out: Array) -> None:
 
 
 @kernel(f"void(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), Tuple((f8[::1], i8[::1], f8)),"
-        " Tuple((f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])))")  # fmt: skip
+        " Tuple((f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])))", aside=True)  # fmt: skip
 def linearise(
     poses: Array,
     given: Given,
@@ -323,7 +323,7 @@ def linearise(
                 add_product(A, H, B, below[slot[k]])
 
 
-@kernel(f"i8[::1](i8[:, ::1], i8[::1], {PATTERN})")
+@kernel(f"i8[::1](i8[:, ::1], i8[::1], {PATTERN})", aside=True)
 def slots_of(edges: Ints, place: Ints, pattern: tuple[Ints, Ints, Ints, Ints]) -> Ints:
     """Where in the pattern the block of each edge lies, -1 where one of its poses is held."""
     start, down, _, _ = pattern
@@ -344,7 +344,9 @@ def slots_of(edges: Ints, place: Ints, pattern: tuple[Ints, Ints, Ints, Ints]) -
     return slot
 
 
-@kernel(f"Tuple((f8, i8, b1))(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), f8[::1], f8[::1])")
+@kernel(
+    f"Tuple((f8, i8, b1))(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), f8[::1], f8[::1])", aside=True
+)
 def descend(
     poses: Array,
     given: Given,
@@ -403,7 +405,10 @@ def descend(
     return best, count, done and damping <= 1e6
 
 
-@kernel(f"b1(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), Tuple((f8[::1], f8, i8)), f8[:, ::1])")
+@kernel(
+    f"b1(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), Tuple((f8[::1], f8, i8)), f8[:, ::1])",
+    aside=True,
+)
 def marginal(
     poses: Array,
     given: Given,

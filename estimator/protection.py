@@ -22,8 +22,7 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
-from estimator.absolute import doubted, pose_at
-from estimator.fusion import covariance
+from estimator.absolute import doubted_covariance, pose_at
 from estimator.records import Array
 from estimator.result import Fix, Protection
 from estimator.state import State
@@ -41,6 +40,7 @@ UNKNOWN_RAD = 0.01
 """What no filter knows of: stamps, lever arms, the survey itself."""
 STRAIN_M, STRAIN_RAD = 0.02, 0.004
 """Drift of a pose that the laser alone carries on, by the root of a metre: three times what tours have shown."""
+STRAIN: Final = np.diag((STRAIN_M**2, STRAIN_M**2, STRAIN_RAD**2))
 MOST_M: Final = 30.0
 """A bound above this says nothing."""
 
@@ -50,9 +50,8 @@ K_FAULT: Final = ALIKE * math.sqrt(-2.0 * math.log(0.25 * RISK / FAULTY))
 """The same with one of two witnesses wrong, each of which may take a quarter of the risk."""
 
 
-def bound(state: State) -> Protection | None:
-    """Bound on the error of the pose after this step; None: there is none."""
-    P = covariance(state)
+def bound(state: State, P: Array) -> Protection | None:
+    """Bound on the error of the pose after this step, ``P`` being its covariance; None: there is none."""
     tie = state.absolute
     laser = state.local is not None and (state.fused.t_mono - state.t_match < 1.0)
     lit = tie is not None and tie.placed and state.light is not None and state.light.result.fix is Fix.GOOD
@@ -85,8 +84,7 @@ def _without_light(state: State) -> tuple[float, float]:
     T_map_odom, P, way = state.frozen.kept[0]
     T_odom_base = state.fused.T_odom_base
     off = se2.between(se2.compose(T_map_odom, T_odom_base), se2.compose(state.T_map_odom, T_odom_base))
-    strain = max(state.way - way, 0.0) * np.diag((STRAIN_M**2, STRAIN_M**2, STRAIN_RAD**2))
-    far, turned = spread(P + strain, K_FAULT)
+    far, turned = spread(P + max(state.way - way, 0.0) * STRAIN, K_FAULT)
     return math.hypot(off[0], off[1]) + far, abs(float(off[2])) + turned
 
 
@@ -95,15 +93,16 @@ def _without_laser(state: State) -> tuple[float, float]:
     tie, light = state.absolute, state.light
     assert tie is not None
     assert light is not None
-    said = doubted(tie, light.result, state.fused.odometry)
+    said, (covered, _) = light.result, doubted_covariance(tie, light.result, state.fused.odometry)
     here = se2.compose(state.T_map_odom, pose_at(state, max(said.t_mono, said.t_pose)))
     off = said.T_map_base - here
-    far, turned = spread(said.covariance, K_FAULT)
+    far, turned = spread(covered, K_FAULT)
     heading = 0.0 if not state.fused.odometry else abs(se2.wrap(float(off[2]))) + turned
     return math.hypot(off[0], off[1]) + far, heading
 
 
 def spread(P: Array, k: float) -> tuple[float, float]:
     """``k`` deviations of a covariance (3, 3): of the larger axis in the plane, and of the heading."""
-    mean, half = 0.5 * (P[0, 0] + P[1, 1]), math.hypot(0.5 * (P[0, 0] - P[1, 1]), P[0, 1])
-    return k * math.sqrt(max(0.0, mean + half)), k * math.sqrt(max(0.0, float(P[2, 2])))
+    (xx, xy, _), (_, yy, _), (_, _, tt) = P.tolist()
+    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    return k * math.sqrt(max(0.0, mean + half)), k * math.sqrt(max(0.0, tt))

@@ -48,6 +48,11 @@ LEAST: Final = 3
 AGAINST: Final = 0.34
 """Share of links against the place from which on it is none."""
 
+HEADED_M: Final = 3.0
+"""Way since the `lights` filter last looked for its place, before which its heading rules nothing out: strengths tell
+it by how the robot moves, and with wheels that turn, or walls that reflect, young hypotheses of it go astray together.
+The laser sees it at once, and where it sees two it goes on looking."""
+
 NEARER_M: Final = 1.0
 STRONGER: Final = 2.0
 """A lamp that is received so many times stronger than it can be within the former of a place is not received there."""
@@ -127,10 +132,25 @@ def out_of_place(state: State, T_map_base: Array) -> bool:
     return any(received(state, T_map_base))
 
 
+def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:
+    """Whether the latest epoch, read by itself, has the robot in one place, and that is farther away than `NEARER_M`.
+
+    Wheels that turn more than they say lead the filter astray, and not one epoch; it says more than that the lamps of
+    the place are received, which they are a few metres beside it too.
+    """
+    if state.light is None or not received(state, T_map_base):
+        return False
+    rx, found = state.light.filter.survey.receiver, glimpsed(state.light)
+    if len(found) != 1:
+        return False
+    (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
+    return math.hypot(found[0].x - x, found[0].y - y) > NEARER_M
+
+
 def in_place(state: State, T_map_base: Array) -> bool:
-    """Whether lamps enough are received now, and all of them can be received about a pose as strong as they are."""
+    """Whether lamps enough are received now, all of them as strong as they can be about a pose, and it may be there."""
     strong = received(state, T_map_base)
-    return len(strong) >= LEAST and not any(strong)
+    return len(strong) >= LEAST and not any(strong) and not glimpsed_elsewhere(state, T_map_base)
 
 
 def received(state: State, T_map_base: Array) -> list[bool]:
@@ -218,7 +238,7 @@ def compatible(state: State, T_map_base: Array) -> bool | None:
         return False
     assert state.light is not None
     lights = state.light.filter
-    if contradicted(lights):
+    if contradicted(lights) or lights.course.way - lights.way_start < HEADED_M:
         return True
     return any(fits(track, T_map_base) for track in likely(lights))
 

@@ -19,7 +19,7 @@ from estimator.records import Array
 Bools = npt.NDArray[np.bool_]
 
 
-@kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1], b1[::1], b1[::1])")
+@kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1], b1[::1], b1[::1])", aside=True)
 def spanning(n: int, edges: Ints, doubtful: Bools, free: Bools) -> tuple[Ints, Ints]:
     """A tree over constraints that are not doubted: poses in order of distance from its roots, and each one's parent.
 
@@ -56,7 +56,7 @@ def spanning(n: int, edges: Ints, doubtful: Bools, free: Bools) -> tuple[Ints, I
     return order, parent
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], Tuple((i8[::1], i8[::1])), f8[:, ::1])")
+@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], Tuple((i8[::1], i8[::1])), f8[:, ::1])", aside=True)
 def carry_on(poses: Array, step: Array, place: Ints, tree: tuple[Ints, Ints], out: Array) -> None:
     """``out`` (n, 3) = ``poses`` after ``step`` (by ``place``, which is negative where a pose is held)."""
     order, parent = tree

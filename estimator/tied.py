@@ -63,7 +63,7 @@ def rows_of(n: int, edges: Ints) -> tuple[Ints, Ints]:
     return start, order % max(1, len(edges))
 
 
-@kernel("void(i8, i8[:, ::1], f8[:, :, ::1], UniTuple(i8[::1], 2), f8[:, :, ::1])")
+@kernel("void(i8, i8[:, ::1], f8[:, :, ::1], UniTuple(i8[::1], 2), f8[:, :, ::1])", aside=True)
 def surest(to: int, edges: Ints, carried: Array, rows: tuple[Ints, Ints], out: Array) -> None:
     """Dijkstra from ``to``, a path being as long as the trace of its covariance; ``out`` gets the covariances."""
     start, order = rows

@@ -102,6 +102,7 @@ class Ahead:
     Attributes:
         t_mono: now. delta: motion since, in the base frame of then. Q: 3x3 covariance of what it has added, in the axes
             of that frame, about the place of now.
+        shared: 3x3, of what it has added with the error of the tie, likewise.
         known: whether ``Q`` was a part of the pose's covariance, and has been taken out of it.
         velocity, velocity_variance: as known now.
     """
@@ -109,6 +110,7 @@ class Ahead:
     t_mono: float
     delta: Array
     Q: Array
+    shared: Array
     known: bool
     velocity: Array
     velocity_variance: Array

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimator import se2
-from estimator.atlas import OWN
+from estimator.atlas import OWN, SETTLE
 from estimator.pipeline import Settings, keyframe_poses, new_state, step
 from estimator.records import UNLIMITED, Array, Command, Order
 from estimator.submap import SIZE, Settled
@@ -20,6 +20,25 @@ def test_without_a_map_there_is_nothing_to_look_in() -> None:
     result = step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED)
     assert state.atlas.adrift is None
     assert result.places is None
+
+
+def test_a_robot_is_looked_for_in_a_map_of_one_submap_that_is_not_finished() -> None:
+    """A map of the first seconds: nothing of it is settled when the place is lost, and it is settled then."""
+    state, rng = new_state(), np.random.default_rng(3)
+    places = [np.array((0.3 * k, 0.0, 0.1 * k)) for k in range(5)]
+    lay(state, places[0], places[0], rng, 1)
+    state.next_key = 2
+    assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places is None, "one scan is no map"
+    for key, T in enumerate(places[1:], 2):
+        lay(state, T, T, rng, key)
+    run_jobs(state)
+    assert not state.atlas.settled()
+    state.next_key = 6
+    assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places == 0
+    lay(state, places[4], places[2], rng, 6, anew=True)
+    assert [job.priority for job in run_jobs(state)] == [SETTLE]
+    assert [submap.key for submap in state.atlas.settled()] == [1]
+    assert state.atlas.adrift == 2
 
 
 def test_what_is_adrift_leaves_the_older_map_as_it_is() -> None:

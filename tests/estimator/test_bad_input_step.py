@@ -18,6 +18,8 @@ from estimator.result import Reason, StepResult
 from tests.estimator.test_bad_input import OUTSIDE
 from tests.estimator.test_pipeline import BEARING, path, scan_at
 
+pytestmark = pytest.mark.jit
+
 N = len(BEARING)
 STILL = np.zeros(3)
 BENT = np.concatenate((BEARING[: N // 2], BEARING[N // 2 :][::-1]))
@@ -127,7 +129,6 @@ def test_a_robot_that_is_switched_on_with_it_waits_for_a_scan(name: str) -> None
     assert first.keyframe > 0
 
 
-@pytest.mark.jit
 @pytest.mark.parametrize("matcher", Matcher)
 def test_scans_without_points_say_so(matcher: Matcher) -> None:
     state, T = settled(matcher)
@@ -143,7 +144,6 @@ def test_scans_without_points_say_so(matcher: Matcher) -> None:
     assert again.match.ok
 
 
-@pytest.mark.jit
 @pytest.mark.parametrize("matcher", Matcher)
 @pytest.mark.parametrize("name", MISFITS)
 def test_scans_that_fit_nowhere_move_nothing(name: str, matcher: Matcher) -> None:
@@ -201,7 +201,6 @@ def test_the_same_scan_again_and_again_is_the_same_place(matcher: Matcher) -> No
     assert again.match.ok
 
 
-@pytest.mark.jit
 def test_a_hundred_thousand_beams() -> None:
     """Two hundred times the map's density, no error, no other place."""
     state, T = settled(Matcher.LINE)
@@ -253,7 +252,6 @@ def fuzzed(
     return Scan(end, end, seed, np.array(mount), bearing, ranges, beam, sigma)
 
 
-@pytest.mark.jit
 @pytest.mark.parametrize("matcher", Matcher)
 @settings(max_examples=15, deadline=None)
 @given(cases=st.lists(FUZZ, min_size=1, max_size=6))

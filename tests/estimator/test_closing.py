@@ -12,7 +12,7 @@ from estimator import se2
 from estimator.absolute import Absolute
 from estimator.adrift import begin
 from estimator.atlas import KEPT, LOOK, LOST, MANY, SOLVE, Atlas, Constraints, cell_of
-from estimator.closing import candidates, found_again, keyframe_laid, take_answer
+from estimator.closing import candidates, found_again, keyframe_laid, surer, take_answer
 from estimator.commands import forget
 from estimator.keyframe import Submap, Virtual, keep
 from estimator.loop import Candidate, Found, LoopSettings, look, look_in
@@ -24,6 +24,8 @@ from estimator.state import State, new_state
 from estimator.submap import SIZE, settle
 from tests.estimator.world import scan_in
 from tools.bench._scenes import Scene, bearings, box, office, paper_room, round_room
+
+pytestmark = pytest.mark.jit  # whole maps; each kernel has tests of its own
 
 HALF = bearings(181, 180.0)
 SMALL = np.diag((0.004**2, 0.004**2, 0.002**2))
@@ -108,6 +110,19 @@ def test_the_pose_is_surer_after_the_loop_than_before() -> None:
     state, _ = driven()
     after = state.atlas.spread(state.fused.T_odom_base)
     assert np.trace(after[:2, :2]) < 0.8 * np.trace(before[:2, :2])
+
+
+def test_a_correction_of_the_map_takes_nothing_from_what_is_known_of_the_pose() -> None:
+    """Unless it moves the pose by more than that allows: then the pose is as uncertain as the graph has it."""
+    state, vague = new_state(), np.diag((0.05**2, 0.05**2, 0.02**2))
+    sharp = vague / 25.0
+    state.T_odom_anchor, state.P_anchor = np.array((3.0, 2.0, 1.0)), sharp
+    state.T_map_odom = np.array((1.0, -2.0, 0.5))
+    for far, expected in ((0.01, sharp), (0.1, vague)):
+        before = state.T_map_odom - (far, 0.0, 0.0)
+        np.testing.assert_array_equal(surer(state, vague, before), expected)
+    state.P_anchor = 4.0 * vague
+    np.testing.assert_array_equal(surer(state, vague, state.T_map_odom), vague)
 
 
 def test_without_settings_nothing_is_looked_for() -> None:

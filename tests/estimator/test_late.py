@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from estimator import se2
+from estimator import absolute, lateness, motion, se2
+from estimator.linear3 import invert3
 from estimator.pipeline import State, new_state, step
-from estimator.records import UNLIMITED, Odometry, Record
-from estimator.result import Reason, StepResult
+from estimator.records import UNLIMITED, Array, Odometry, Record
+from estimator.result import Fix, LightsResult, Reason, StepResult
 from estimator.trail import KEPT_S, Trail, made
 from tests.estimator.test_pipeline import path, scan_at
 
@@ -85,6 +88,64 @@ def test_a_scan_older_than_what_is_remembered_is_not_matched() -> None:
     assert result.match.reason is Reason.LATE
     assert np.hypot(*se2.between(before, result.T_odom_base)[:2]) < 0.05, "and moves nothing"
     assert state.failures == 0
+
+
+def lit(state: State, follows: bool) -> None:
+    """An epoch of light at the present pose: followed, or its information taken."""
+    T, P = state.fused.T_odom_base, np.diag((0.03**2, 0.03**2, 0.02**2))
+    told = LightsResult(0.0, Fix.GOOD, T, P, (), frozenset(), 0.9 * invert3(P), np.zeros(3))
+    if follows:
+        absolute.follow(state, told, T)
+    else:
+        absolute.gain(state, told, T, np.zeros(3))
+
+
+def least(state: State) -> float:
+    """Least eigenvalue of the correlation of both errors, the tie's and the pose's."""
+    tie, moving = state.absolute, state.fused
+    assert tie is not None
+    joint = np.block([[tie.P, tie.X], [tie.X.T, moving.P]])
+    scale = np.sqrt(np.diag(joint))
+    return float(np.linalg.eigvalsh(joint / np.outer(scale, scale)).min())
+
+
+@pytest.mark.parametrize("epochs", [{}, {9: False}, {9: False, 12: False}, {12: True}, {12: True, 15: False}])
+def test_what_light_has_mended_is_not_taken_out_of_the_tie_for_a_late_scan(epochs: dict[int, bool]) -> None:
+    """Scans held up for seconds, light meanwhile: of the error of then there is what light has left, never less than 0.
+
+    Else a match of then would move the map against its own correction, and by many times that.
+    """
+    state = new_state()
+    moving, tie = state.fused, absolute.Absolute(placed=True, proved=True, t_match=0.0)
+    moving.t_mono, moving.P, state.absolute = 0.0, np.diag((0.01, 0.01, 0.003)) ** 2, tie
+    tie.P, tie.X = np.diag((0.03, 0.03, 0.01)) ** 2 + moving.P, moving.P.copy()
+    then: Array = np.zeros((3, 3))
+    for k in range(20):
+        before = moving.T_odom_base, moving.P, moving.t_mono
+        delta = np.array((0.05, 0.0, 0.004))
+        motion.on_odometry(moving, Odometry(PERIOD_S * k, PERIOD_S * (k + 1), delta), motion.MotionNoise())
+        absolute.on_motion(state, *before)
+        if k == 5:
+            then = moving.P.copy()
+        if k in epochs:
+            lit(state, epochs[k])
+    assert least(state) > 0.0
+    now = tie.P.copy(), tie.X.copy(), moving.P.copy()
+    scan = replace(scan_at(TRUTH[0], 0.0, 0, np.random.default_rng(0)), t_begin=5 * PERIOD_S, t_end=6 * PERIOD_S)
+    ahead = lateness.go_back(state, scan)
+    assert ahead.known
+    assert np.allclose(moving.P, then, rtol=1e-6, atol=1e-12)
+    share = np.diag(tie.X @ np.linalg.inv(moving.P))
+    if True in epochs.values():
+        assert share == pytest.approx(np.zeros(3), abs=1e-6)
+    elif epochs:
+        assert np.all((share > 0.1) & (share < 0.95))
+    else:
+        assert share == pytest.approx(np.ones(3), abs=1e-6)
+    assert least(state) > 0.0
+    lateness.come_again(state, ahead)
+    for there, was in zip((tie.P, tie.X, moving.P), now, strict=True):
+        assert np.allclose(there, was, rtol=1e-6, atol=1e-12)
 
 
 def test_the_trail_tells_the_way_since_any_instant() -> None:

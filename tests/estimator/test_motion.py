@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from estimator import motion, se2
+from estimator import fusion, motion, se2
 from estimator.motion import Motion, MotionNoise
 from estimator.records import Array, Odometry
 
@@ -72,3 +72,30 @@ def test_an_increment_over_a_silence_of_everything_counts_whole() -> None:
         motion.on_odometry(moving, record, NOISE)
     motion.on_odometry(moving, Odometry(11.0, 21.0, np.array((3.0, 0.0, 0.0))), NOISE)
     assert moving.T_odom_base[0] == pytest.approx(3.0)
+
+
+def test_surprises_along_one_axis_do_not_blow_up_the_other() -> None:
+    """In a corridor nothing ever takes back what is added along it; two hundred surprises across made it 10^19 m."""
+    moving = Motion(P=np.diag((1e-4, 1e-4, 1e-6)), odometry=True)
+    corridor = np.diag((1e-3, 1e6, 1e6))
+    for k in range(200):
+        correction = np.array((0.0, 0.3 * (-1) ** k, 0.0))
+        lacked = motion.learn(moving, correction, corridor, known=False)
+        assert correction @ np.linalg.inv(moving.P + lacked) @ correction <= 9.0 + 1e-6
+        moving.P = fusion.updated(moving.P + lacked, corridor, odometry=True)
+        moving.P += np.diag((1e-5, 1e-5, 1e-7))
+    assert moving.P[0, 0] < 1e-4 + 200 * 1.1e-5
+
+
+def test_a_correction_within_three_deviations_lacked_nothing() -> None:
+    moving = Motion(P=np.diag((1e-2, 1e-2, 1e-4)))
+    assert not motion.learn(moving, np.array((0.2, -0.2, 0.0)), np.eye(3), known=False).any()
+
+
+def test_an_increment_may_be_a_view_that_cannot_be_written() -> None:
+    table = np.zeros((3, 2), dtype=np.int64)
+    table[0, 0] = 1
+    table.flags.writeable = False
+    moving = Motion(t_mono=0.0)
+    motion.on_odometry(moving, Odometry(0.0, 1.0, table[:, 0]), NOISE)
+    assert moving.T_odom_base.tolist() == [1.0, 0.0, 0.0]

@@ -13,12 +13,13 @@ from estimator import protection
 from estimator.absolute import Absolute, holds_heading, without_heading
 from estimator.cdma_epoch import BlockFlag
 from estimator.frozen import FROZEN_M, Frozen
+from estimator.fusion import covariance
 from estimator.lamps import Survey
 from estimator.light import LightsSetup
 from estimator.linear3 import invert3
 from estimator.protection import ALONE, FAULTY, K_FAULT, K_PLAIN, RISK, UNKNOWN_M, bound, spread
 from estimator.records import Array
-from estimator.result import Fix, LightsResult
+from estimator.result import Fix, LightsResult, Protection
 from estimator.state import State, new_state
 
 P = np.diag((0.02**2, 0.03**2, 0.01**2))
@@ -46,6 +47,11 @@ def lit(light_at: tuple[float, float, float] = (0.0, 0.0, 0.0), wheels: bool = T
     return state
 
 
+def held_by(state: State) -> Protection | None:
+    """The bound as a step asks for it."""
+    return bound(state, covariance(state))
+
+
 def test_the_quantiles_are_those_of_the_stated_risk() -> None:
     """A Gaussian error in the plane leaves K sigma with half the risk; of two witnesses each takes a quarter."""
     assert math.exp(-0.5 * (K_PLAIN / protection.ALIKE) ** 2) == pytest.approx(0.5 * RISK)
@@ -57,13 +63,13 @@ def test_the_quantiles_are_those_of_the_stated_risk() -> None:
 
 def test_a_hundred_thousand_gaussian_errors_are_within_it() -> None:
     errors = np.random.default_rng(3).standard_normal((100_000, 2)) * 0.03
-    held = bound(lit())
+    held = held_by(lit())
     assert held is not None
     assert np.hypot(*errors.T).max() < held.horizontal_m
 
 
 def test_two_witnesses_that_agree_bound_it_by_the_covariance() -> None:
-    held = bound(lit())
+    held = held_by(lit())
     assert held is not None
     assert (held.laser, held.light, held.wheels) == (True, True, True)
     assert held.horizontal_m == pytest.approx(UNKNOWN_M + K_PLAIN * 0.03)
@@ -72,13 +78,13 @@ def test_two_witnesses_that_agree_bound_it_by_the_covariance() -> None:
 
 @pytest.mark.parametrize("off", [0.5, 2.0])
 def test_light_elsewhere_moves_the_bound_out_to_there(off: float) -> None:
-    held = bound(lit((off, 0.0, 0.0)))
+    held = held_by(lit((off, 0.0, 0.0)))
     assert held is not None
     assert off < held.horizontal_m < off + 1.0
 
 
 def test_without_wheels_light_says_nothing_against_the_heading() -> None:
-    with_wheels, without = bound(lit((0.0, 0.0, 3.0))), bound(lit((0.0, 0.0, 3.0), wheels=False))
+    with_wheels, without = held_by(lit((0.0, 0.0, 3.0))), held_by(lit((0.0, 0.0, 3.0), wheels=False))
     assert with_wheels is not None
     assert without is not None
     assert with_wheels.yaw_rad > 3.0 > without.yaw_rad
@@ -86,16 +92,16 @@ def test_without_wheels_light_says_nothing_against_the_heading() -> None:
 
 def test_a_pose_that_light_has_drawn_away_from_the_laser_is_bounded_by_both() -> None:
     state = lit()
-    bound(state)
+    held_by(state)
     state.way += FROZEN_M + 1.0
     state.T_map_odom = np.array((0.8, 0.0, 0.0))
     assert state.light is not None
     state.light.result = lights(np.array((0.8, 0.0, 0.0)), P)
-    held = bound(state)
+    held = held_by(state)
     assert held is not None
     assert held.horizontal_m > 0.8, "light may have gone wrong: the laser alone would be 0.8 m away"
     state.frozen.forget()
-    again = bound(state)
+    again = held_by(state)
     assert again is not None
     assert again.horizontal_m < 0.5
 
@@ -103,9 +109,9 @@ def test_a_pose_that_light_has_drawn_away_from_the_laser_is_bounded_by_both() ->
 def test_one_witness_alone_bounds_less() -> None:
     state = lit()
     assert state.light is not None
-    both = bound(state)
+    both = held_by(state)
     state.t_match = -math.inf
-    dark = bound(state)
+    dark = held_by(state)
     assert both is not None
     assert dark is not None
     assert not dark.laser
@@ -115,7 +121,7 @@ def test_one_witness_alone_bounds_less() -> None:
 def test_a_pose_that_may_be_anywhere_has_no_bound() -> None:
     state = lit()
     cast(Absolute, state.absolute).P = np.diag((100.0, 100.0, 9.0))
-    assert bound(state) is None
+    assert held_by(state) is None
 
 
 def test_ties_are_kept_for_one_to_two_stretches() -> None:

@@ -15,7 +15,18 @@ from estimator.light import LightsSetup
 from estimator.lights_start import rule_out
 from estimator.pipeline import new_state, step
 from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
-from estimator.relocate_light import Window, compatible, disputed, elsewhere, out_of_place, told, windows, witness
+from estimator.relocate_light import (
+    HEADED_M,
+    Window,
+    compatible,
+    disputed,
+    elsewhere,
+    in_place,
+    out_of_place,
+    told,
+    windows,
+    witness,
+)
 from estimator.result import Fix
 from estimator.state import State
 from estimator.submap import Settled
@@ -76,6 +87,20 @@ def test_what_fits_is_compatible_and_what_lies_elsewhere_is_not() -> None:
     assert compatible(state, HERE + np.array((3.0, 0.0, 0.0))) is False
     assert witness(state, HERE)
     assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
+
+
+def test_a_heading_from_light_rules_a_place_out_only_after_some_way() -> None:
+    """Young hypotheses of it go astray together: a robot that the laser had found stood RELOCATING for that."""
+    state = shown(robot())
+    lights = state.light.filter  # type: ignore[union-attr]
+    lights.tracks = lights.tracks[:1]
+    lights.tracks[0].x[:3] = HERE
+    lights.tracks[0].P[:3, :3] = np.diag((0.01, 0.01, 0.001))
+    for way, told_apart in ((0.5, False), (HEADED_M + 0.5, True)):
+        lights.course.way = lights.way_start + way
+        assert compatible(state, HERE) is True
+        assert compatible(state, HERE + np.array((0.0, 0.0, 1.5))) is not told_apart
+        assert compatible(state, HERE + np.array((3.0, 0.0, 0.0))) is False
 
 
 def test_before_the_first_epoch_and_in_another_frame_light_says_nothing() -> None:
@@ -214,3 +239,38 @@ def test_a_filter_led_astray_sets_no_robot_adrift_that_receives_the_lamps_of_its
         assert disputed(state)
         adrift.doubt(state)
         assert (state.atlas.adrift is not None) == (carried or not proved)
+
+
+@pytest.mark.parametrize(("failures", "broken", "waits"), [(adrift.UNFIT, False, False), (0, True, True)])
+def test_a_robot_carried_a_little_way_is_adrift_when_the_laser_has_lost_it(
+    failures: int, broken: bool, waits: bool
+) -> None:
+    """Two metres beside its place the same lamps are received, no stronger than they may be."""
+    state = shown(robot())
+    state.atlas.adrift, state.atlas.since, state.failures = None, 0, failures
+    here = HERE + np.array((1.4, 1.2, 0.0))
+    state.T_map_odom = se2.compose(here, se2.inverse(state.fused.T_odom_base))
+    tie, light = state.absolute, state.light
+    tie.placed, tie.proved, tie.broken = True, True, broken  # type: ignore[union-attr]
+    light.filter.lost = True  # type: ignore[union-attr]
+    assert not out_of_place(state, here)
+    assert not in_place(state, here)
+    assert in_place(state, HERE)
+    adrift.doubt(state)
+    assert (state.atlas.adrift is None) == waits
+    if waits:
+        state.fused.t_mono += adrift.ASIDE_S + 0.01
+        adrift.doubt(state)
+        assert state.atlas.adrift is not None
+
+
+def test_a_robot_that_the_laser_holds_is_not_set_adrift_by_single_epochs() -> None:
+    state = shown(robot())
+    state.atlas.adrift, state.atlas.since = None, 0
+    state.T_map_odom = se2.compose(HERE + np.array((1.4, 1.2, 0.0)), se2.inverse(state.fused.T_odom_base))
+    state.absolute.placed = state.absolute.proved = True  # type: ignore[union-attr]
+    state.light.filter.lost = True  # type: ignore[union-attr]
+    for _ in range(3):
+        state.fused.t_mono += 2.0
+        adrift.doubt(state)
+    assert state.atlas.adrift is None
