@@ -19,7 +19,6 @@ import asyncio
 import contextlib
 import errno
 import ipaddress
-import signal
 import socket
 import stat
 import sys
@@ -33,6 +32,7 @@ from hal.i2c import AsyncBus, BusOpener, Message, Transferred, check
 from hal.i2c_remote import clock_name, parse_address
 from hal.inet import resolve
 from hal.opening import open_bus
+from hal.serving import say, until_told
 
 AHEAD: Final = 8
 """Transactions a client may have ordered and not been answered; further bytes of it are not read meanwhile."""
@@ -173,7 +173,7 @@ async def _put(
 
 
 async def _check_loopback(where: str, host: str, port: int) -> None:
-    if any(not ipaddress.ip_address(address).is_loopback for _, (address, _) in await resolve(host, port)):
+    if any(not ipaddress.ip_address(address).is_loopback for _, (address, *_) in await resolve(host, port)):
         remedy = "serve unix:/path or tcp://127.0.0.1:PORT, reach it by ssh -L; or say --anyone if the network is yours"
         raise DeviceRefused(where, "everyone who can reach that address could write to all chips of the bus", remedy)
 
@@ -202,23 +202,6 @@ def _private_socket(path: str) -> socket.socket:
         sock.close()
         raise
     return sock
-
-
-def say(text: str) -> None:
-    """A line for whoever started this process."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
-
-
-async def until_told(seconds: float = 0.0) -> None:
-    """Wait for SIGINT or SIGTERM, or for a time."""
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    if seconds > 0:
-        loop.call_later(seconds, stop.set)
-    await stop.wait()
 
 
 async def _main(bus: str, where: str, anyone: bool) -> None:

@@ -9,22 +9,55 @@ from typing import Any, Final
 
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 
-Address = tuple[socket.AddressFamily, tuple[str, int]]
-"""Family and what `bind` and `sendto` take (IPv6 scope and flow are left at 0)."""
+Address = tuple[socket.AddressFamily, tuple[str, int] | tuple[str, int, int, int]]
+"""Family and what `bind` and `sendto` take; the longer one names the network interface (IPv6 scope), flow 0."""
 
 PRIVILEGED: Final = 1024
 
 
-def _addresses(found: list[Any]) -> list[Address]:
-    return list(dict.fromkeys((family, (str(address[0]), int(address[1]))) for family, _, _, _, address in found))
+def scope(address: Address) -> int:
+    """Number of the network interface that an address names, 0: none."""
+    where = address[1]
+    return where[3] if len(where) == 4 else 0
+
+
+def with_port(address: Address, port: int) -> Address:
+    """The same address with another port."""
+    family, where = address
+    return family, (where[0], port) if len(where) == 2 else (where[0], port, where[2], where[3])
+
+
+def _addresses(found: list[Any], index: int = 0) -> list[Address]:
+    """Addresses without repetitions; ``index``: of the interface, where the name had told one."""
+    addresses: list[Address] = []
+    for family, _, _, _, (host, port, *more) in found:
+        interface = index or (more[1] if more else 0)
+        where = (str(host), int(port), 0, interface) if family == socket.AF_INET6 and interface else (host, int(port))
+        addresses.append((family, where))
+    return list(dict.fromkeys(addresses))
+
+
+def _interface(host: str) -> tuple[str, int]:
+    """A host without its interface, and the number of that, 0: none (RFC 4007, 11).
+
+    The system's own look-up knows interfaces by name only behind addresses of one link, not behind groups of a site.
+
+    Raises:
+        OSError: there is no such interface (now).
+    """
+    bare, percent, name = host.partition("%")
+    if not percent:
+        return host, 0
+    return bare, int(name) if name.isascii() and name.isdigit() else socket.if_nametoindex(name)
 
 
 def numeric(host: str, port: int, flags: int = 0) -> list[Address]:
-    """Addresses of a numeric host, without any look-up; none where it is a name."""
+    """Addresses of a numeric host, without any look-up; none where it is a name, or names an interface not there."""
     try:
+        bare, index = _interface(host)
         flags |= socket.AI_NUMERICHOST
-        return _addresses(socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=flags))
-    except socket.gaierror:
+        return _addresses(socket.getaddrinfo(bare or None, port, type=socket.SOCK_DGRAM, flags=flags), index)
+    except OSError:  # what getaddrinfo says of names is one, too
         return []
 
 
@@ -37,11 +70,17 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
         passive: whether the addresses are to be listened on.
 
     Raises:
-        DeviceMissing: the name is not known (now).
+        DeviceMissing: the name is not known (now), or there is no such network interface.
     """
     flags = socket.AI_PASSIVE if passive else 0
     if found := numeric(host, port, flags):
         return found
+    try:
+        _interface(host)
+    except OSError as error:
+        there = ", ".join(name for _, name in socket.if_nameindex())
+        problem = f"no network interface {host.partition('%')[2]} on this computer"
+        raise DeviceMissing(f"{host}:{port}", problem, f"name one that there is: {there}") from error
     loop = asyncio.get_running_loop()
     try:
         return _addresses(await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=flags))

@@ -172,7 +172,7 @@ class InputPort:
             self._users += 1
 
     def _listen(self, address: inet.Address) -> None:
-        sock = inet.listening((address[0], (address[1][0], self.port)), socket.SOCK_DGRAM)
+        sock = inet.listening(inet.with_port(address, self.port), socket.SOCK_DGRAM)
         self._sockets.append(sock)
         stamp_arrivals(sock)
         self._readers.append(Reader(sock.fileno(), partial(self._read, sock), self._share))

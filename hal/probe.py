@@ -58,15 +58,18 @@ async def probe(opener: PortOpener, devices: Sequence[str] = ()) -> list[Finding
     return [await identify_at(opener, device) for device in devices or discover.candidates()]
 
 
-async def identify_at(opener: PortOpener, device: str) -> Finding:
-    """Identify what is at one device; never raises for anything the device does."""
+async def identify_at(opener: PortOpener, device: str, baud: int = 0) -> Finding:
+    """Identify what is at one device; never raises for anything the device does.
+
+    ``baud``: of an RS-232 line, looked for at first; 0: not known.
+    """
     try:
-        rs232 = discover.is_rs232(device)
-        port = await opener(device, BAUD_RATES[0] if rs232 else _USB_BAUD)
+        rs232 = discover.is_rs232(device, baud)
+        port = await opener(device, (baud or BAUD_RATES[0]) if rs232 else _USB_BAUD)
         session = Session(Line(port))
         try:
             if rs232:
-                await session.find_rate()
+                await session.find_rate(baud)
             await session.settle()
             identity = await session.identify()
             await session.quiet()

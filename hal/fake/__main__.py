@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import signal
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from hal.fake.scan import ScanSource
 from hal.fake.schedule import FaultSchedule
 from hal.fake.tcp_server import TcpServer
 from hal.fake.world import RecordedRanges, Room
+from hal.serving import say, until_told
 
 
 @dataclass(slots=True)
@@ -45,7 +46,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m hal.fake", description="A simulated HOKUYO lidar.")
     add = parser.add_argument
     add("--model", default="UTM-30LX", choices=sorted(MODELS), help="type of sensor (default %(default)s)")
-    add("--world", default="box", help="box: a small room; or an .npz file with an array range_mm")
+    add(
+        "--world",
+        default="box",
+        help="box: a small room, in which it wanders; still: it stands there; or an .npz file with an array range_mm",
+    )
     add("--pty", type=Path, metavar="LINK", help="serve as a serial port, found by this symbolic link")
     add("--tcp", metavar="HOST:PORT", help="serve over TCP, port 0 chooses a free one")
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
@@ -59,14 +64,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
-
-
 def _world(options: _Options, model: LidarModel) -> ScanSource:
     if options.world == "box":
         return Room(model, seed=options.seed)
+    if options.world == "still":
+        return Room(model, seed=options.seed, lap_s=math.inf)
     return RecordedRanges(Path(options.world), model)
 
 
@@ -83,20 +85,20 @@ async def _serve(options: _Options) -> None:
     schedule = FaultSchedule({"lidar": device})
     if options.faults is not None:
         faults = schedule.load(options.faults.read_text(encoding="utf-8"))
-        _say(f"{len(faults)} faults of {options.faults} ordered")
+        say(f"{len(faults)} faults of {options.faults} ordered")
     pty = tcp = control = None
     try:
         if options.tcp is not None:
             host, _, port = options.tcp.rpartition(":")
             tcp = TcpServer(device)
-            _say(f"{options.model} on tcp://{host}:{await tcp.listen(host, int(port))}")
+            say(f"{options.model} on tcp://{host}:{await tcp.listen(host, int(port))}")
         if options.pty is not None or options.tcp is None:
             pty = PtyServer(device, options.pty)
-            _say(f"{options.model} on {pty.path}")
+            say(f"{options.model} on {pty.path}")
         if options.control is not None:
             control = await serve_control(Control(schedule), options.control)
-            _say(f"fault orders on {options.control}")
-        await _until_told(options.seconds)
+            say(f"fault orders on {options.control}")
+        await until_told(options.seconds)
     finally:
         schedule.close()
         if pty is not None:
@@ -107,20 +109,10 @@ async def _serve(options: _Options) -> None:
             control.close()
         device.close()
     counts = device.counts
-    _say(
+    say(
         f"{device.scans_sent} scans made; replies: {counts.sent} sent, {counts.unheard} unheard, "
         f"{counts.lost_in_sensor} lost in the sensor, {counts.refused_by_host} lost at a full queue"
     )
-
-
-async def _until_told(seconds: float) -> None:
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    if seconds > 0:
-        loop.call_later(seconds, stop.set)
-    await stop.wait()
 
 
 def _is_address(text: str) -> bool:

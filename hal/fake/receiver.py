@@ -27,7 +27,8 @@ from hal.fake.control import Control, serve_control
 from hal.fake.faults import FaultError
 from hal.fake.i2c_adapters import ADAPTERS
 from hal.fake.schedule import FaultSchedule
-from hal.i2c_server import BusServer, say, until_told
+from hal.i2c_server import BusServer
+from hal.serving import say, until_told
 
 BUS = "simulated"
 DC_ADDRESS = 0x48

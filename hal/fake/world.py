@@ -42,10 +42,12 @@ class Room:
         model: the sensor.
         noise_mm: one sigma of the range noise.
         seed: of the noise.
+        lap_s: time of a round; infinite: the sensor stands still.
     """
 
-    def __init__(self, model: LidarModel, noise_mm: float = 8.0, seed: int = 0) -> None:
+    def __init__(self, model: LidarModel, noise_mm: float = 8.0, seed: int = 0, lap_s: float = LAP_S) -> None:
         self._model = model
+        self._lap_s = lap_s
         self._noise = noise_mm
         self._chance = np.random.default_rng(seed)
         self._walls = _walls()
@@ -55,7 +57,7 @@ class Room:
 
     def pose(self, t_mono: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """True x, y (m) and heading (rad) of the sensor at the given times, shape (n, 3)."""
-        phase = t_mono * (2.0 * math.pi / LAP_S)
+        phase = t_mono * (2.0 * math.pi / self._lap_s)
         x = CENTRE[0] + HALF_AXES[0] * np.cos(phase)
         y = CENTRE[1] + HALF_AXES[1] * np.sin(phase)
         heading = np.arctan2(HALF_AXES[1] * np.cos(phase), -HALF_AXES[0] * np.sin(phase))

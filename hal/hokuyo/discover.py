@@ -60,6 +60,13 @@ def usb_vendor(tty: str) -> str:
     return ""
 
 
-def is_rs232(device: str) -> bool:
-    """True where the line rate matters: a UART or a USB-to-serial adapter, also behind a symbolic link."""
-    return device.startswith("/") and _RS232.match(Path(device).resolve().name) is not None
+def is_rs232(device: str, baud: int = 0) -> bool:
+    """True where the line rate matters: a UART or a USB-to-serial adapter, also behind a symbolic link.
+
+    Whatever else has a ``baud`` that somebody has written behind its name is taken for a line, too (a pseudo-terminal,
+    an adapter whose driver has a name of its own); USB CDC-ACM and Ethernet have no rate, whatever is written.
+    """
+    if not device.startswith("/"):
+        return False
+    name = Path(device).resolve().name
+    return _RS232.match(name) is not None or (baud > 0 and not name.startswith("ttyACM"))

@@ -12,6 +12,7 @@ import asyncio
 import logging
 import random
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from hal.clock import Clock
@@ -26,6 +27,7 @@ from hal.hokuyo.session import AbnormalState, Session
 from hal.hokuyo.stream import ScanStream
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
 from hal.port import PortOpener
+from hal.recovery import stay_connected
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +49,8 @@ class HokuyoDriver:
         clock: gives the times of arrival; the same as the ports'.
         opener: opens ports (:func:`hal.opening.open_port`).
         serial: the sensor's own number (``VV SERI``); with ``auto`` it is found wherever it is plugged in.
-        baud: RS-232 rate to use; 0: the lowest that carries every revolution. No meaning on USB and Ethernet.
+        baud: RS-232 rate to use; 0: the lowest that carries every revolution. No meaning on USB and Ethernet; a port
+            that is not known to be either is taken for an RS-232 line where it is given.
         intensity: ask for intensities where model and firmware can give them.
 
     Raises:
@@ -96,16 +99,7 @@ class HokuyoDriver:
 
     async def run(self, on_scan: Callable[[RawScan], None]) -> None:
         """Deliver scans until cancelled; then the laser is switched off, which takes a tenth of a second at most."""
-        try:
-            while True:
-                try:
-                    await self._connection(on_scan)
-                except HalError as error:
-                    self._note(error)
-                self._status.link = Link.WAITING
-                await asyncio.sleep(self._pause())
-        finally:
-            self._status.link = Link.CLOSED
+        await stay_connected(self._status, partial(self._connection, on_scan), self._note, self._pause)
 
     # one connection
 
@@ -171,7 +165,7 @@ class HokuyoDriver:
 
     async def _open(self, device: str) -> Session:
         """A session with a sensor that is idle, known, and the right one."""
-        rs232 = discover.is_rs232(device)
+        rs232 = discover.is_rs232(device, self._baud)
         port = await self._opener(device, self._rate_found or self._baud or (BAUD_RATES[0] if rs232 else _USB_BAUD))
         session = Session(Line(port))
         try:

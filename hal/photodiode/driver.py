@@ -14,6 +14,7 @@ import logging
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from hal.adc import AdcStatus, Blemish, BusStuck, RawSamples, WrongChip
@@ -30,6 +31,7 @@ from hal.photodiode.sampler import Sampler, describe
 from hal.photodiode.silence import HANG_S, WatchedBus
 from hal.photodiode.timebase import SLOWER
 from hal.photodiode.trouble import explain, policy_for
+from hal.recovery import stay_connected
 
 log = logging.getLogger(__name__)
 
@@ -102,16 +104,7 @@ class PhotodiodeAdc:
 
     async def run(self, on_samples: Callable[[RawSamples], None]) -> None:
         """Deliver blocks until cancelled."""
-        try:
-            while True:
-                try:
-                    await self._connection(on_samples)
-                except HalError as error:
-                    self._note(error)
-                self._status.link = Link.WAITING
-                await asyncio.sleep(self._pause())
-        finally:
-            self._status.link = Link.CLOSED
+        await stay_connected(self._status, partial(self._connection, on_samples), self._note, self._pause)
 
     async def _connection(self, on_samples: Callable[[RawSamples], None]) -> None:
         """Open, stream, recover on the open bus as long as that makes sense; raises to have it opened anew."""

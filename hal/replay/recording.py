@@ -68,6 +68,16 @@ class Kind(IntEnum):
     NOTE = 48  # text for people: gaps of the recording itself
 
 
+HEAD: Final = {"head of a segment": _START.format, "head of a record": _HEAD.format}
+LAYOUTS: Final = {
+    Kind.SCAN: (_SCAN.format, "seq t_rx t_mono t_sigma"),
+    Kind.SAMPLES: (_SAMPLES.format + " and words <H", "seq t0 t1 t_first rate_hz slack_s bits blemish count"),
+    Kind.ODOMETRY: (_ODOMETRY.format, "t_rx t_mono x y yaw"),
+    Kind.IMU: (_IMU.format, "t_rx t_mono yaw_rate"),
+}
+"""Layouts (as of the `struct` module) and fields of the payloads that are binary. Part of the format."""
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One record; ``channel`` tells devices of one kind apart (0: the lidar)."""

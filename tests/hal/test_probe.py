@@ -14,7 +14,7 @@ from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX, UTM_30LX, Unit
 from hal.fake.transport import FakeOpener
 from hal.hokuyo import discover
-from hal.probe import Finding, probe
+from hal.probe import Finding, identify_at, probe
 from tests.hal.hokuyo.bench import Scene
 
 
@@ -107,6 +107,31 @@ def test_nothing_plugged_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_line_kinds(device: str, rs232: bool) -> None:
     assert discover.is_rs232(device) is rs232
+
+
+@pytest.mark.parametrize(
+    ("device", "rs232"),
+    [("/dev/pts/3", True), ("/tmp/lidar", True), ("/dev/ttyUSB0", True), ("/dev/ttyACM0", False), ("tcp://h", False)],
+)
+def test_a_rate_that_somebody_has_written_makes_a_line_of_what_is_not_known(device: str, rs232: bool) -> None:
+    assert discover.is_rs232(device, 19200) is rs232
+
+
+@pytest.mark.parametrize("wrong", [0, 19200])
+def test_a_line_that_nothing_tells_to_be_one_is_found_with_its_rate(wrong: int) -> None:
+    """Also where the sensor talks at another rate than the one that was written."""
+
+    async def body() -> tuple[Finding, Finding]:
+        plugs = FakeOpener(LoopClock(asyncio.get_running_loop()))
+        plugs.plug("/dev/pts/7", FakeHokuyo(URG_04LX, Scene(URG_04LX), unit=Unit(serial="H2", baud=57600)))
+        unknown = await identify_at(plugs, "/dev/pts/7")
+        await asyncio.sleep(0.1)  # it is closed
+        return unknown, await identify_at(plugs, "/dev/pts/7", wrong or 57600)
+
+    unknown, found = run_virtual(body())
+    assert unknown.geometry is None
+    assert found.geometry is not None
+    assert found.baud == 57600
 
 
 def test_line_kind_behind_a_link(tmp_path: Path) -> None:

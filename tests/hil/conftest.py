@@ -1,0 +1,177 @@
+"""Options to ends, needs to skips, coroutines to runs, and what was seen to a report."""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.errors import HalError
+from tests.hil.ends import FAKE, AdcEnd, LidarEnd, Operator, operator_for
+from tests.hil.programs import Served, program, served_lidar
+from tests.hil.walking import Walked, walk_real, walk_simulated
+from tools.bench.plots import Plot
+from tools.bench.report import About, CannotCompare, Figure, Result, facts, read, write
+
+KINDS = ("motion", "light", "operator")
+TELLING = pytest.StashKey["Telling"]()
+RESULTS = pytest.StashKey[dict[str, Result]]()
+
+
+@dataclass
+class Telling:
+    """What a test has to say in the report, whether it passes or not."""
+
+    lines: list[str] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
+    plots: list[Plot] = field(default_factory=list)
+
+    def say(self, text: str) -> None:
+        """A line."""
+        self.lines.append(text)
+
+    def figure(self, name: str, value: float, unit: str = "", **how: Any) -> None:
+        """A number; ``how``: see :class:`tools.bench.report.Figure`."""
+        self.figures.append(Figure(name, float(value), unit, **how))
+
+    def plot(self, plot: Plot) -> None:
+        """A picture."""
+        self.plots.append(plot)
+
+
+@pytest.fixture
+def told(request: pytest.FixtureRequest) -> Telling:
+    telling = Telling()
+    request.node.stash[TELLING] = telling
+    return telling
+
+
+@pytest.fixture
+def lidar(request: pytest.FixtureRequest) -> LidarEnd:
+    name = str(request.config.getoption("--lidar"))
+    _needs(request, name)
+    return LidarEnd(name, _operator(request))
+
+
+@pytest.fixture
+def adc(request: pytest.FixtureRequest) -> AdcEnd:
+    name = str(request.config.getoption("--adc"))
+    _needs(request, name)
+    return AdcEnd(name, _operator(request))
+
+
+@pytest.fixture
+def served(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Served]:
+    """The lidar as other programs open it: the real one's name, or the fake as a process with a pty."""
+    name = str(request.config.getoption("--lidar"))
+    _needs(request, name)
+    if name != FAKE:
+        yield Served(name, _operator(request), tmp_path)
+        return
+    with served_lidar(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def walk(request: pytest.FixtureRequest, lumiloop: list[str], tmp_path: Path) -> Walked:
+    """A walk with odometry, recorded by the program under test."""
+    name = str(request.config.getoption("--lidar"))
+    _needs(request, name)
+    if name == FAKE:
+        return walk_simulated(lumiloop, tmp_path)
+    port, seconds = request.config.getoption("--odometry-port"), request.config.getoption("--walk-s")
+    return walk_real(lumiloop, Served(name, _operator(request), tmp_path), port, seconds)
+
+
+@pytest.fixture
+def lumiloop(request: pytest.FixtureRequest) -> list[str]:
+    """The words that start the program under test."""
+    return program(str(request.config.getoption("--program")))
+
+
+def _operator(request: pytest.FixtureRequest) -> Operator | None:
+    return operator_for(str(request.config.getoption("--operator")))
+
+
+def _needs(request: pytest.FixtureRequest, device: str) -> None:
+    """Skip a test that needs what this bench does not have; fakes have everything."""
+    marked = [kind for mark in request.node.iter_markers("needs") for kind in mark.args]
+    assert set(marked) <= set(KINDS), f"{request.node.name} needs {marked}; known are {KINDS}"
+    have = {text.strip() for text in str(request.config.getoption("--have")).split(",") if text.strip()}
+    if unknown := sorted(have - set(KINDS)):
+        raise pytest.UsageError(f"--have {unknown[0]}: known are motion and light; an operator is named by --operator")
+    if request.config.getoption("--operator"):
+        have.add("operator")
+    lacking = [kind for kind in marked if kind not in have]
+    if device != FAKE and lacking:
+        remedy = {"operator": "--operator terminal"}.get(lacking[0], f"--have {lacking[0]}")
+        pytest.skip(f"needs {' and '.join(lacking)} on {device}; where there is: {remedy}")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """A coroutine is played where its device is; what is wrong with the device fails in its own words."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    given = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+    end = given.get("lidar") or given["adc"]
+    try:
+        end.play(lambda: pyfuncitem.obj(**given))
+    except HalError as error:
+        pytest.fail(str(error), pytrace=False)
+    return True
+
+
+# the report
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """See early that the run to compare with can be read."""
+    config.stash[RESULTS] = {}
+    if config.getoption("--against"):
+        try:
+            read(Path(config.getoption("--against")))
+        except CannotCompare as reason:
+            raise pytest.UsageError(f"--against: {reason}") from reason
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, None]:
+    """Keep what came of each test of this suite."""
+    report = (yield).get_result()
+    if report.when != "call" and report.passed:
+        return
+    telling = item.stash.get(TELLING, Telling())
+    title = (inspect.getdoc(getattr(item, "obj", None)) or item.name).splitlines()[0].rstrip(".")
+    skipped = report.longrepr[2].removeprefix("Skipped: ") if report.skipped else ""
+    said = "\n".join([*telling.lines, *([report.longreprtext[-3000:]] if report.failed else [])])
+    name = item.nodeid.rpartition("/")[2]
+    item.config.stash[RESULTS][name] = Result(
+        name, title, report.passed, report.duration, said, skipped, tuple(telling.figures), tuple(telling.plots)
+    )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the report if one is asked for; what has become worse makes the run fail."""
+    config = session.config
+    results = list(config.stash[RESULTS].values())
+    folder, old = config.getoption("--hil-report"), config.getoption("--against")
+    if not folder or not results:
+        return
+    options = ("lidar", "adc", "have", "operator", "program")
+    ends = {name: str(config.getoption(f"--{name}") or "-") for name in options}
+    about = About("hil", "Devices", facts(**ends, when=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())))
+    worse = write(Path(folder), results, about, Path(old) if old else None)
+    say = config.get_terminal_writer()
+    say.line()
+    for text in worse:
+        say.line(f"worse than before: {text}")
+    say.line(f"report: {folder}/report.html")
+    if worse and session.exitstatus == 0:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

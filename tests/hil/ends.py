@@ -1,0 +1,276 @@
+"""Two kinds of ends for one test body: fakes in virtual time, and devices that ``--lidar`` and ``--adc`` name.
+
+A body is a coroutine; :meth:`LidarEnd.play` and :meth:`AdcEnd.play` run it where its device is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Protocol
+
+import pytest
+
+from hal.adc import RawSamples
+from hal.clock import Clock, LoopClock, SystemClock, run_virtual
+from hal.fake.adc import FakeAdc, FakeBuses
+from hal.fake.adc_light import OrdinaryLamps
+from hal.fake.control import Control
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import UTM_30LX, Unit
+from hal.fake.schedule import FaultSchedule, Target
+from hal.fake.transport import FakeOpener
+from hal.fake.world import Room
+from hal.hokuyo.driver import HokuyoDriver
+from hal.i2c import BusOpener
+from hal.lidar import RawScan
+from hal.opening import open_bus, open_port
+from hal.photodiode.driver import PhotodiodeAdc
+from hal.port import PortOpener
+
+FAKE: Final = "fake"
+LINE, BUS = "/dev/ttyACM7", "/dev/i2c-7"  # names that stand for a kind; nothing is opened under them
+UNIT: Final = Unit(serial="H0000007", clock_gain=30e-6, seed=7)
+ANSWER_S: Final = 5.0
+Body = Callable[[], Awaitable[None]]
+
+
+class Operator(Protocol):
+    """Whoever plugs, covers and carries."""
+
+    async def ask(self, request: str, order: str) -> None:
+        """Have something done; returns when it has been. ``order`` says it in words of ``hal.fake.control``."""
+        ...
+
+    def tell(self, request: str, order: str) -> None:
+        """The same, blocking."""
+        ...
+
+
+@dataclass(frozen=True)
+class FakeOperator:
+    """Does it to the fake."""
+
+    control: Control
+
+    async def ask(self, request: str, order: str) -> None:
+        """At once."""
+        self.tell(request, order)
+
+    def tell(self, request: str, order: str) -> None:
+        """The same."""
+        answer = self.control.answer(order)
+        assert answer.endswith("ok\n"), f"{request}: {answer}"
+
+
+@dataclass(frozen=True)
+class SocketOperator:
+    """A program that takes the same orders on a unix socket: a fake in another process, or a lab's own relays."""
+
+    path: str
+
+    async def ask(self, request: str, order: str) -> None:
+        """Returns when it has answered."""
+        await asyncio.to_thread(self.tell, request, order)
+
+    def tell(self, request: str, order: str) -> None:
+        """The same, blocking."""
+        with socket.socket(socket.AF_UNIX) as link:
+            link.settimeout(ANSWER_S)
+            link.connect(self.path)
+            link.sendall(order.encode() + b"\n")
+            answer = b""
+            while not answer.endswith(b"ok\n") and b"refused" not in answer:
+                part = link.recv(4096)
+                assert part, f"{self.path} has hung up"
+                answer += part
+        assert b"refused" not in answer, f"{request}: {answer.decode()}"
+
+
+@dataclass(frozen=True)
+class Person:
+    """Somebody at the terminal, who presses Enter when it is done."""
+
+    async def ask(self, request: str, order: str) -> None:
+        """Prompt, and wait for Enter as long as it takes; the devices go on meanwhile."""
+        await asyncio.to_thread(self.tell, request, order)
+
+    def tell(self, request: str, order: str) -> None:
+        """The same, blocking."""
+        with Path("/dev/tty").open("r+b", buffering=0) as terminal:
+            terminal.write(f"\n>>> {request}, then press Enter: ".encode())
+            terminal.readline()
+
+
+def operator_for(text: str) -> Operator | None:
+    """By the option's text; None: there is nobody."""
+    if text == "terminal":
+        try:
+            Path("/dev/tty").open("r+b", buffering=0).close()
+        except OSError as error:
+            raise pytest.UsageError(f"--operator terminal: {error}; run it in a terminal, not in a job") from error
+        return Person()
+    if text and not Path(text).is_socket():
+        raise pytest.UsageError(f"--operator {text}: no socket; say terminal, or the socket of hal.fake --control")
+    return SocketOperator(text) if text else None
+
+
+@dataclass
+class LidarEnd:
+    """A lidar. While a body runs, everything in it may be used; ``fake`` is None on a real device."""
+
+    name: str
+    operator: Operator | None = None
+    clock: Clock = field(default_factory=SystemClock)
+    opener: PortOpener = open_port
+    fake: FakeHokuyo | None = None
+
+    @property
+    def real(self) -> bool:
+        """Whether it is a device of this computer, or one on the network."""
+        return self.name != FAKE
+
+    @property
+    def device(self) -> str:
+        """What a driver opens."""
+        return self.name if self.real else LINE
+
+    def play(self, body: Body) -> None:
+        """Run a body to its end."""
+        if self.real:
+            asyncio.run(_await(body))
+        else:
+            run_virtual(self._on_fake(body), start=1000.0)
+
+    async def _on_fake(self, body: Body) -> None:
+        self.clock = LoopClock(asyncio.get_running_loop())
+        self.fake = FakeHokuyo(UTM_30LX, Room(UTM_30LX, seed=7, lap_s=math.inf), unit=UNIT)
+        plugs = FakeOpener(self.clock)
+        plugs.plug(LINE, self.fake)
+        self.opener = plugs
+        schedule, self.operator = _orders({"lidar": self.fake})
+        try:
+            await body()
+        finally:
+            schedule.close()
+            self.fake.close()
+
+    async def measure(self, seconds: float, driver: HokuyoDriver | None = None) -> list[RawScan]:
+        """Scans of so many seconds, from the first on that comes within 15 s."""
+        driver = driver or self.driver()
+        scans: list[RawScan] = []
+        running = asyncio.create_task(driver.run(scans.append))
+        try:
+            await self.until(lambda: bool(scans), 15.0, lambda: f"no scan has come: {driver.status.error}")
+            await asyncio.sleep(seconds)
+        finally:
+            await ended(running)
+        return scans
+
+    def driver(self) -> HokuyoDriver:
+        """A driver of our own on it."""
+        return HokuyoDriver(self.device, clock=self.clock, opener=self.opener)
+
+    async def until(self, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
+        """Wait until something is so; the seconds it took. Fails with the text after ``seconds``."""
+        return await _until(self.clock, so, seconds, else_)
+
+
+@dataclass
+class AdcEnd:
+    """A photodiode's converter; as :class:`LidarEnd`."""
+
+    name: str
+    operator: Operator | None = None
+    clock: Clock = field(default_factory=SystemClock)
+    opener: BusOpener = open_bus
+    fake: FakeAdc | None = None
+
+    def __post_init__(self) -> None:
+        bus, at, rest = (f"{BUS}@0x4d" if self.name == FAKE else self.name).rpartition("@")
+        address, _, chip = rest.partition(",")
+        try:
+            self.bus, self.address, self.chip = bus, int(address, 0), chip or "MCP3221"
+        except ValueError:
+            at = ""
+        if not at or not bus:
+            raise pytest.UsageError(f"--adc {self.name}: expected BUS@ADDRESS[,CHIP], as /dev/i2c-1@0x4d")
+
+    @property
+    def real(self) -> bool:
+        """Whether it is a device of this computer, or one on the network."""
+        return self.name != FAKE
+
+    def play(self, body: Body) -> None:
+        """Run a body to its end."""
+        if self.real:
+            asyncio.run(_await(body))
+        else:
+            run_virtual(self._on_fake(body), start=1000.0)
+
+    async def _on_fake(self, body: Body) -> None:
+        self.clock = LoopClock(asyncio.get_running_loop())
+        self.fake = FakeAdc(OrdinaryLamps(seed=7), self.clock, address=self.address, seed=7)
+        buses = FakeBuses(self.clock)
+        buses.plug(self.bus, self.fake)
+        self.opener = buses
+        schedule, self.operator = _orders({"adc": self.fake})
+        try:
+            await body()
+        finally:
+            schedule.close()
+
+    async def measure(self, seconds: float) -> list[RawSamples]:
+        """Blocks of so many seconds, from the first on that comes within 15 s."""
+        driver = self.driver()
+        blocks: list[RawSamples] = []
+        running = asyncio.create_task(driver.run(blocks.append))
+        try:
+            await self.until(lambda: bool(blocks), 15.0, lambda: f"no samples have come: {driver.status.error}")
+            await asyncio.sleep(seconds)
+        finally:
+            await ended(running)
+        return blocks
+
+    def driver(self) -> PhotodiodeAdc:
+        """A driver of our own on it."""
+        return PhotodiodeAdc(self.bus, self.address, self.chip, clock=self.clock, opener=self.opener)
+
+    async def until(self, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
+        """Wait until something is so; the seconds it took. Fails with the text after ``seconds``."""
+        return await _until(self.clock, so, seconds, else_)
+
+
+async def ended(running: asyncio.Task[None]) -> None:
+    """Cancel a driver and see that it ends by that and by nothing else."""
+    assert not running.done(), "a driver must never end by itself"
+    running.cancel()
+    await asyncio.wait([running])
+    assert running.cancelled(), "the driver swallowed its cancellation"
+
+
+def asked(end: LidarEnd | AdcEnd) -> Operator:
+    """The operator of an end whose test has said that it needs one."""
+    assert end.operator is not None
+    return end.operator
+
+
+async def _await(body: Body) -> None:
+    await body()
+
+
+async def _until(clock: Clock, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
+    begun = clock.now()
+    while not so():
+        assert clock.now() - begun < seconds, f"not within {seconds:g} s: {else_()}"
+        await asyncio.sleep(0.005)
+    return clock.now() - begun
+
+
+def _orders(targets: dict[str, Target]) -> tuple[FaultSchedule, Operator]:
+    schedule = FaultSchedule(targets)
+    return schedule, FakeOperator(Control(schedule))
