@@ -7,6 +7,7 @@ it to the threads that write.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import re
@@ -19,8 +20,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from daemon.cycle import Cycle, CycleRecord
 from daemon.disk import SEGMENT_BYTES, SegmentWriter
-from daemon.flight import Begun, Flight, Told
+from daemon.flight import ASKED, Begun, Flight, Told
 from daemon.health import FAULTS, Fault
+from daemon.moment import CYCLE_PARTS
 from estimator.records import Job
 from hal.clock import Clock
 from hal.replay.recording import Kind, pack_frame
@@ -40,13 +42,12 @@ AFTER_S: Final = 5.0
 """A dump because of a fault shows what became of it for so long."""
 AGAIN_S: Final = 300.0
 """The same fault makes another dump after so long."""
+ASKED_AGAIN_S: Final = 10.0
+"""Whoever asks for dumps gets another after so long: each costs a cycle the taking of a state."""
+JOBS: Final = 64
+"""Beyond so many jobs under way those are looked for that nobody waits for."""
 UNASKED: Final = 16
 """Jobs that the estimator waits for no longer, but that may still answer."""
-CYCLE_PARTS: Final = (
-    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
-    "alarm", "trust", "inbox", "paused", "watch", "_used",
-)  # fmt: skip
-"""What a cycle remembers."""
 UNDER_WAY: Final = "another dump is just being made"
 QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
 """Faults that a dump cannot tell anything about."""
@@ -132,6 +133,7 @@ class BlackBox:
         self._dumped: dict[Fault, float] = {}
         self._pending: tuple[float, Fault] | None = None
         self._asked = False
+        self._ask_from = -math.inf
 
     @property
     def failing(self) -> str:
@@ -174,22 +176,30 @@ class BlackBox:
     def dump(self, told: Told) -> None:
         """Make a dump of what there is, now; ``told`` in this thread when it is there, or why not.
 
-        One at a time: each holds a state until the disk has it.
+        One at a time, each holds a state until the disk has it; and another only after :data:`ASKED_AGAIN_S`.
         """
+        now, loop = self._clock.now(), asyncio.get_running_loop()
         if self._asked:
             told(UNDER_WAY)
             return
-        loop = asyncio.get_running_loop()
+        if now < self._ask_from:
+            told(f"one was made a moment ago; another can be made in {self._ask_from - now:.0f} s")
+            return
 
         def end(reason: str) -> None:
             self._asked = False
             told(reason)
 
         def back(reason: str) -> None:
-            loop.call_soon_threadsafe(end, reason)
+            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+                loop.call_soon_threadsafe(end, reason)
 
-        self._dump("asked", "somebody has asked for it", back)
-        self._asked = True
+        self._asked, self._ask_from = True, now + ASKED_AGAIN_S
+        try:
+            self._dump(ASKED, "somebody has asked for it", back)
+        except Exception as error:  # a defect in here must not leave the client waiting, and is told in full
+            log.exception("the flight recorder has failed")
+            end(repr(error))
 
     def close(self, ended: bool) -> None:
         """Finish what is under way; after the disk."""
@@ -199,8 +209,16 @@ class BlackBox:
         """Keep the jobs that may still answer."""
         if record.limits is not None and record.result is not None and record.result.jobs:
             self._jobs.update((job.job_id, job) for job in record.result.jobs)
+            if len(self._jobs) > JOBS and (state := self._state()) is not None:
+                self._let_go(state)
         for job_id in record.answers:
             self._jobs.pop(job_id, None)
+
+    def _let_go(self, state: State) -> None:
+        """Forget the jobs that nobody waits for any more, but the latest: they hold what they are about."""
+        unasked = [job_id for job_id in self._jobs if job_id not in state.atlas.asked]
+        for job_id in unasked[:-UNASKED]:
+            del self._jobs[job_id]
 
     def _watch_faults(self, now: float) -> None:
         faults = frozenset(self._faults())
@@ -241,9 +259,7 @@ class BlackBox:
         cycle, state = self._cycle, self._state()
         if cycle is None or state is None:
             return None
-        unasked = [job_id for job_id in self._jobs if job_id not in state.atlas.asked]
-        for job_id in unasked[:-UNASKED]:
-            del self._jobs[job_id]
+        self._let_go(state)
         samples, blocks = cycle.parts.samples, cycle.parts.blocks
         rest: dict[str, object] = {
             "cycle": {name: getattr(cycle, name) for name in CYCLE_PARTS},

@@ -1,13 +1,15 @@
-"""``lumiloop check``: whether configuration and survey are good, and whether the photodiode's bus is here."""
+"""``lumiloop check``: whether configuration, survey and maps are good, and whether the photodiode's bus is here."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
 from daemon import cli
 from daemon.config import Config
+from daemon.folders import maps_folder
 
 
 def main(args: argparse.Namespace) -> int:
@@ -30,8 +32,39 @@ def main(args: argparse.Namespace) -> int:
             remarks.append("the survey is not used: `photodiode.bus` is empty")
     if settings.photodiode.fitted:
         remarks.append(_look_at_bus(settings.photodiode.bus))
+    if settings.map.kept:
+        usable, remark = look_at_maps(settings)
+        if settings.map.localise and not usable:
+            return cli.fail(f"{remark}; `map.localise` in {args.config} asks for a map: `run` would be refused")
+        remarks.append(remark)
     sys.stdout.write("".join(f"{line}\n" for line in (f"{args.config}: good", *remarks)))
     return cli.OK
+
+
+def look_at_maps(settings: Config) -> tuple[bool, str]:
+    """Whether there is a map to begin with, and one line about the folder; nothing in it is touched.
+
+    What cannot be used is said, each file by itself, by the store's own log. A folder is often another user's.
+    """
+    folder = maps_folder(settings.map.folder)
+    if not os.access(folder, os.F_OK):
+        return False, f"{folder}: not there yet, maps will be kept in it"
+    if not folder.is_dir():
+        return False, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return False, f"{folder}: maps in it cannot be read by this user"
+    from daemon.lights import load_lights  # with them comes the arithmetic, which no other remark needs
+    from daemon.store import Store, judge_for
+
+    store = Store(folder, mend=False)
+    start = store.load(judge_for(load_lights(settings)))
+    unwritten = not settings.map.localise and not os.access(folder, os.W_OK)
+    more = "; nothing can be kept in it by this user" if unwritten else ""
+    if start is None:
+        return False, f"{folder}: {'no map in it can be used' if store.refused else 'no map in it yet'}{more}"
+    meta, count = start.stored.meta, len(start.stored.tables["submap.key"])
+    named = f" ({meta.name})" if meta.name else ""
+    return True, f"{folder}: map {meta.map_id:08x}{named} of {count} submaps is good{more}"
 
 
 def _look_at_bus(name: str) -> str:

@@ -25,11 +25,11 @@ Body = Callable[[argparse.Namespace], int]
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Wrong usage raises SystemExit(2) after explaining itself."""
     try:
-        parser = _parser()
-        args = parser.parse_args(argv)
+        words = parser()
+        args = words.parse_args(argv)
         body: Body | None = getattr(args, "body", None)
         if body is None:
-            parser.print_help(sys.stderr)
+            words.print_help(sys.stderr)
             return USAGE
         return body(args)
     except KeyboardInterrupt:
@@ -51,7 +51,8 @@ def say(text: str) -> None:
     sys.stderr.flush()
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Every command with its options; ``body`` of what it parses is the :data:`Body` to run."""
     parser = argparse.ArgumentParser(
         prog="lumiloop",
         description="Indoor robot localisation from a 2D lidar and coded ceiling lights: a pose over Modbus and UDP. "
@@ -61,6 +62,8 @@ def _parser() -> argparse.ArgumentParser:
     _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
     _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
     _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
+    from daemon import cli_taps
+
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
@@ -74,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
     _warm(commands.add_parser("warm", help="compile the kernels of this version now, and not at the first start"))
     _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
+    cli_taps.add(commands)
     return parser
 
 
@@ -85,7 +89,8 @@ def _print_option(parser: argparse.ArgumentParser, flag: str, text: Callable[[],
     parser.add_argument(flag, action="store_const", const=body, dest="body", help=f"print {what}")
 
 
-def _config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
+def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
+    """The options of every command that reads the configuration; see :func:`configured`."""
     if file:
         parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
@@ -93,13 +98,13 @@ def _config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> Non
 
 
 def _run(parser: argparse.ArgumentParser) -> None:
-    _config_arguments(parser)
+    config_arguments(parser)
     parser.add_argument("--lidar", metavar="DEVICE", help="same as --set lidar.device=DEVICE")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record raw bytes and cycles into this directory")
     parser.add_argument(
         "--last", type=_minutes, metavar="MINUTES", help="record in a ring; a fault, or a command, makes a dump of it"
     )
-    parser.set_defaults(body=_recording(_later("daemon.main", "main")))
+    parser.set_defaults(body=_recording(later("daemon.main", "main")))
 
 
 def _minutes(text: str) -> float:
@@ -120,15 +125,15 @@ def _recording(body: Body) -> Body:
 
 def _check(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
-    _config_arguments(parser, file=False)
-    parser.set_defaults(body=_later("daemon.check", "main"))
+    config_arguments(parser, file=False)
+    parser.set_defaults(body=later("daemon.check", "main"))
 
 
 def _probe(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("devices", nargs="*", metavar="DEVICE", help="where to look; default: everywhere it may be")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
-    _config_arguments(parser)
-    parser.set_defaults(body=_later("daemon.probe", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.probe", "main"))
 
 
 def _replay(parser: argparse.ArgumentParser) -> None:
@@ -138,8 +143,8 @@ def _replay(parser: argparse.ArgumentParser) -> None:
         "--journal", metavar="N[,N..]", help="write these matches in full, counted from 1; or: failed; or failed,5"
     )
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
-    _config_arguments(parser)
-    parser.set_defaults(body=_estimating("daemon.replay", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=estimating("daemon.replay", "main"))
 
 
 def _why(parser: argparse.ArgumentParser) -> None:
@@ -152,21 +157,21 @@ def _why(parser: argparse.ArgumentParser) -> None:
         help="a recording or a dump, or a folder of several; default: `flight` in the state directory",
     )
     parser.add_argument("--out", type=Path, metavar="PNG", help="and draw it")
-    _config_arguments(parser)
-    parser.set_defaults(body=_estimating("daemon.why", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=estimating("daemon.why", "main"))
 
 
 def _status(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("address", nargs="?", metavar="HOST[:PORT]", help="default: the configuration's Modbus server")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
-    _config_arguments(parser)
-    parser.set_defaults(body=_later("daemon.publish.client", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.publish.client", "main"))
 
 
 def _explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("words", nargs="+", metavar="WORD", help="as in: alert_m; DEGRADED; fault 302; map_yaw; 1008")
-    parser.set_defaults(body=_loaded("daemon.explain", "main"))
+    parser.set_defaults(body=loaded("daemon.explain", "main"))
 
 
 def _map(parser: argparse.ArgumentParser) -> None:
@@ -177,29 +182,29 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--pgm", action="store_true", help="map.pgm, map.yaml, map.png; what is written by default")
     export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
     export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
-    _config_arguments(export)
-    export.set_defaults(body=_estimating("daemon.export", "main"))
+    config_arguments(export)
+    export.set_defaults(body=estimating("daemon.export", "main"))
     taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
     taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
     taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
     taken.add_argument(
         "--out", type=Path, metavar="FILE", help="default: the configured folder of maps; the next start takes it"
     )
-    _config_arguments(taken)
-    taken.set_defaults(body=_estimating("daemon.mapfile", "take_in", "warm-plan"))
+    config_arguments(taken)
+    taken.set_defaults(body=estimating("daemon.mapfile", "take_in", "warm-plan"))
     render = verbs.add_parser("render", help="draw a map file as a picture")
     render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
-    _config_arguments(render)
-    render.set_defaults(body=_estimating("daemon.mapfile", "render", "warm-plan"))
+    config_arguments(render)
+    render.set_defaults(body=estimating("daemon.mapfile", "render", "warm-plan"))
     _map_changes(verbs)
     info = verbs.add_parser("info", help="say what a map file holds")
     info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     info.add_argument("--json", action="store_true", help="machine-readable output")
-    info.set_defaults(body=_loaded("daemon.store_cli", "info"))
+    info.set_defaults(body=loaded("daemon.store_cli", "info"))
     verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
     verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
-    verify.set_defaults(body=_loaded("daemon.store_cli", "verify"))
+    verify.set_defaults(body=loaded("daemon.store_cli", "verify"))
 
 
 def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -216,7 +221,7 @@ def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
             metavar="FILE",
             help="default: beside FILE, as the newest; the daemon there has to be stopped",
         )
-        parser.set_defaults(body=_loaded("daemon.mapstore", verb))
+        parser.set_defaults(body=loaded("daemon.mapstore", verb))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:
@@ -227,41 +232,41 @@ def _calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lidar-mount", action="store_true", help="where the lidar sits, instead of lights")
     other = "with --odometry or --lidar-mount the configuration, lumiloop-calibrated.toml"
     _written(parser, f"survey to write, default lights-calibrated.toml; {other}")
-    parser.set_defaults(body=_estimating("daemon.calibrate", "main", "warm-teach"))
+    parser.set_defaults(body=estimating("daemon.calibrate", "main", "warm-teach"))
 
 
 def _survey(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="REC", help="recording of a drive under the lamps")
     parser.add_argument("--height", type=float, metavar="M", help="of the lamps above the floor; default: estimated")
     _written(parser, "survey to write; default: lights.toml", Path("lights.toml"))
-    parser.set_defaults(body=_estimating("daemon.survey", "main", "warm-teach"))
+    parser.set_defaults(body=estimating("daemon.survey", "main", "warm-teach"))
 
 
 def _written(parser: argparse.ArgumentParser, what: str, default: Path | None = None) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE", default=default, help=what)
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
-    _config_arguments(parser)
+    config_arguments(parser)
 
 
 def _warm(parser: argparse.ArgumentParser) -> None:
-    _config_arguments(parser)
-    parser.set_defaults(body=_later("daemon.warm", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.warm", "main"))
 
 
 def _codes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", choices=("A", "B", "D"), default="A", help="air interface; default: A")
     parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
     parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
-    parser.set_defaults(body=_loaded("daemon.codes", "main"))
+    parser.set_defaults(body=loaded("daemon.codes", "main"))
 
 
-def _later(module: str, name: str) -> Body:
+def later(module: str, name: str) -> Body:
     """A body that resolves the configuration (``args.settings``: `daemon.config.Config`) and then loads its module."""
-    return _configured(_loaded(module, name))
+    return configured(loaded(module, name))
 
 
-def _estimating(module: str, name: str, what: str = "warm") -> Body:
-    """As `_later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
+def estimating(module: str, name: str, what: str = "warm") -> Body:
+    """As `later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
 
     def body(args: argparse.Namespace) -> int:
         from daemon import warmup
@@ -270,12 +275,12 @@ def _estimating(module: str, name: str, what: str = "warm") -> Body:
             warmup.load_aloud(say, what, lambda: (warmup.load(), import_module(module)))
         except warmup.CannotLoad as error:
             return fail(str(error))
-        return _loaded(module, name)(args)
+        return loaded(module, name)(args)
 
-    return _configured(body)
+    return configured(body)
 
 
-def _loaded(module: str, name: str) -> Body:
+def loaded(module: str, name: str) -> Body:
     """A body that loads its module when it runs."""
 
     def body(args: argparse.Namespace) -> int:
@@ -285,7 +290,9 @@ def _loaded(module: str, name: str) -> Body:
     return body
 
 
-def _configured(body: Body) -> Body:
+def configured(body: Body) -> Body:
+    """A body that is run with the resolved configuration as ``args.settings``."""
+
     def resolve_and_run(args: argparse.Namespace) -> int:
         from daemon import configfile
 

@@ -21,6 +21,7 @@ from daemon.evidence import EARLY, Observer
 from daemon.inbox import Inbox, Taken
 from daemon.lampwatch import LampWatch
 from daemon.laps import Laps, PulseTaker
+from daemon.leftout import LeftOut
 from daemon.logs import of_state
 from daemon.pace import ScanPeriod
 from daemon.photodiode import BlockWatch
@@ -43,8 +44,6 @@ log = logging.getLogger(__name__)
 
 OWN_SHARE: Final = 0.5
 """Part of the scan period that is the budget where none is configured."""
-TAKEN_UP: Final = 5
-"""Steps in a row that take the laser in again until it is no longer said to be left out: a few are trials."""
 
 Sink = Callable[[Snapshot], None]
 """Takes every snapshot; called from the loop thread, never waited for: it must return at once."""
@@ -155,7 +154,7 @@ class Cycle:
         self._switch: Callable[[], tuple[int, str]] | None = None
         self._switched = ""
         self._held: list[Answer] = []
-        self._used = 0
+        self._left_out = LeftOut()
         self.laps = Laps(parts.stopwatch)
         self.taker = PulseTaker()
 
@@ -212,8 +211,11 @@ class Cycle:
         answers, self._held = tuple(replace(answer, t_begin=t_mono) for answer in self._held), []
         return answers
 
-    def switch(self, take_over: Callable[[], tuple[int, str]]) -> None:
-        """Before the next step, have the estimator go on in another map: ``take_over`` does it, tells ID and digest."""
+    def switch(self, take_over: Callable[[], tuple[int, str]] | None) -> None:
+        """Before the next step, have the estimator go on in another map: ``take_over`` does it, tells ID and digest.
+
+        None: do not, after all; what has been taken over stays.
+        """
         self._switch = take_over
 
     def loops_seen(self, counter: int) -> None:
@@ -228,6 +230,10 @@ class Cycle:
     def map_id(self) -> int:
         """Identity of the map frame, another one after every RESET."""
         return self._painter.map_id
+
+    @map_id.setter
+    def map_id(self, map_id: int) -> None:
+        self._painter.map_id = map_id
 
     @property
     def budget_us(self) -> float:
@@ -313,12 +319,11 @@ class Cycle:
         return lights is not None and lights.fix is Fix.GOOD and self.result is not None and self.result.placed
 
     def _tell_unused(self, limits: Limits) -> None:
-        """Tell the judge that the laser is left out; that it is not any more only after some steps that use it."""
-        self._used = 0 if limits.rung >= Rung.CARRIED else self._used + 1
-        if self._used == 0:
-            self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED
-        elif self._used >= TAKEN_UP or self.observer.unused is Cause.PAUSED:
-            self.observer.unused = None
+        """Tell the judge that the laser is left out, and why."""
+        if self.paused or self.observer.unused is Cause.PAUSED:
+            self._left_out.clear()
+        overloaded = not self.paused and self._left_out.on_step(limits.rung >= Rung.CARRIED)
+        self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED if overloaded else None
         self.taker.on_rung(limits.rung, self.paused)
 
     def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:

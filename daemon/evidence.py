@@ -29,6 +29,8 @@ GUESS_S: Final = 0.5
 """A velocity carries the pose along an axis that nothing shows for this long; after that the pose is a guess there."""
 TELLING: Final = (LoopReason.PLACED, LoopReason.LIT)
 """Loops that tell the place of a robot that may have been carried off."""
+SEVERAL: Final = 3
+"""Lamps by which light can find a place anew."""
 EARLY: Final = 0.01
 """Part of a scan period by which a timer may be early and still stand for the whole period."""
 
@@ -151,6 +153,7 @@ class Observer:
         return Light(
             alive=alive,
             used=alive and lights.fix is Fix.GOOD and bool(lights.accepted),
+            fits=alive and not self._odd and gap is not None and _nearly(lights),
             placed=result.placed,
             lost=lights.fix is Fix.LOST,
             agrees=None if not alive or (gap is None and not against) else not self._odd,
@@ -195,6 +198,8 @@ class Observer:
                 self._t_shown[axis] = t_mono
             elif result.keyframe >= 0 and t_mono - self._t_shown[axis] > GUESS_S:
                 self._guessed[axis] = True
+        if not any(self._guessed):
+            return match
         x, y, yaw = (known and not guess for known, guess in zip(match.known, self._guessed, strict=True))
         return replace(match, known=(x, y, yaw))
 
@@ -225,6 +230,12 @@ def _lit(result: StepResult) -> bool:
     """Whether light tells a place and the pose agrees."""
     agrees = result.placed and result.gap is not None and result.gap <= SURPRISE
     return agrees and result.lights is not None and result.lights.fix is Fix.GOOD
+
+
+def _nearly(lights: light.LightsResult) -> bool:
+    """Whether light has a place that it is not sure of yet, by several lamps and no vaguer than a pose may be."""
+    spread = float(lights.covariance[0, 0] + lights.covariance[1, 1])
+    return lights.fix is Fix.STARTING and len(lights.accepted) >= SEVERAL and spread < 2.0 * VAGUE_M**2
 
 
 def _axes(known: Array) -> tuple[bool, bool, bool]:

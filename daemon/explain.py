@@ -16,17 +16,15 @@ from typing import Any, Final
 from daemon import configfile
 from daemon.cli import FAILED, OK, fail
 from daemon.health import FAULTS
-from daemon.publish import holding, integrity, lights, parts, pulse, registers
+from daemon.publish import holding, integrity, registers
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.points import Layout, Point
+from daemon.publish.requests import BLOCKS
 from daemon.reasons import REASONS
 
 _BLOCKS: Final = (
     ("input register", registers.BODY_ADDRESS, registers.BODY),
-    ("input register", lights.BODY_ADDRESS, lights.BLOCK),
-    ("input register", integrity.BODY_ADDRESS, integrity.BLOCK),
-    ("input register", pulse.BODY_ADDRESS, pulse.BLOCK),
-    ("input register", parts.BODY_ADDRESS, parts.BLOCK),
+    *(("input register", block.body, block) for block in BLOCKS),
     ("holding register", holding.COMMAND_ADDRESS, holding.COMMAND),
     ("holding register", holding.ODOMETRY_ADDRESS, holding.ODOMETRY),
 )

@@ -14,6 +14,7 @@ import logging
 import math
 import os
 import queue
+import re
 import shutil
 import threading
 import time
@@ -38,7 +39,11 @@ DUMP: Final = "dump-"
 """Folders of dumps are named so, by the time."""
 ABOUT: Final = "dump.json"
 DUMPS: Final = 8
-"""Dumps that are kept, the latest."""
+"""Dumps that are kept because of faults and of runs that died, the latest."""
+ASKED: Final = "asked"
+"""Reason of a dump that somebody has asked for."""
+ASKED_DUMPS: Final = 4
+"""Such dumps that are kept: whoever asks again and again does not push those of faults out."""
 DUMP_S: Final = 600.0
 """What a dump of a recording that is kept as a whole reaches back."""
 MAP_SUFFIX: Final = ".lumimap"
@@ -120,7 +125,7 @@ class Flight:
         self._tasks.put(partial(self._dump, about, told))
 
     def close(self, ended: bool) -> None:
-        """Finish what was asked for. ``ended``: as it should; else the ring is kept as a dump by the next start."""
+        """Finish what was asked for, for so long. ``ended``: as it should; else the next start keeps it as a dump."""
         self._tasks.put(None)
         self._thread.join(CLOSE_S)
         if self._ring >= 0:
@@ -226,18 +231,25 @@ class Flight:
                     path.unlink()
 
     def _dump(self, about: dict[str, Any], told: Told) -> None:
-        begin = self._dump_from(float(about["t_mono"]))
+        reason = "a defect, see the log"
+        try:
+            reason = self._dumped(about)
+        finally:  # whoever has asked hears of it, whatever has happened
+            told(reason)
+
+    def _dumped(self, about: dict[str, Any]) -> str:
+        """Make a dump; empty, or why there is none."""
         name = f"{DUMP}{about['at']}-{about['reason']}"
         try:
-            made = _linked(self._folder, self._names(begin), self._folder.parent / name, about)
+            names = self._names(self._dump_from(float(about["t_mono"])))
+            made = _linked(self._folder, names, self._folder.parent / name, about)
             _prune_dumps(self._folder.parent, made)
         except OSError as error:
             self._fail("a dump", error)
-            told(f"{self._folder.parent}: {error.strerror or error}")
-            return
+            return f"{self._folder.parent}: {error.strerror or error}"
         self.dumps += 1
         log.info("flight recorder: %s (%s)", made, about["why"])
-        told("")
+        return ""
 
     def _dump_from(self, now: float) -> int:
         """The segment a dump begins with."""
@@ -291,10 +303,18 @@ def _free(path: Path) -> Path:
 
 
 def _prune_dumps(parent: Path, made: Path) -> None:
-    """Remove the oldest by their names, never the one just ``made``: the clock may not have been set yet."""
-    others = sorted(path for path in parent.glob(f"{DUMP}*") if path != made)
-    for old in others[: -(DUMPS - 1)]:
+    """Remove the oldest by their names, never the one just ``made``: the clock may not have been set yet.
+
+    Those that were asked for and the others do not count together.
+    """
+    asked = _was_asked(made)
+    others = sorted(path for path in parent.glob(f"{DUMP}*") if path != made and _was_asked(path) == asked)
+    for old in others[: 1 - (ASKED_DUMPS if asked else DUMPS)]:
         shutil.rmtree(old, ignore_errors=True)
+
+
+def _was_asked(dump: Path) -> bool:
+    return re.search(rf"-{ASKED}(-\d+)?$", dump.name) is not None
 
 
 def _begin_ring(folder: Path) -> int:
@@ -315,9 +335,12 @@ def _see_to(mark: Path) -> None:
             if file.read():
                 shutil.rmtree(mark.parent, ignore_errors=True)
                 return
-        mark.unlink()
-        kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
-        mark.parent.rename(kept)
+        kept = mark.parent
+        if not kept.name.startswith(DUMP):  # else it was moved, and the power went before its mark did
+            kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
+            mark.parent.rename(kept)
+        (kept / RING).unlink()
+        sync_folder(kept.parent)
         log.warning("the run before this one did not end as it should: what it recorded last is in %s", kept)
         _prune_dumps(kept.parent, kept)
     except OSError as error:

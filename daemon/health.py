@@ -154,7 +154,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.ODOMETRY_GAPS: (
         "odometry readings are lost, late, or come more seldom than before",
-        "check the network and the sender's load; send at least once per scan",
+        "check the network and the sender's load; send ten readings per second or more",
     ),
     Fault.PROTECTION_ALERT: (
         "the position error may be above the limit that is set, `integrity.alert_m`",

@@ -27,7 +27,7 @@ FORGOTTEN_S: Final = 600.0
 ENOUGH: Final = 3
 """Links that make a majority worth the name."""
 
-_ODD: Final = {LinkState.REJECTED: Fault.LAMP_MOVED, LinkState.MISSING: Fault.LAMP_DEAD}
+_ODD: Final = ((LinkState.REJECTED, Fault.LAMP_MOVED), (LinkState.MISSING, Fault.LAMP_DEAD))
 _UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
 _SAID: Final = {
     Fault.LAMP_MOVED: "does not shine as surveyed: moved, exchanged, or its power is another",
@@ -67,7 +67,7 @@ class LampWatch:
     stalled: int = 0
     odd: dict[int, tuple[Fault, float]] = field(default_factory=dict)
     _t_epoch: float = float("-inf")
-    _lamps: dict[tuple[int, LinkState], _Lasting] = field(default_factory=dict)
+    _lamps: dict[tuple[int, Fault], _Lasting] = field(default_factory=dict)
     _dark: _Lasting = field(default_factory=lambda: _Lasting(LASTS_S))
     _twin: _Lasting = field(default_factory=lambda: _Lasting(TWIN_S))
     _wrong: _Lasting = field(default_factory=lambda: _Lasting(LASTS_S))
@@ -100,22 +100,25 @@ class LampWatch:
         self.faults = frozenset(present | lamps)
 
     def _look_at_each(self, t_mono: float, links: tuple[Link, ...]) -> None:
-        """Find lamps that have been odd for long, and those that are well again."""
+        """Find lamps that have been odd for long, and those that are well again; most links are neither."""
+        lamps = self._lamps
         for link in links:
             if link.lamp_id is None:
                 continue
-            for state, fault in _ODD.items():
-                lasting = self._lamps.get((link.lamp_id, state))
-                if lasting is None:
-                    lasting = self._lamps[link.lamp_id, state] = _Lasting(LASTS_S)
-                if lasting.now(t_mono, link.state is state) and link.state is state:
+            for state, fault in _ODD:
+                so, lasting = link.state is state, lamps.get((link.lamp_id, fault)) if lamps else None
+                if so and lasting is None:
+                    lasting = lamps[link.lamp_id, fault] = _Lasting(LASTS_S)
+                if lasting is not None and lasting.now(t_mono, so) and so:
                     self._find(link, fault, t_mono)
             if link.state is LinkState.ACCEPTED and link.lamp_id in self.odd:
                 del self.odd[link.lamp_id]
                 log.info("lamp %d (code %d) is received as it should be again", link.lamp_id, link.code)
-        self.odd = {lamp: found for lamp, found in self.odd.items() if t_mono - found[1] < FORGOTTEN_S}
-        here = {link.lamp_id for link in links}
-        self._lamps = {key: lasting for key, lasting in self._lamps.items() if key[0] in here}
+        if self.odd:
+            self.odd = {lamp: found for lamp, found in self.odd.items() if t_mono - found[1] < FORGOTTEN_S}
+        if lamps:
+            here = {link.lamp_id for link in links}
+            self._lamps = {key: lasting for key, lasting in lamps.items() if key[0] in here}
 
     def _find(self, link: Link, fault: Fault, t_mono: float) -> None:
         assert link.lamp_id is not None

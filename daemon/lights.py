@@ -17,6 +17,7 @@ import msgspec
 
 from daemon.config import Config
 from daemon.photodiode import profile_of
+from daemon.store_file import Damaged
 from daemon.surveyfile import SurveyError, read_survey, residuals_beside
 from estimator.cdma_profile import PROFILES, Profile
 from estimator.lamps import Survey
@@ -29,12 +30,27 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 
 log = logging.getLogger(__name__)
 
-__all__ = ["Lights", "SurveyError", "from_header", "load_lights", "lost_residuals", "new_state"]
+__all__ = [
+    "CannotBegin",
+    "Lights",
+    "SurveyError",
+    "begun",
+    "from_header",
+    "load_lights",
+    "lost_residuals",
+    "new_state",
+]
 
 HEADER: Final = "lights"
 """Key of a recording's head."""
 RESIDUALS: Final = "lights.residuals.npz"
 """File of a recording's folder."""
+
+
+class CannotBegin(Damaged):
+    """A map that passes every check of its file, and yet the estimator cannot be begun with it."""
+
+    remedy = "it is kept, the generation before it is used; please report it, with the file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +148,9 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     """The estimator's state for a robot just switched on, and the map it begins with; loads the estimator.
 
     A residual map that cannot be used is named in the log, and the robot drives without.
+
+    Raises:
+        CannotBegin: the map is at fault. ValueError: the survey or the stored sample clock is.
     """
     from estimator import pipeline
 
@@ -142,7 +161,22 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     from estimator.mapimage import restored
 
     settings = replace(settings or pipeline.Settings(), localise=start.localise)
-    return restored(image_from(start.stored, start.changed), settings, setup)
+    try:
+        return restored(image_from(start.stored, start.changed), settings, setup)
+    except Exception as error:  # what no check has foreseen must not end this start, and the next, and the next
+        pipeline.new_state(settings, setup)  # what is wrong without a map too is not the map's fault
+        if isinstance(error, MemoryError):
+            raise
+        raise CannotBegin(f"it passes every check, but cannot be made into a state: {error!r}") from error
+
+
+def begun(lights: Lights | None, settings: Settings, start: Start | None) -> State:
+    """The same for a replay: the run that began without a map that it could not be begun with is repeated so."""
+    try:
+        return new_state(lights, settings, start)
+    except CannotBegin as error:
+        log.error("the stored map is not used: %s", error)
+        return new_state(lights, settings)
 
 
 def _setup(lights: Lights) -> LightsSetup:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import socket
 import sys
@@ -42,6 +43,30 @@ def of_state(state: str, reason: str, remedy: str) -> dict[str, Any]:
 
 def _extra(fields: Fields) -> dict[str, Any]:
     return {"fields": fields}
+
+
+class Sparing:
+    """Lines about what others do at a rate of their own: so many in a while, then only how many more there were.
+
+    Args:
+        log: gets the lines. lines, seconds: so many are told in so many seconds.
+    """
+
+    def __init__(self, log: logging.Logger, lines: int = 10, seconds: float = 10.0) -> None:
+        self._log, self._lines, self._seconds = log, lines, seconds
+        self._until = -math.inf
+        self._told = self._left_out = 0
+
+    def say(self, t_mono: float, level: int, text: str) -> None:
+        """Tell it, or count it."""
+        if t_mono >= self._until:
+            self._until, self._told = t_mono + self._seconds, 0
+        if self._told == self._lines:
+            self._left_out += 1
+            return
+        more, self._left_out = self._left_out, 0
+        self._told += 1
+        self._log.log(level, "%s%s", text, f" ({more} more such lines were left out before it)" if more else "")
 
 
 def start_log() -> None:

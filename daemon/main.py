@@ -27,10 +27,11 @@ from daemon.cli import FAILED, OK, USAGE
 from daemon.condition import Reporter
 from daemon.config import Config
 from daemon.cycle import Cycle, Parts, Step
+from daemon.folders import maps_folder, runtime_folder, state_folder
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.lastpose import LastPose
-from daemon.lights import Lights, SurveyError, load_lights, new_state
+from daemon.lights import CannotBegin, Lights, SurveyError, load_lights, new_state
 from daemon.logs import start_log
 from daemon.mapswitch import Maps, MapSwitch, Switch, take_over
 from daemon.network import Feeds, Network
@@ -39,9 +40,9 @@ from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
 from daemon.realtime import claim, line_up
-from daemon.sampleclock import SampleClock, runtime_folder, state_folder
+from daemon.sampleclock import SampleClock
 from daemon.stallwatch import StallWatch
-from daemon.store import NoMap, Start, folder_of, judge_for, started
+from daemon.store import NoMap, Start, judge_for, started
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
 from daemon.streambeat import StreamBeat
@@ -174,10 +175,31 @@ class Daemon:
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
         if self._world.start is not None:
-            self._estimator.load()
+            self._begin(self._world.start.stored.meta.map_id)
             gc.freeze()  # the map stays
             self.keeper.loaded()
             self._remember()
+
+    def _begin(self, map_id: int) -> None:
+        """Load the map that is stored; without it, and under another identity, where nothing can be begun with it.
+
+        An earlier generation of it is gone on in as soon as the cycles run, as after the command SWITCH_MAP.
+
+        Raises:
+            NoMap: there is none that can be used, and `map.localise` asks for one.
+        """
+        try:
+            self._estimator.load()
+        except CannotBegin as error:
+            assert self._world.store is not None
+            self._world.store.refuse(error)
+            if self._estimator.localise:
+                raise NoMap(f"map {map_id:08x} cannot be used, and `map.localise` is true; start again") from error
+            self._estimator.start = None
+            self._estimator.load()
+            self.cycle.map_id = self._world.draw_map_id()
+            self.keeper.without_start()
+            self.maps.ask(map_id, lambda why: log.warning("a new map is begun: %s", why) if why else None, patient=True)
 
     def _remember(self) -> None:
         """Tell the estimator where the run before has left the robot."""
@@ -197,8 +219,11 @@ class Daemon:
         maps = Maps(self._world.store, judge_for(lights), self._estimator.made, keep)
         return MapSwitch(maps, self.keeper, self._put_switch)
 
-    def _put_switch(self, switch: Switch, taken: Callable[[], None]) -> None:
-        """The cycle takes it over; what is kept of maps knows it in the same instant."""
+    def _put_switch(self, switch: Switch | None, taken: Callable[[], None]) -> None:
+        """The cycle takes it over (None: does not after all); what is kept of maps knows it in the same instant."""
+        if switch is None:
+            self.cycle.switch(None)
+            return
 
         def take_over() -> tuple[int, str]:
             self._estimator.take_over(switch)
@@ -297,14 +322,15 @@ class _Estimator:
     """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
 
     Attributes:
-        state: None until then. lap: told the name of each part of a step that has ended.
+        state: None until then. start: the map that it begins with. localise: maps are only used, never changed.
+        lap: told the name of each part of a step that has ended.
     """
 
     def __init__(self, lights: Lights | None, start: Start | None, localise: bool = False) -> None:
         self.state: Estimate | None = None
-        self._localise = localise
+        self.localise = localise
         self._lights = lights
-        self._start = start
+        self.start = start
         self._step: Step | None = None
         self.lap: Callable[[str], object] = no_lap
 
@@ -312,7 +338,7 @@ class _Estimator:
         """A state as at a start in a stored map; may be called in another thread."""
         from estimator import pipeline
 
-        return new_state(self._lights, pipeline.Settings(), replace(start, localise=self._localise))
+        return new_state(self._lights, pipeline.Settings(), replace(start, localise=self.localise))
 
     def take_over(self, switch: Switch) -> None:
         """Go on in another map."""
@@ -323,7 +349,7 @@ class _Estimator:
         """Load the estimator, and the map into it."""
         from estimator import pipeline
 
-        self.state = new_state(self._lights, pipeline.Settings(localise=self._localise), self._start)
+        self.state = new_state(self._lights, pipeline.Settings(localise=self.localise), self.start)
         self._step = partial(pipeline.step, self.state, lap=self.lap)
         return self._step
 
@@ -409,7 +435,7 @@ def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> 
     said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
     said += [f"stream {stream}"] if stream is not None else []
     used = "map from" if settings.map.localise else "maps in"
-    said += [f"{used} {folder_of(settings.map.folder)}"] if settings.map.kept else ["no map is kept"]
+    said += [f"{used} {maps_folder(settings.map.folder)}"] if settings.map.kept else ["no map is kept"]
     said += [f"recording into {record}"] if record is not None else []
     return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 

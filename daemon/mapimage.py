@@ -30,6 +30,10 @@ LAMP: Final = np.array((250.0, 204.0, 21.0))
 _LAMP_PX: Final = 6.0
 _RING_PX: Final = 2.0
 _LINE_PX: Final = 1.2
+_JUMP_M: Final = 0.5
+_JUMP_TIMES: Final = 8.0
+"""Between two positions that lie farther apart than this, and than so many ordinary steps, nothing was driven: the
+robot was carried, or found elsewhere. No line is drawn."""
 _DOT_PX: Final = 7.0
 _BAR_PX: Final = 3.0
 _BAND: Final = 64
@@ -86,13 +90,16 @@ def _discs(grid: Grid, path: Array, lamps: Array | None, scale: int) -> list[Dis
         discs.append((at, np.tile(WALL, (len(at), 1)), _LAMP_PX + _RING_PX))
         discs.append((at, np.tile(LAMP, (len(at), 1)), _LAMP_PX))
     places = _to_pixels(grid, path, scale, rows)
-    return discs + _line(places) if len(places) > 0 else discs
+    return discs + _line(places, scale / grid.resolution) if len(places) > 0 else discs
 
 
-def _line(places: Array) -> list[Discs]:
-    """The path, densely stamped with soft dots, and a larger dot at either end."""
+def _line(places: Array, pixels_per_metre: float) -> list[Discs]:
+    """The path, densely stamped with soft dots, and a larger dot at either end; nothing where the robot was carried."""
     steps = np.hypot(*np.diff(places, axis=0).T) if len(places) > 1 else np.zeros(0)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
+    driven = steps[steps > 0.01 * pixels_per_metre]
+    ordinary = float(np.percentile(driven, 90.0)) if len(driven) else 0.0
+    carried = steps > max(_JUMP_M * pixels_per_metre, _JUMP_TIMES * ordinary)
+    along = np.concatenate([[0.0], np.cumsum(np.where(carried, 1e-9, steps))])
     count = max(2, int(along[-1] * 1.5))
     wanted = np.linspace(0.0, along[-1], count)
     dense = np.stack([np.interp(wanted, along, places[:, axis]) for axis in (0, 1)], axis=1)

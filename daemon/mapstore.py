@@ -20,7 +20,8 @@ import numpy.typing as npt
 
 from daemon import cli
 from daemon.config import Config
-from daemon.store import Store, folder_of, said
+from daemon.folders import maps_folder
+from daemon.store import Store, said
 from daemon.store_file import BadMap, pack
 from daemon.store_tables import Meta, Stored, Tables, read
 from daemon.wholefile import write_whole
@@ -79,7 +80,7 @@ def keep(settings: Config, content: bytes, map_id: int) -> Path:
     """Put a map into the configured folder; `OSError`, with the remedy, where another process uses it."""
     if not settings.map.kept:
         raise OSError("`map.folder` is none; name a place with --out FILE")
-    store = Store(folder_of(settings.map.folder))
+    store = Store(maps_folder(settings.map.folder))
     try:
         return store.save(content, map_id)
     except OSError as error:

@@ -35,6 +35,9 @@ BUSY: Final = "another map is just being loaded"
 IN_USE: Final = "that map is in use"
 NO_FOLDER: Final = "maps are not kept: `map.folder` is none"
 NOT_LOADED: Final = "the estimator is still being loaded"
+NOTHING_COMES: Final = "nothing arrives from lidar, odometry or photodiode, so no cycle can take the map over"
+TAKEN_S: Final = 10.0
+"""A cycle that has something to work with takes the map within a scan; without any it is given up after this long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,29 +118,33 @@ class MapSwitch:
 
     Args:
         keeper: saves the map in use.
-        put: hands a switch to the cycle; its second argument is called once the cycle has taken it.
+        put: hands a switch to the cycle; its second argument is called once the cycle has taken it. None takes back
+            what has been handed over and not been taken.
     """
 
-    def __init__(self, maps: Maps, keeper: Keeper, put: Callable[[Switch, Callable[[], None]], None]) -> None:
+    def __init__(self, maps: Maps, keeper: Keeper, put: Callable[[Switch | None, Callable[[], None]], None]) -> None:
         self._maps, self._keeper, self._put = maps, keeper, put
         self._task: asyncio.Task[None] | None = None
 
-    def ask(self, map_id: int, told: Told) -> None:
-        """Go on in a stored map; ``told``: empty, or why that came to nothing."""
+    def ask(self, map_id: int, told: Told, patient: bool = False) -> None:
+        """Go on in a stored map; ``told``: empty, or why that came to nothing.
+
+        ``patient``: wait for a cycle that takes it for as long as it may be; nobody waits for an answer.
+        """
         if self._task is not None and not self._task.done():
             told(BUSY)
             return
-        self._task = asyncio.get_running_loop().create_task(self._switch(map_id, told), name="map switch")
+        self._task = asyncio.get_running_loop().create_task(self._switch(map_id, told, patient), name="map switch")
 
-    async def _switch(self, map_id: int, told: Told) -> None:
+    async def _switch(self, map_id: int, told: Told, patient: bool) -> None:
         try:
-            reason = await self._carried_out(map_id)
+            reason = await self._carried_out(map_id, patient)
         except Exception as error:  # a defect must not leave the client waiting, and is told in full
             log.exception("the map cannot be switched")
             reason = repr(error)
         told(reason)
 
-    async def _carried_out(self, map_id: int) -> str:
+    async def _carried_out(self, map_id: int, patient: bool) -> str:
         store = self._maps.store
         if store is None:
             return NO_FOLDER
@@ -160,7 +167,13 @@ class MapSwitch:
             return f"map {map_id:08x} cannot be used: {said(error) if isinstance(error, OSError) else error}"
         taken = asyncio.Event()
         self._put(switch, taken.set)
-        await taken.wait()
+        try:
+            async with asyncio.timeout(None if patient else TAKEN_S):
+                await taken.wait()
+        except TimeoutError:
+            if not taken.is_set():
+                self._put(None, taken.set)
+                return NOTHING_COMES
         log.info("map %08x is in use; the robot is looked for in it", map_id)
         return DONE
 

@@ -70,6 +70,11 @@ class MapTiles:
             self._busy = True
             self._hand_out(live.task(adrift), adrift, JOBS, loop)
 
+    @property
+    def busy(self) -> bool:
+        """Whether something is being drawn."""
+        return self._busy
+
     def forget(self) -> None:
         """Nobody watches any more."""
         if not self._busy:

@@ -6,17 +6,24 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from hal.errors import DataInvalid
 from hal.replay.recording import STATE_SUFFIX, Recording
 from hal.replay.text import unreadable
 
 if TYPE_CHECKING:  # loads the estimator
-    from daemon.checkpoint import Piece
     from daemon.cycle import Cycle
+    from daemon.restore import Piece
     from estimator.records import Job
     from estimator.state import State
+
+
+CYCLE_PARTS: Final = (
+    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
+    "alarm", "trust", "inbox", "paused", "watch", "_left_out",
+)  # fmt: skip
+"""What a cycle remembers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,11 +47,13 @@ class Moment:
         Raises:
             DataInvalid: it was made by other software, or is damaged.
         """
-        from daemon.checkpoint import CannotRestore, restore
+        from daemon.restore import CannotRestore, restore
         from daemon.statefile import BadState
 
         try:
             state, rest = restore(self.pieces)
+            if unknown := set(rest["cycle"]) - set(CYCLE_PARTS):
+                raise CannotRestore(f"a cycle remembers no {', '.join(sorted(map(str, unknown)))}")
         except (CannotRestore, BadState) as error:
             made = ", ".join(f"{name} {number}" for name, number in sorted(self.versions.items()))
             raise DataInvalid(
@@ -79,9 +88,8 @@ class Restored:
             (cycle.parts.blocks, self.rest["blocks"]),
         ):
             if part is not None and remembered is not None:
-                for name, value in remembered.items():
-                    if name != "status":
-                        setattr(part, name, value)
+                for name in vars(part).keys() & remembered.keys() - {"status"}:
+                    setattr(part, name, remembered[name])
 
 
 def state_beside(segment: Path) -> Path:

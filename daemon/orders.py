@@ -1,4 +1,8 @@
-"""Orders that come in over Modbus: each goes to who carries it out, and its end back to the client."""
+"""Orders that come in over Modbus: each goes to who carries it out, and its end back to the client.
+
+A controller may repeat an order at any rate (it writes a new number in every turn of its program): the log then gets
+some of them and their count.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from daemon.logs import Sparing
 from daemon.publish.holding import CommandCode, Outcome, Request
 from daemon.publish.snapshot import Snapshot
 from estimator.records import Command, Order
@@ -48,11 +53,12 @@ class Orders:
         self._feeds = feeds
         self._acknowledge = acknowledge
         self._asked: list[_Asked] = []
+        self._lines = Sparing(log)
 
     def take(self, request: Request) -> None:
         """An order as it was written."""
         feeds, code = self._feeds, request.code
-        log.info("Modbus: %s", _said(request))
+        self._lines.say(self._clock.now(), logging.INFO, f"Modbus: {_said(request)}")
         told = partial(self._ended, request)
         if code is CommandCode.SAVE_MAP:
             feeds.on_save(told)
@@ -82,7 +88,7 @@ class Orders:
 
     def _ended(self, request: Request, reason: str) -> None:
         if reason:
-            log.warning("Modbus: %s refused: %s", request.code.name, reason)
+            self._lines.say(self._clock.now(), logging.WARNING, f"Modbus: {request.code.name} refused: {reason}")
         self._acknowledge(request.number, Outcome.REFUSED if reason else Outcome.DONE)
 
 

@@ -22,14 +22,13 @@ class ScanPeriod:
     def __init__(self) -> None:
         self._nominal = IDLE_PERIOD_S
         self._steps: deque[float] = deque(maxlen=MEDIAN_OF)
+        self._median = 0.0
         self._last: tuple[int, float] | None = None
 
     @property
     def seconds(self) -> float:
         """The period: learned, else nominal, else :data:`IDLE_PERIOD_S`."""
-        if len(self._steps) < ENOUGH:
-            return self._nominal
-        return sorted(self._steps)[len(self._steps) // 2]
+        return self._nominal if len(self._steps) < ENOUGH else self._median
 
     def learn(self, scan: RawScan) -> None:
         """Take in one scan's stamp."""
@@ -41,6 +40,7 @@ class ScanPeriod:
         step = (scan.t_mono - last[1]) / (scan.seq - last[0])
         if step > 0.0:
             self._steps.append(step)
+            self._median = sorted(self._steps)[len(self._steps) // 2]  # asked for ten times a cycle
 
     def learn_block(self, seconds: float) -> None:
         """Take in the length of a block of light samples."""

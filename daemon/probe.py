@@ -8,6 +8,8 @@ import json
 import re
 import sys
 
+from daemon import cli
+from daemon.endpoints import LidarPlace, parse_lidar
 from hal import i2c_linux
 from hal.hokuyo import discover
 from hal.opening import open_bus, open_port
@@ -31,7 +33,11 @@ def main(args: argparse.Namespace) -> int:
     if not devices and not args.json:
         sys.stderr.write(NOTHING)
         return 1
-    findings = asyncio.run(_look(devices, quiet=args.json))
+    try:
+        places = {device: LidarPlace(device) if is_bus(device) else parse_lidar(device) for device in devices}
+    except ValueError as error:
+        return cli.fail(str(error))
+    findings = asyncio.run(_look(places, quiet=args.json))
     if args.json:
         sys.stdout.write(json.dumps([as_dict(finding) for finding in findings], indent=2) + "\n")
     good = sum(map(_usable, findings))
@@ -43,18 +49,21 @@ def is_bus(device: str) -> bool:
     return re.match(r"/dev/i2c-|adapter:|unix:|i2c\+tcp://", device) is not None
 
 
-async def _look(devices: list[str], quiet: bool) -> list[Found]:
+async def _look(places: dict[str, LidarPlace], quiet: bool) -> list[Found]:
+    """``places``: by what a person writes for them."""
     findings: list[Found] = []
-    for device in devices:
+    for device, place in places.items():
         if not quiet:
             sys.stderr.write(f"looking at {device} ...\n")
         bus = is_bus(device)
         finding: Found = (
-            await probe_bus(open_bus, device.removeprefix("i2c+")) if bus else await identify_at(open_port, device)
+            await probe_bus(open_bus, device.removeprefix("i2c+"))
+            if bus
+            else await identify_at(open_port, place.device, place.baud)
         )
         findings.append(finding)
         if not quiet:
-            sys.stdout.write(describe(finding))
+            sys.stdout.write(describe(finding, device))
             sys.stdout.flush()
     return findings
 
@@ -65,14 +74,14 @@ def _usable(finding: Found) -> bool:
     return finding.error is None
 
 
-def describe(finding: Found) -> str:
-    """What a person wants to read: the line and how to use it."""
+def describe(finding: Found, device: str) -> str:
+    """What a person wants to read: the line and how to use it; ``device``: as it was written."""
     if isinstance(finding, BusFinding):
         use = (_how_to_use(finding.bus, chip) for chip in finding.chips)
         return "\n".join((str(finding), *(f"  use it: {text}" for text in use if text))) + "\n"
     if finding.error is not None:
         return f"no lidar: {finding}\n"
-    return f"{finding}\n  use it: lumiloop run --lidar {finding.device}\n"
+    return f"{finding}\n  use it: lumiloop run --lidar {device}\n"
 
 
 def _how_to_use(bus: str, chip: Chip) -> str:

@@ -60,8 +60,8 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "check its converter's power and bus; read the fault",
     ),
     Reason.LIGHT_DARK: (
-        "no lamp can be used",
-        "are the lamps on, is the photodiode covered, is this part of the building surveyed?",
+        "the lamps have not told the place for a while: too few are received, or they do not agree on one",
+        "are the lamps on, is the photodiode covered, is this part of the building surveyed? else drive a metre or two",
     ),
     Reason.LIGHT_DISAGREES: (
         "light and pose contradict each other about the place",

@@ -17,7 +17,7 @@ from daemon.budget import FixedBudget
 from daemon.config import Config
 from daemon.cycle import Cycle, CycleRecord, Parts
 from daemon.ledger import Ledger
-from daemon.lights import Lights, new_state
+from daemon.lights import Lights, begun, new_state
 from daemon.mapswitch import take_over
 from daemon.moment import Restored
 from daemon.photodiode import BlockWatch
@@ -39,6 +39,7 @@ from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
     from daemon.matchjournal import MatchJournal
+    from estimator.state import State
 
 
 class ReplayClock:
@@ -122,7 +123,7 @@ class Rerun:
         self._clock = ReplayClock()
         self._lights, self._localise = lights, config.map.localise
         settings = pipeline.Settings(history=True, localise=config.map.localise)
-        self._state = new_state(lights, settings, start) if begin is None else begin.keep_history()
+        self._state = begun(lights, settings, start) if begin is None else begin.keep_history()
         self._journal = journal
         if journal is not None:
             journal.attach(self._state)
@@ -157,6 +158,11 @@ class Rerun:
         if begin is None:
             return ScheduledWorker(self._answers)
         return ScheduledWorker(self._answers, begin.rest["cycle"]["cycles"], begin.jobs)
+
+    @property
+    def state(self) -> State:
+        """The estimator's, to be looked at."""
+        return self._state
 
     @property
     def t_mono(self) -> float:

@@ -107,6 +107,16 @@ def tum(trajectory: Trajectory) -> bytes:
     return (_TUM_HEAD + "".join(lines)).encode()
 
 
+def kitti(trajectory: Trajectory) -> bytes:
+    """KITTI text: the upper three rows of each pose's matrix in one line, ascending by stamp; it has no stamps."""
+    poses = trajectory.poses[np.argsort(trajectory.stamps, kind="stable")]
+    c, s = np.cos(poses[:, 2]).tolist(), np.sin(poses[:, 2]).tolist()
+    rows = zip(c, s, poses[:, 0].tolist(), poses[:, 1].tolist(), strict=True)
+    return "".join(
+        f"{c:.9f} {-s + 0.0:.9f} 0 {x:.6f} {s:.9f} {c:.9f} 0 {y:.6f} 0 0 1 0\n" for c, s, x, y in rows
+    ).encode()
+
+
 def finest(draw: Callable[[float], Grid]) -> Grid:
     """The map at the finest of :data:`RESOLUTIONS_M` that its extent allows: ``draw`` raises `ValueError` beyond."""
     for resolution in RESOLUTIONS_M[:-1]:

@@ -10,12 +10,11 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from daemon.config import PhotodiodeConfig
+from daemon.folders import state_folder
 from daemon.photodiode import profile_of
 
 log = logging.getLogger(__name__)
@@ -23,22 +22,6 @@ log = logging.getLogger(__name__)
 FILE: Final = "sample-clock.json"
 MOVED_PPM: Final = 20.0
 """A change that is worth writing: the decoder is content with 200 ppm."""
-
-
-def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where what is learned is kept: the service manager's StateDirectory, else the user's own."""
-    if named := environment.get("STATE_DIRECTORY", "").partition(":")[0]:
-        return Path(named)
-    home = environment.get("XDG_STATE_HOME") or str(Path(environment.get("HOME", "/")) / ".local" / "state")
-    return Path(home) / "lumiloop"
-
-
-def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where sockets are: the service manager's RuntimeDirectory, else the user's own, else beside what is learned."""
-    if named := environment.get("RUNTIME_DIRECTORY", "").partition(":")[0]:
-        return Path(named)
-    user = environment.get("XDG_RUNTIME_DIR", "")
-    return Path(user) / "lumiloop" if user else state_folder(environment)
 
 
 class SampleClock:

@@ -22,10 +22,11 @@ class Histogram:
 
     def add(self, us: int) -> None:
         """Count one."""
-        shift = max(0, us.bit_length() - FINE - 1)
-        step = (shift << FINE) + (us >> shift)
+        shift = us.bit_length() - FINE - 1
+        step = (shift << FINE) + (us >> shift) if shift > 0 else us
         self._newer[step] = self._newer.get(step, 0) + 1
-        self._newer_max = max(self._newer_max, us)
+        if us > self._newer_max:
+            self._newer_max = us
 
     def turn(self) -> None:
         """Forget the older half."""

@@ -37,6 +37,8 @@ class Light:
 
     Attributes:
         alive: samples arrive. used: lamps are received and used, and the place and heading they tell are good.
+        fits: enough lamps are received at a place like the pose's, though light, which has had to look for it anew,
+            is not sure of it by itself yet.
         placed: it has been told by light where the map lies.
         lost: what is received contradicts the place that light itself had told.
         agrees: whether the light's place and the pose are the same within what both may be wrong; None: cannot be said.
@@ -46,6 +48,7 @@ class Light:
 
     alive: bool
     used: bool = False
+    fits: bool = False
     placed: bool = False
     lost: bool = False
     agrees: bool | None = None

@@ -48,6 +48,7 @@ class Memory:
         sure: the pose was proved when the laser fell silent. recalled: the laser is back, and has found it there.
         lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
         odd_since: since when light has contradicted the place; both None while it does not.
+        led: light has moved the pose, and has not been sure of the place since.
     """
 
     state: State = State.STARTING
@@ -67,17 +68,20 @@ class Memory:
     lit_since: float | None = None
     lit_last: float | None = None
     odd_since: float | None = None
+    led: bool = False
 
 
 def remember(memory: Memory, evidence: Evidence) -> Memory:
     """Take in one cycle's evidence."""
     now = evidence.t_mono
-    memory = replace(memory, odd_since=None) if evidence.light is None else _take_light(memory, evidence.light, now)
+    memory = _odd(memory, None) if evidence.light is None else _take_light(memory, evidence.light, now)
     silent = evidence.silence is not None and evidence.silence >= SILENT_PERIODS
     if not evidence.lidar or silent or evidence.unused is not None:
         return _forget_laser(memory, evidence)
     since = memory.disagree_since if memory.disagree_since is not None else now
-    memory = replace(memory, disagree_since=since if evidence.agree is False else None)
+    since_or_none = since if evidence.agree is False else None
+    if since_or_none is not memory.disagree_since:
+        memory = replace(memory, disagree_since=since_or_none)
     if evidence.places is not None:
         # what fits the surroundings proves nothing of the place in the map
         memory = replace(memory, good=0, sure=False, recalled=False)
@@ -102,6 +106,7 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
         lit_since=memory.lit_since,
         lit_last=memory.lit_last,
         odd_since=memory.odd_since,
+        led=memory.led,
     )
 
 
@@ -115,13 +120,23 @@ def _sure(memory: Memory, watched: bool) -> bool:
 def _take_light(memory: Memory, light: Light, now: float) -> Memory:
     """Remember since when light has told the place, and since when it has contradicted the pose."""
     odd = light.agrees is False
-    memory = replace(memory, odd_since=(now if memory.odd_since is None else memory.odd_since) if odd else None)
+    memory = _odd(memory, (now if memory.odd_since is None else memory.odd_since) if odd else None)
     if light.moved or light.lost:
-        memory = replace(memory, doubt=True, lit_since=None, good=0, sure=False, recalled=False)
+        led = memory.led or light.moved
+        memory = replace(memory, doubt=True, lit_since=None, good=0, sure=False, recalled=False, led=led)
     if light.used and light.placed and not odd:
         begun = memory.lit_since is None or now - (memory.lit_last or now) > DARK_S
-        return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now)
+        led = memory.led and light.moved
+        return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now, led=led)
+    held = memory.state is State.TRACKING and not (memory.doubt or memory.led)
+    if light.fits and light.placed and not odd and held:
+        return replace(memory, lit_last=now)  # a second witness finds the pose that is held: that is not dark
     return memory
+
+
+def _odd(memory: Memory, since: float | None) -> Memory:
+    """Since when light has contradicted the pose; making a new memory costs more than looking whether it is one."""
+    return memory if since is memory.odd_since else replace(memory, odd_since=since)
 
 
 def _take_failed(memory: Memory) -> Memory:

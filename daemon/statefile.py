@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import msgspec
 
-from daemon.checkpoint import ROOT, Piece
+from daemon.restore import ROOT, Piece
 from daemon.wholefile import sync_folder
 
 MAGIC: Final = b"LUMISTAT"

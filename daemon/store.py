@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.config import MapConfig
-from daemon.sampleclock import state_folder
+from daemon.folders import maps_folder
 from daemon.store_file import BadMap, Damaged, Foreign
 from daemon.store_tables import OtherBuilding, Stored, against_survey, read
 from daemon.wholefile import sync_folder, write_whole
@@ -42,7 +42,6 @@ MOST_BROKEN: Final = 8
 """Files that a failing disk has spoilt while they were saved, kept for who wants to know."""
 START: Final = "start.lumimap"
 """File of a recording's folder: the map that the run began with."""
-MAPS: Final = "maps"
 """Folder below the state directory."""
 NEWEST: Final = 2
 OTHERS: Final = 7
@@ -102,7 +101,7 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
     """
     if not config.kept:
         return None, None
-    store = Store(folder_of(config.folder), mend)
+    store = Store(maps_folder(config.folder), mend)
     start = store.load(judge_for(lights))
     if start is None and config.localise:
         raise NoMap(
@@ -129,11 +128,6 @@ def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: boo
         raise Damaged(f"{path.name} is not the map that the recorded run began with")
     stored = read(content)
     return Start(content, stored, judge_for(lights)(stored)[1], localise)
-
-
-def folder_of(configured: str) -> Path:
-    """Where maps are kept."""
-    return Path(configured) if configured else state_folder() / MAPS
 
 
 class Store:
@@ -232,6 +226,12 @@ class Store:
                 stored.isolated,
             )
         return Start(content, stored, changed)
+
+    def refuse(self, error: BadMap) -> None:
+        """The map that was loaded cannot be used after all: say why, and get it out of the way."""
+        if self._origin is not None:
+            self._refuse(self._origin, error)
+            self._origin = None
 
     def _copy_aside(self, path: Path, content: bytes) -> Path:
         """Keep a torn map for who wants to know: what is saved next lacks a part of it."""

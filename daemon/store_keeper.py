@@ -123,6 +123,10 @@ class Keeper:
             _, news, closures = self._revision(state)
             self._saved = map_id, news, closures
 
+    def without_start(self) -> None:
+        """The run begins with no map after all, under another identity; of it, nothing is there to be saved yet."""
+        self._start, self._map_of = None, self._map_id()
+
     def loaded(self) -> None:
         """The estimator has been loaded: what it begins with need not be saved."""
         state = self._state()

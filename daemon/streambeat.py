@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from daemon.cycle import Cycle
@@ -33,6 +34,7 @@ class StreamBeat:
         faults: Callable[[], tuple[Fault, ...]],
     ) -> None:
         self._server, self._cycle, self._faults = server, cycle, faults
+        server.place = partial(place_of, state)
         self.tiles = server.tiles = MapTiles(state, server.on_tiles)
 
     async def run(self) -> None:
@@ -55,6 +57,16 @@ class StreamBeat:
             self.tiles.follow(loop)
         else:
             self.tiles.forget()
+
+
+def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:
+    """Where a keyframe lies in the map as corrected so far (m, m, rad); None where it is not kept any more."""
+    now = state()
+    frame = None if now is None else now.keyframes.get(keyframe)
+    if frame is None:
+        return None
+    x, y, yaw = frame.T_map_keyframe.tolist()
+    return x, y, yaw
 
 
 def figures(cycle: Cycle, t_mono: float) -> dict[str, object]:

@@ -127,7 +127,7 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
         CannotLoad: as for :func:`load`.
     """
     try:
-        mark = _mark(what)
+        mark = mark_of(what)
         if mark.exists():
             return
         begun, before = time.monotonic(), _compiled()
@@ -146,7 +146,7 @@ def _compiled() -> set[Path]:
     return set(CACHE_DIR.rglob("*.nbc"))
 
 
-def _mark(what: str) -> Path:
+def mark_of(what: str) -> Path:
     """The file that says that an earlier start has compiled all that this one needs."""
     from estimator.kernel import CACHE_DIR
 
@@ -159,7 +159,7 @@ def _load_locked(begun: float, lights: Lights | None) -> Warmth:
 
     with (CACHE_DIR / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        mark = _mark("warm" if lights is None else "warm-lights")
+        mark = mark_of("warm" if lights is None else "warm-lights")
         cold = not mark.exists()
         if cold:
             count = kernel_count(lights is not None)

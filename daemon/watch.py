@@ -27,6 +27,8 @@ READINGS: Final = 2560
 """Readings whose arrival is kept: of a window and more at 1 kHz."""
 FEWER: Final = 0.6
 """Part of the usual rate of readings below which they come more seldom than before."""
+LEAST_HZ: Final = 10.0
+"""Rate of readings that is asked for; less will do for a lidar that turns more slowly."""
 LEARNING: Final = 0.03
 """Weight of a window of readings in the usual rate: what lasts for a minute has become usual."""
 MISFIT_S: Final = 2.0
@@ -77,7 +79,10 @@ class Watch:
         self._arrived.append(reading.t_rx)
 
     def seldom(self, t_mono: float, period: float) -> bool:
-        """Whether odometry readings come more seldom than they used to, or than scans do; asked for once a second."""
+        """Whether odometry readings come more seldom than they used to, or than is asked for; asked for once a second.
+
+        What is asked for goes by the lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
+        """
         window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
         recent = sum(t_mono - t <= window for t in self._arrived)
         if not recent or t_mono - self._arrived[0] < window or window > 10.0 * WINDOW_S:
@@ -88,7 +93,7 @@ class Watch:
         elif t_mono - self._t_learned >= 0.5 * window:
             self._usual_hz += LEARNING * (hz - self._usual_hz)
             self._t_learned = t_mono
-        return hz < FEWER * self._usual_hz or hz * period < FEWER
+        return hz < FEWER * max(self._usual_hz, min(LEAST_HZ, 1.0 / period))
 
     def on_verdict(self, t_mono: float, memory: Memory, scans: bool) -> None:
         """A cycle has judged; ``scans``: they arrive."""

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from daemon import cli, warmup, whyplot, whysaid
 from daemon.config import Config
 from daemon.cycle import CycleRecord
+from daemon.folders import state_folder
 from daemon.replay import NOTHING_GIVEN, config_for, lights_for, start_for
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused
-from daemon.sampleclock import state_folder
 from daemon.sources import RecordingSource, Turn
 from daemon.whysaid import Moment
 from hal.errors import DataInvalid, HalError
@@ -34,6 +34,8 @@ FLIGHT: Final = "flight"
 """Folder below the state directory in which recordings are looked for where none is named."""
 BEFORE_S, AFTER_S = 20.0, 5.0
 """How much around the moment is looked at."""
+EVER_S: Final = 1e11
+"""Beyond the year 5000."""
 UNIX_S: Final = 1e8
 """A number of seconds beyond is since the Unix epoch, else since the recording began."""
 
@@ -102,12 +104,23 @@ def spans(folder: Path) -> list[Span]:
 def _span(path: Path) -> Span:
     recording = open_recording(path)
     source = RecordingSource(path)
-    header = recording.header
-    utc = float(header["t_utc"]) - float(header["t_mono"])
-    begin = float(header["t_mono"]) if source.begin is None else source.begin.t_mono
+    begun, utc = _begun(path, recording.header)
+    begin = begun if source.begin is None else source.begin.t_mono
     last = open_recording(recording.segments[-1])
     end = max((frame.t_mono for frame in last.frames(LogReport())), default=begin)
     return Span(path, utc + begin, utc + end, utc)
+
+
+def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:
+    """When a run began, on its monotonic clock, and the UTC at which that clock was zero."""
+    try:
+        t_mono, t_utc = float(header["t_mono"]), float(header["t_utc"])
+    except (KeyError, TypeError, ValueError) as error:
+        problem = "its head does not say when it began, so no moment can be found in it"
+        raise DataInvalid(str(path), problem, "replay it as a whole: lumiloop replay") from error
+    if not (abs(t_mono) < EVER_S and abs(t_utc) < EVER_S):  # not a number is neither
+        raise DataInvalid(str(path), "its head says no time that can be", "replay it as a whole: lumiloop replay")
+    return t_mono, t_utc - t_mono
 
 
 def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float]:

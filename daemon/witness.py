@@ -51,12 +51,21 @@ class Told:
         return away_m <= swing and away_rad <= FLOOR_RAD + PART_RAD * turned
 
 
+@dataclass(slots=True, eq=False)
+class _Seen:
+    """A pose of the laser; the ``wheels``' own at that instant once it was asked for, which nothing changes later."""
+
+    t_mono: float
+    T_odom_base: Array
+    wheels: Array | None = None
+
+
 class Witnesses:
     """Compares both motions; holds a few seconds of poses and nothing else."""
 
     def __init__(self) -> None:
         self._wheels: deque[tuple[float, Array]] = deque()
-        self._laser: deque[tuple[float, Array]] = deque()
+        self._laser: deque[_Seen] = deque()
         self._T_start_base = se2.identity()
 
     def restart(self) -> None:
@@ -78,8 +87,8 @@ class Witnesses:
         if not complete:
             self._laser.clear()
             return
-        self._laser.append((t_mono, T_odom_base))
-        while self._laser[-1][0] - self._laser[0][0] > 2.0 * WINDOW_S:
+        self._laser.append(_Seen(t_mono, T_odom_base))
+        while self._laser[-1].t_mono - self._laser[0].t_mono > 2.0 * WINDOW_S:
             self._laser.popleft()
 
     def agree(self) -> bool | None:
@@ -92,22 +101,28 @@ class Witnesses:
         span = self._span()
         if span is None:
             return None
-        (t_old, T_odom_old), (t_new, T_odom_new) = span
-        laser = se2.between(T_odom_old, T_odom_new)
-        wheels = se2.between(self._wheel_pose(t_old), self._wheel_pose(t_new))
-        return Told(t_new - t_old, laser, wheels)
+        old, new = span
+        laser = se2.between(old.T_odom_base, new.T_odom_base)
+        wheels = se2.between(self._wheels_at(old), self._wheels_at(new))
+        return Told(new.t_mono - old.t_mono, laser, wheels)
 
-    def _span(self) -> tuple[tuple[float, Array], tuple[float, Array]] | None:
+    def _span(self) -> tuple[_Seen, _Seen] | None:
         """Oldest and newest laser pose inside the window for which the wheels have spoken too."""
         if not self._wheels:
             return None
         first, last = self._wheels[0][0], self._wheels[-1][0]
         first = max(first, last - WINDOW_S)
-        oldest = next((pose for pose in self._laser if first <= pose[0] <= last), None)
-        newest = next((pose for pose in reversed(self._laser) if first <= pose[0] <= last), None)
-        if oldest is None or newest is None or newest[0] - oldest[0] < SHORTEST * WINDOW_S:
+        oldest = next((pose for pose in self._laser if first <= pose.t_mono <= last), None)
+        newest = next((pose for pose in reversed(self._laser) if first <= pose.t_mono <= last), None)
+        if oldest is None or newest is None or newest.t_mono - oldest.t_mono < SHORTEST * WINDOW_S:
             return None
         return oldest, newest
+
+    def _wheels_at(self, seen: _Seen) -> Array:
+        """The wheels' pose at the instant of a laser pose; looked up once, while it is among the newest."""
+        if seen.wheels is None:
+            seen.wheels = self._wheel_pose(seen.t_mono)
+        return seen.wheels
 
     def _wheel_pose(self, t_mono: float) -> Array:
         """The wheels' pose at an instant inside their history, at constant twist between two readings."""

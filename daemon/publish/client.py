@@ -13,12 +13,14 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from daemon.publish import integrity, lights, parts, pulse, registers
+from daemon.publish.block import Block
 from daemon.publish.points import U16, Value
+from daemon.publish.requests import BLOCKS
 from daemon.publish.snapshot import LightFix, LinkUse, Stage, State
 
 if TYPE_CHECKING:
@@ -88,26 +90,24 @@ class Reader:
                     "right HOST:PORT"
                 ) from error
             reading = self._reading(answer)
-            reading |= self._block(integrity.ADDRESS, integrity.BLOCK_WORDS, integrity.decode_integrity)
-            reading |= self._block(pulse.ADDRESS, pulse.BLOCK_WORDS, pulse.decode_pulse)
-            reading |= self._block(parts.ADDRESS, parts.BLOCK_WORDS, parts.decode_parts)
-            if reading["links"] is not None:
-                reading |= self._block(lights.ADDRESS, lights.BLOCK_WORDS, lights.decode_lights)
+            for block in BLOCKS:
+                if block is not lights.BLOCK or reading["links"] is not None:
+                    reading |= self._block(block)
             return reading
         raise NoAnswer(
             f"{self._where}: no answer within {_TRIES * _TIMEOUT_S:g} s; check that the daemon runs, that its `bind` "
             "is not the loopback address of another computer, and that no firewall drops UDP"
         )
 
-    def _block(self, address: int, words: int, decode: Callable[[bytes], Reading]) -> Reading:
+    def _block(self, block: Block) -> Reading:
         """A block beside the first one; nothing where the daemon is of a version without it."""
         for _ in range(_TRIES):
             with contextlib.suppress(OSError):
-                answer = self._ask(address, words)
+                answer = self._ask(block.address, block.registers)
                 if len(answer) == _ANSWER.size and answer[7] & 0x80:
                     return {}  # no such block
                 with contextlib.suppress(ValueError):
-                    reading = decode(answer[_ANSWER.size :])
+                    reading = block.decode(answer[_ANSWER.size :])
                     del reading["seq"]
                     return reading
         return {}

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping
+import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from daemon.health import FAULTS
 from daemon.publish import holding, integrity, lights, modbus, parts, pulse, registers, requests
+from daemon.publish.block import Block
 from daemon.publish.document_udp import udp_page
 from daemon.publish.holding import CommandCode
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
-from daemon.publish.rtu import SILENCE_S
+from daemon.publish.rtu import PATIENCE_S, SILENCE_S
 from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
 from daemon.publish.tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, table
 from daemon.reasons import REASONS
@@ -47,6 +48,25 @@ def _codes() -> str:
 
 {table(("bit", "name", "set when"), bit_rows(registers.DEVICES))}
 """
+
+
+def _span(block: Block) -> tuple[int, int]:
+    return block.address, block.address + block.registers - 1
+
+
+def _whole(block: Block, rows: Sequence[tuple[str, ...]] = ()) -> str:
+    """The table of a block from its magic to its end; `rows` stand in for its points where they repeat."""
+    first, last = _span(block)
+    tag = block.magic.to_bytes(2, "big").decode()
+    return table(
+        ("address", "name", "type", "step", "not known", "meaning"),
+        [
+            (str(first), "`magic`", "uint16", "", "", f'0x{block.magic:04X} ("{tag}").'),
+            (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {block.version}."),
+            *(rows or layout_rows(block, block.body, 1)),
+            (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
+        ],
+    )
 
 
 def modbus_page() -> str:
@@ -117,34 +137,32 @@ def _serial() -> str:
 `modbus.serial = "/dev/ttyUSB1@115200#1"`: the line, its rate, our unit. Without a rate it is 19200 bit/s; characters
 are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2). An answer goes
 out 3.5 characters after its request at the earliest; a request that pauses for more than {1e3 * SILENCE_S:g} ms is
-given up. What is sent to unit 0 is carried out and not answered. Adapters that echo are fine. A reference client is
-`tools/clients/read_rtu.py`. Try it with
+given up. What is sent to unit 0 is carried out and not answered. Adapters that echo are fine.
+
+Let the master wait for half a second or more. A request that this computer had no time for within {1e3 * PATIENCE_S:g}
+ms, or that the master's next one has overtaken, is neither carried out nor answered: the answer would collide with the
+next request. So a request without an answer has done nothing, or its answer was lost; ask again.
+
+A reference client is `tools/clients/read_rtu.py`. Try it with
 `mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0` from the other end, and with
 `mbpoll -m tcp -p 1502 -t 3 -0 -r 0 -c 64 HOST` over the network.
 """
 
 
 def _lights() -> str:
-    first, width = lights.ADDRESS, lights.ROW_WORDS
-    last = first + lights.BLOCK_WORDS - 1
-    head = [row for row in layout_rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if not row[1].startswith("`link_")]
-    start = lights.BODY_ADDRESS + lights.BLOCK.offsets[len(head)]
-    rows = [row for row in layout_rows(lights.BLOCK, lights.BODY_ADDRESS, 1) if row[1].startswith("`link_1_")]
-    block = [
-        (str(first), "`magic`", "uint16", "", "", f"0x{lights.MAGIC:04X} (\"LI\")."),
-        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {lights.VERSION}."),
-        *head,
-        *rows,
-        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
-    ]  # fmt: skip
-    words, links = lights.BLOCK_WORDS, lights.ROWS
+    first, last = _span(block := lights.BLOCK)
+    every = layout_rows(block, block.body, 1)
+    head = [row for row in every if not row[1].startswith("`link_")]
+    one = [row for row in every if row[1].startswith("`link_1_")]
+    start, width = block.body + block.offsets[len(head)], lights.ROW_WORDS
+    words, links = block.registers, lights.ROWS
     return f"""## Lights: input registers {first} to {last}
 
 The lamps in view, strongest first, and the position from lights alone, which the laser never touches. Read
 **{words} registers from address {first} in one request**. There are {links} links, the strongest first; link k
 begins at {start} + {width} (k - 1), and the table shows the first.
 
-{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+{_whole(block, [*head, *one])}
 
 {table(("`light_fix`", "name", "meaning"), [(str(fix.value), fix.name, FIXES[fix]) for fix in LightFix])}
 
@@ -153,20 +171,13 @@ begins at {start} + {width} (k - 1), and the table shows the first.
 
 
 def _integrity() -> str:
-    first = integrity.ADDRESS
-    last = first + integrity.BLOCK_WORDS - 1
-    block = [
-        (str(first), "`magic`", "uint16", "", "", f"0x{integrity.MAGIC:04X} (\"LP\")."),
-        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {integrity.VERSION}."),
-        *layout_rows(integrity.BLOCK, integrity.BODY_ADDRESS, 1),
-        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
-    ]  # fmt: skip
+    first, last = _span(block := integrity.BLOCK)
     return f"""## Integrity: input registers {first} to {last}
 
 How far the pose can be trusted; what a protection level is, and at which risk it holds, says
-[Integrity](integrity.md). Read **{integrity.BLOCK_WORDS} registers from address {first} in one request**.
+[Integrity](integrity.md). Read **{block.registers} registers from address {first} in one request**.
 
-{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+{_whole(block)}
 
 {table(("bit of `witnesses`", "name", "set when"), bit_rows(integrity.WITNESSES))}
 
@@ -175,40 +186,26 @@ How far the pose can be trusted; what a protection level is, and at which risk i
 
 
 def _pulse() -> str:
-    first = pulse.ADDRESS
-    last = first + pulse.BLOCK_WORDS - 1
-    block = [
-        (str(first), "`magic`", "uint16", "", "", f"0x{pulse.MAGIC:04X} (\"LC\")."),
-        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {pulse.VERSION}."),
-        *layout_rows(pulse.BLOCK, pulse.BODY_ADDRESS, 1),
-        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
-    ]  # fmt: skip
+    first, last = _span(block := pulse.BLOCK)
     return f"""## The cycle: input registers {first} to {last}
 
 What the daemon leaves out where the computer is too slow, how long the stages of a cycle take, and when it stood still.
-Medians and the like are those of the last half minute to minute. Read **{pulse.BLOCK_WORDS} registers from address
+Medians and the like are those of the last half minute to minute. Read **{block.registers} registers from address
 {first} in one request**.
 
-{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+{_whole(block)}
 """
 
 
 def _parts() -> str:
-    first = parts.ADDRESS
-    last = first + parts.BLOCK_WORDS - 1
-    block = [
-        (str(first), "`magic`", "uint16", "", "", f"0x{parts.MAGIC:04X} (\"LF\")."),
-        (str(first + 1), "`version`", "uint16", "", "", f"Version of this table: {parts.VERSION}."),
-        *layout_rows(parts.BLOCK, parts.BODY_ADDRESS, 1),
-        (str(last - 1), "`seq_end`", "uint32", "", "", "The same as `seq`: the block was read whole."),
-    ]  # fmt: skip
+    first, last = _span(block := parts.BLOCK)
     return f"""## The parts: input registers {first} to {last}
 
 Every fault that is present, not the gravest alone, what had to be restarted since the start, and for how long the
-daemon runs: an uptime that begins anew tells of a restart. Read **{parts.BLOCK_WORDS} registers from address {first}
+daemon runs: an uptime that begins anew tells of a restart. Read **{block.registers} registers from address {first}
 in one request**. Faults are looked for once a second.
 
-{table(("address", "name", "type", "step", "not known", "meaning"), block)}
+{_whole(block)}
 
 {table(("bit of `hanging`", "name", "what hangs, and what then"), _thread_rows())}
 """
@@ -289,5 +286,14 @@ def write(folder: Path) -> None:
         (folder / name).write_text(text)
 
 
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m daemon.publish.document", description=f"Write {' and '.join(pages())} from the daemon's tables."
+    )
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where to; docs, unless given")
+    write(parser.parse_args().folder)
+
+
 if __name__ == "__main__":
-    write(Path(sys.argv[1] if len(sys.argv) > 1 else "docs"))
+    main()

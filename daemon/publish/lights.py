@@ -10,17 +10,14 @@ The block is only put together when somebody reads it; most clients never do.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
 from operator import attrgetter
 from typing import Final
 
+from daemon.publish.block import Block
 from daemon.publish.points import I16, I32, U16, U32, Layout, Point, Rule, Value
 from daemon.publish.snapshot import LightFix, LinkUse, Snapshot
 
-VERSION: Final = 1
-MAGIC: Final = 0x4C49  # "LI"
-ADDRESS: Final = 200
 ROWS: Final = 16
 """Links shown, the strongest."""
 
@@ -108,10 +105,9 @@ def _row(row: int) -> tuple[Point, ...]:
     )  # fmt: skip
 
 
-BLOCK: Final = Layout(
+BLOCK: Final = Block(
+    "lights", 200, "LI", 1,
     (
-        Point("seq", "snapshot number", U32, attrgetter("seq"), "The same as in the first block.", rule=Rule.WRAP,
-              can_be_unknown=False),
         *_estimate(),
         Point("light_floor", "diffuse light", U16, _light("floor"), "Part of a lamp's own strength below it.", 10_000),
         Point("sample_clock", "error of the sample clock", I16, _light("clock_ppm"), "Parts per million; not known "
@@ -121,37 +117,7 @@ BLOCK: Final = Layout(
         Point("blocks_lost", "blocks without use", U32, _count("blocks_lost"), "Dropped, damaged, or without a cycle "
               "that could take them, since the start.", rule=Rule.WRAP, can_be_unknown=False),
         *(point for row in range(ROWS) for point in _row(row)),
-    )
+    ),
 )  # fmt: skip
 ROW_WORDS: Final = sum(point.wire.words for point in _row(0))
 TAIL: Final = Layout(_estimate())
-
-_HEAD: Final = struct.Struct(">HH")
-_END: Final = struct.Struct(">I")
-BODY_ADDRESS: Final = ADDRESS + _HEAD.size // 2
-BLOCK_WORDS: Final = BLOCK.words + (_HEAD.size + _END.size) // 2
-
-
-def encode_lights(snapshot: Snapshot) -> bytes:
-    """The input registers at :data:`ADDRESS` (big-endian)."""
-    raw = BLOCK.raw(snapshot)
-    return _HEAD.pack(MAGIC, VERSION) + BLOCK.big.pack(*raw) + _END.pack(raw[0])
-
-
-def decode_lights(block: bytes) -> dict[str, Value]:
-    """Values by name from the block.
-
-    Raises:
-        ValueError: not this block, a version this decoder does not know, or torn (seq differs at its ends).
-    """
-    if len(block) != 2 * BLOCK_WORDS:
-        raise ValueError(f"the block of lights has {BLOCK_WORDS} registers, got {len(block) / 2:g}")
-    magic, version = _HEAD.unpack_from(block)
-    if magic != MAGIC or version != VERSION:
-        known = f"this reader knows {MAGIC:#06x} and {VERSION}"
-        raise ValueError(f"magic {magic:#06x} and version {version} of the block of lights; {known}")
-    raw = BLOCK.big.unpack_from(block, _HEAD.size)
-    (seq_end,) = _END.unpack_from(block, len(block) - _END.size)
-    if raw[0] != seq_end:
-        raise ValueError(f"torn block: seq is {raw[0]} at its begin and {seq_end} at its end; read it in one request")
-    return BLOCK.values(raw)

@@ -22,11 +22,7 @@ from typing import Final
 
 from daemon.publish import registers
 from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
-from daemon.publish.integrity import encode_integrity
-from daemon.publish.lights import encode_lights
-from daemon.publish.parts import encode_parts
-from daemon.publish.pulse import encode_pulse
-from daemon.publish.requests import MAX_FRAME, Responder, frame_size
+from daemon.publish.requests import BLOCKS, MAX_FRAME, Responder, frame_size
 from daemon.publish.snapshot import Snapshot, State
 from hal import inet
 from hal.arrival import STAMP_SPACE, kernel_age, stamp_arrivals
@@ -367,12 +363,11 @@ class ModbusPublisher:
             raise inet.refusal(f"Modbus on {bind or '*'}:{port}", "modbus.port", port, error) from error
 
     async def _listen(self, tcp: TcpEndpoint, address: inet.Address) -> None:
-        family, (host, port) = address
-        stream = inet.listening((family, (host, self.port or port)), socket.SOCK_STREAM)
+        stream = inet.listening(inet.with_port(address, self.port or address[1][1]), socket.SOCK_STREAM)
         with contextlib.ExitStack() as undo:
             undo.callback(stream.close)
             self.port = int(stream.getsockname()[1])
-            datagrams = inet.listening((family, (host, self.port)), socket.SOCK_DGRAM)
+            datagrams = inet.listening(inet.with_port(address, self.port), socket.SOCK_DGRAM)
             undo.callback(datagrams.close)
             datagrams.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
             await tcp.listen(stream)
@@ -382,7 +377,7 @@ class ModbusPublisher:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; never waits."""
-        encoders = (registers.encode_mirror, encode_lights, encode_integrity, encode_pulse, encode_parts)
+        encoders = (registers.encode_mirror, *(block.encode for block in BLOCKS))
         self._responder.show(registers.encode_block(snapshot), *[partial(encode, snapshot) for encode in encoders])
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:

@@ -7,17 +7,14 @@ The contract is that of the other tables: under the same version a point never m
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from operator import attrgetter
 from typing import Final
 
-from daemon.publish.points import U16, U32, Layout, Point, Rule, Value
+from daemon.publish.block import Block
+from daemon.publish.points import U16, U32, Point, Rule, Value
 from daemon.publish.snapshot import NO_CONDITION, Condition, Part, Snapshot, Thread
 
-VERSION: Final = 1
-MAGIC: Final = 0x4C46  # "LF": LP is the block of the protection level
-ADDRESS: Final = 400
 FAULTS: Final = 12
 """Faults that are named; more are only counted."""
 
@@ -93,40 +90,4 @@ POINTS: Final = (
           can_be_unknown=False),
 )  # fmt: skip
 
-BLOCK: Final = Layout(
-    (
-        Point("seq", "snapshot number", U32, attrgetter("seq"), "The same as in the first block.", rule=Rule.WRAP,
-              can_be_unknown=False),
-        *POINTS,
-    )
-)  # fmt: skip
-
-_HEAD: Final = struct.Struct(">HH")
-_END: Final = struct.Struct(">I")
-BODY_ADDRESS: Final = ADDRESS + _HEAD.size // 2
-BLOCK_WORDS: Final = BLOCK.words + (_HEAD.size + _END.size) // 2
-
-
-def encode_parts(snapshot: Snapshot) -> bytes:
-    """The input registers at :data:`ADDRESS` (big-endian)."""
-    raw = BLOCK.raw(snapshot)
-    return _HEAD.pack(MAGIC, VERSION) + BLOCK.big.pack(*raw) + _END.pack(raw[0])
-
-
-def decode_parts(block: bytes) -> dict[str, Value]:
-    """Values by name from the block.
-
-    Raises:
-        ValueError: not this block, a version this decoder does not know, or torn (seq differs at its ends).
-    """
-    if len(block) != 2 * BLOCK_WORDS:
-        raise ValueError(f"the block of the parts has {BLOCK_WORDS} registers, got {len(block) / 2:g}")
-    magic, version = _HEAD.unpack_from(block)
-    if magic != MAGIC or version != VERSION:
-        known = f"this reader knows {MAGIC:#06x} and {VERSION}"
-        raise ValueError(f"magic {magic:#06x} and version {version} of the block of the parts; {known}")
-    raw = BLOCK.big.unpack_from(block, _HEAD.size)
-    (seq_end,) = _END.unpack_from(block, len(block) - _END.size)
-    if raw[0] != seq_end:
-        raise ValueError(f"torn block: seq is {raw[0]} at its begin and {seq_end} at its end; read it in one request")
-    return BLOCK.values(raw)
+BLOCK: Final = Block("the parts", 400, "LF", 1, POINTS)

@@ -47,13 +47,9 @@ _READ_ANSWER: Final = struct.Struct(">HHHBBB")
 _FIXED_BODY: Final = 5  # function, address, count or value
 
 Make = Callable[[], bytes]
-_BESIDE: Final = (
-    (MIRROR_ADDRESS, MIRROR_WORDS),
-    (lights.ADDRESS, lights.BLOCK_WORDS),
-    (integrity.ADDRESS, integrity.BLOCK_WORDS),
-    (pulse.ADDRESS, pulse.BLOCK_WORDS),
-    (parts.ADDRESS, parts.BLOCK_WORDS),
-)
+BLOCKS: Final = (lights.BLOCK, integrity.BLOCK, pulse.BLOCK, parts.BLOCK)
+"""The blocks of their own, by address."""
+_BESIDE: Final = ((MIRROR_ADDRESS, MIRROR_WORDS), *((block.address, block.registers) for block in BLOCKS))
 """First address and size of the blocks beside the first one, in the order in which they are shown."""
 
 

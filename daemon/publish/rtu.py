@@ -3,6 +3,8 @@
 * An answer goes out 3.5 characters after its request at the earliest, as the standard asks: a half-duplex master needs
   that time to let the line go.
 * What the line sends back of our own answers (adapters with echo) is no request.
+* A request for which this computer had no time until its master has given up is neither carried out nor answered: the
+  answer would collide with the master's next request.
 * Nothing waits: an answer that the line does not take is dropped, and the line is opened anew.
 """
 
@@ -21,6 +23,12 @@ SILENCE_S: Final = 0.05
 """Without a byte for so long, a request that has begun does not end any more; USB adapters pause for up to 16 ms."""
 ECHO_S: Final = 0.005
 """Our own answer may come back this long after its last bit; no master asks again that soon."""
+PATIENCE_S: Final = 0.3
+"""A request older than this is given up by its master, or soon will be; masters wait for half a second or more."""
+TURN_S: Final = 0.05
+"""The loop tells this often that it has time for the line."""
+STRAY: Final = 2
+"""Bytes that a line driver may add where the direction changes; more of them are the master's next request."""
 _FAST: Final = 19200
 _FAST_GAP_S: Final = 0.00175
 _CHARACTER: Final = 11.0  # bits
@@ -61,11 +69,11 @@ class RtuServer:
         opener: opens it.
 
     Attributes:
-        requests, unsent: answered, and answers that the line did not take.
+        requests, unsent: answered, and answers that the line did not take. late: given up, for lack of time.
     """
 
     def __init__(self, line: RtuLine, answer: Answer, opener: LineOpener = open_line) -> None:
-        self.requests = self.unsent = 0
+        self.requests = self.unsent = self.late = 0
         self.frames = RtuFrames(line.unit)
         self._line = line
         self._answer = answer
@@ -75,6 +83,8 @@ class RtuServer:
         self._sent = b""
         self._echo_until = 0.0
         self._going: asyncio.TimerHandle | None = None
+        self._turn: asyncio.TimerHandle | None = None
+        self._free = 0.0
 
     async def run(self) -> None:
         """Serve until cancelled.
@@ -85,37 +95,60 @@ class RtuServer:
         lost: asyncio.Future[HalError] = asyncio.get_running_loop().create_future()
         self._port = await self._opener(self._line.path, self._line.baud, style=self._line.format)
         try:
+            self._turns()
             self._port.start(self._take, lost.set_result)
             raise await lost
         finally:
-            if self._going is not None:
-                self._going.cancel()
+            for timer in (self._going, self._turn):
+                if timer is not None:
+                    timer.cancel()
             self.frames.forget()
             self._port.close()
             self._port = None
+
+    def _turns(self) -> None:
+        """Whatever comes after this was not there before it."""
+        loop = asyncio.get_running_loop()
+        self._free = loop.time()
+        self._turn = loop.call_later(TURN_S, self._turns)
 
     def _take(self, data: bytes, t_rx: float) -> None:
         if t_rx - self._heard > SILENCE_S:
             self.frames.forget()
         self._heard = t_rx
+        if self._going is not None and len(data) > STRAY:  # the master does not wait for it any more
+            self._give_up()
+        late = t_rx - self._free > PATIENCE_S
         for unit, body in self.frames.take(data):
             if t_rx <= self._echo_until and framed(unit, body) == self._sent:
                 continue  # the answer to a write of one register is its request again
+            if late and unit != BROADCAST:  # what is for all is not answered, nor repeated
+                self.late += 1
+                continue
             self.requests += 1
             answer = self._answer(body)
             if unit != BROADCAST:
-                self._send_soon(framed(unit, answer))
+                self._send_soon(framed(unit, answer), t_rx)
 
-    def _send_soon(self, frame: bytes) -> None:
-        """Once the master has let the line go; it waits for no more than one answer."""
+    def _give_up(self) -> None:
         if self._going is not None:
             self._going.cancel()
-        gap = _FAST_GAP_S if self._line.baud > _FAST else 3.5 * _CHARACTER / self._line.baud
-        self._going = asyncio.get_running_loop().call_later(gap, self._send, frame)
+            self._going = None
+            self.late += 1
 
-    def _send(self, frame: bytes) -> None:
+    def _send_soon(self, frame: bytes, asked: float) -> None:
+        """Once the master has let the line go; it waits for no more than one answer, and for that not for ever."""
+        self._give_up()
+        gap = _FAST_GAP_S if self._line.baud > _FAST else 3.5 * _CHARACTER / self._line.baud
+        self._going = asyncio.get_running_loop().call_later(gap, self._send, frame, asked)
+
+    def _send(self, frame: bytes, asked: float) -> None:
+        now = asyncio.get_running_loop().time()
         self._going = None
         if self._port is None:
+            return
+        if now - asked > PATIENCE_S:
+            self.late += 1
             return
         try:
             self._port.write(frame)
@@ -123,5 +156,4 @@ class RtuServer:
             self.unsent += 1  # a line that is gone tells so itself
             return
         self._sent = frame
-        now = asyncio.get_running_loop().time()
         self._echo_until = now + _CHARACTER * len(frame) / self._line.baud + ECHO_S

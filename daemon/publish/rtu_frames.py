@@ -61,37 +61,52 @@ class RtuFrames:
         self.skipped = 0
         self._unit = unit
         self._data = bytearray()
+        self._open: list[int] = []  # where requests may begin that are not whole yet
+        self._next = 0  # from here on nothing has been looked at
 
     def forget(self) -> None:
         """Drop what has been collected: the line was silent, so no request is still on its way."""
-        self.skipped += len(self._data)
-        self._data.clear()
+        self._skip(len(self._data))
 
     def take(self, data: bytes) -> list[tuple[int, bytes]]:
-        """The requests that are whole with these bytes: unit as addressed, and the function's body."""
+        """The requests that are whole with these bytes: unit as addressed, and the function's body.
+
+        Each place is judged once, when all of the request is there that may begin at it.
+        """
         self._data += data
         found: list[tuple[int, bytes]] = []
-        at, keep = 0, -1
-        while at < len(self._data):
-            size = _size(self._data, at) if self._data[at] in (self._unit, BROADCAST) else -1
-            if size == 0 or at + size > len(self._data):  # still coming
-                keep = at if keep < 0 else keep
-            elif size >= _SHORTEST and self._good(at, size):
-                found.append((self._data[at], bytes(self._data[at + 1 : at + size - _CRC])))
-                self.skipped += at
-                del self._data[: at + size]
-                at, keep = 0, -1
-                continue
-            at += 1
-        self._drop(len(self._data) if keep < 0 else keep)
+        while (frame := self._first()) is not None:
+            at, size = frame
+            found.append((self._data[at], bytes(self._data[at + 1 : at + size - _CRC])))
+            self.skipped -= size
+            self._skip(at + size)
+        keep = self._open[0] if self._open else len(self._data)
+        self._skip(max(keep, len(self._data) - MAX_FRAME))
         return found
+
+    def _first(self) -> tuple[int, int] | None:
+        """Place and size of the first request that is whole; what is not looked at again is let go of."""
+        waiting, self._open = self._open, []
+        while waiting or self._next < len(self._data):
+            if waiting:
+                at = waiting.pop(0)
+            else:
+                at, self._next = self._next, self._next + 1
+            size = _size(self._data, at) if self._data[at] in (self._unit, BROADCAST) else -1
+            if size == 0 or at + size > len(self._data):
+                self._open.append(at)
+            elif size >= _SHORTEST and self._good(at, size):
+                self._open += waiting
+                return at, size
+        return None
+
+    def _skip(self, count: int) -> None:
+        """Let go of what can be no part of a request any more."""
+        self.skipped += count
+        del self._data[:count]
+        self._open = [at - count for at in self._open if at >= count]
+        self._next = max(self._next - count, 0)
 
     def _good(self, at: int, size: int) -> bool:
         end = at + size - _CRC
         return FramerRTU.compute_CRC(bytes(self._data[at:end])) == int.from_bytes(self._data[end : end + _CRC], "big")
-
-    def _drop(self, count: int) -> None:
-        """Let go of what can be no part of a request any more."""
-        count = max(count, len(self._data) - MAX_FRAME)
-        self.skipped += count
-        del self._data[:count]

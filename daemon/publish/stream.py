@@ -29,6 +29,8 @@ from hal.lidar import VALID, RawScan
 
 log = logging.getLogger(__name__)
 
+Place = Callable[[int], tuple[float, float, float] | None]
+
 SCHEMA: Final = 1
 """Version of all that follows. A field never changes its meaning under the same number; readers skip unknown ones."""
 
@@ -40,7 +42,7 @@ LATEST: Final = {
 }
 """Topics of which a slow client gets the latest only."""
 ONCE: Final = {
-    "state": "a change of state or reason, with meaning and remedy",
+    "state": "at first and at a change: state and reason, with meaning and remedy",
     "loop": "a loop closed: counter, both keyframes, residual, reason",
     "faults": "at first and at a change: all that are present, with meaning and remedy",
 }
@@ -77,15 +79,20 @@ def framed(message: Mapping[str, object]) -> bytes:
 
 def scan_message(scan: RawScan) -> dict[str, object]:
     """A scan in SI units: bearings in rad from the lidar's front axis, counter-clockwise, evenly spaced."""
-    bearing = scan.geometry.bearings(scan.first_step, scan.stride, 2)
+    geometry = scan.geometry
+    bearing = geometry.bearings(scan.first_step, scan.stride, 2)
     valid = scan.code == VALID
-    ranges = np.where(valid, scan.ranges * scan.geometry.range_unit_m, np.nan).astype("<f4")
+    ranges = np.where(valid, scan.ranges * geometry.range_unit_m, np.nan).astype("<f4")
     return {
         "seq": scan.seq,
         "t_mono": scan.t_mono,
         "bearing_first": float(bearing[0]),
         "bearing_step": float(bearing[1] - bearing[0]),
         "ranges": ranges.tobytes(),
+        "range_min": geometry.dmin * geometry.range_unit_m,
+        "range_max": geometry.dmax * geometry.range_unit_m,
+        "beam_dt": geometry.beam_dt_s * scan.stride,
+        "period": geometry.period_s,
     }
 
 
@@ -94,6 +101,7 @@ class StreamServer:
 
     Attributes:
         clients: that are connected. tiles: of the map; None: there are none.
+        place: where a keyframe lies in the map, by ID; None: it is not known.
 
     Args:
         path: of the socket; its folder is made. name: of the robot.
@@ -105,11 +113,10 @@ class StreamServer:
         self.clients: set[Client] = set()
         self._name = name
         self._explain = explain
-        self._state: tuple[int, int] | None = None
-        self._loops = 0
-        self._map_id = 0
+        self._latest: Snapshot | None = None
         self._faults: list[dict[str, object]] = []
         self.tiles: MapTiles | None = None
+        self.place: Place = _nowhere
 
     async def run(self) -> None:
         """Serve until cancelled.
@@ -155,17 +162,20 @@ class StreamServer:
 
     def publish(self, snapshot: Snapshot) -> None:
         """Tell a snapshot; a sink of the cycle."""
+        before, self._latest = self._latest, snapshot
         if self.clients:
-            meaning, remedy = self._explain(snapshot.reason)
-            told = {"state_name": snapshot.state.name, "meaning": meaning, "remedy": remedy}
+            told = self._told(snapshot)
             self._tell("pose", lambda: {**told, **_fields(snapshot)})
             self._tell("lights", lambda: {} if snapshot.light is None else _fields(snapshot.light))
-            if (snapshot.state, snapshot.reason) != self._state:
-                self._tell("state", lambda: {"t_mono": snapshot.t_mono, "state": snapshot.state, **told})
-            if snapshot.loop_counter != self._loops:
-                self._tell("loop", lambda: _loop(snapshot))
-        self._state, self._loops = (snapshot.state, snapshot.reason), snapshot.loop_counter
-        self._map_id = snapshot.map_id
+            if before is None or (snapshot.state, snapshot.reason) != (before.state, before.reason):
+                self._tell("state", lambda: _state(snapshot, told))
+            if snapshot.loop_counter != (0 if before is None else before.loop_counter):
+                self._tell("loop", lambda: _loop(snapshot, self.place))
+
+    def _told(self, snapshot: Snapshot) -> dict[str, object]:
+        """The state in words."""
+        meaning, remedy = self._explain(snapshot.reason)
+        return {"state_name": snapshot.state.name, "meaning": meaning, "remedy": remedy}
 
     def on_scan(self, scan: RawScan) -> None:
         """Tell a scan."""
@@ -201,6 +211,8 @@ class StreamServer:
 
     def welcome(self, client: Client, fresh: frozenset[str]) -> None:
         """A client wants these from now on: it is told how things stand."""
+        if "state" in fresh and (snapshot := self._latest) is not None:
+            client.tell("state", _encode(_state(snapshot, self._told(snapshot))))
         if "faults" in fresh:
             client.tell("faults", _encode({"t_mono": None, "present": self._faults}))
         if "map" in fresh:
@@ -218,7 +230,7 @@ class StreamServer:
             now, tiles = tiles[:count], tiles[count:]
             client.shown = now[-1][0]
             message = {
-                "map_id": self._map_id,
+                "map_id": 0 if self._latest is None else self._latest.map_id,
                 "resolution": RESOLUTION_M,
                 "side": SIDE,
                 "unit": UNIT,
@@ -377,7 +389,15 @@ def _samples(block: RawSamples) -> dict[str, object]:
     }
 
 
-def _loop(snapshot: Snapshot) -> dict[str, object]:
+def _nowhere(keyframe: int) -> None:
+    return None
+
+
+def _state(snapshot: Snapshot, told: Mapping[str, object]) -> dict[str, object]:
+    return {"t_mono": snapshot.t_mono, "state": snapshot.state, **told}
+
+
+def _loop(snapshot: Snapshot, place: Place) -> dict[str, object]:
     return {
         "t_mono": snapshot.t_mono,
         "counter": snapshot.loop_counter,
@@ -385,4 +405,6 @@ def _loop(snapshot: Snapshot) -> dict[str, object]:
         "keyframe_old": snapshot.loop_old,
         "reason": snapshot.loop_reason,
         "residual": snapshot.loop_residual,
+        "at_new": None if snapshot.loop_new is None else place(snapshot.loop_new),
+        "at_old": None if snapshot.loop_old is None else place(snapshot.loop_old),
     }

@@ -22,6 +22,7 @@ from enum import IntEnum
 from functools import partial
 from typing import Any, Final
 
+from daemon.logs import Sparing
 from hal import inet
 from hal.share import Reader, Share
 
@@ -31,12 +32,14 @@ SUBSCRIBERS: Final = 16
 LONGEST_LEASE_S: Final = 60
 COOKIE_S: Final = 120.0
 """A cookie is good for one to two of these."""
-_BODY: Final = struct.Struct("<4sHHHHQ")
+LAYOUT: Final = (
+    ("magic", "4s"), ("version", "H"), ("length", "H"), ("status", "H"), ("lease", "H"), ("cookie", "Q"),
+)  # fmt: skip
+"""Fields before the CRC-32, little-endian, of a request and of its answer (codes of the `struct` module)."""
+_BODY: Final = struct.Struct("<" + "".join(code for _, code in LAYOUT))
 _CRC: Final = struct.Struct("<I")
 SIZE: Final = _BODY.size + _CRC.size
 _PER_TURN: Final = 8
-_SAY_S: Final = 10.0
-"""Who comes and goes is told this often at most: one who does so all the time must not fill the log."""
 
 log = logging.getLogger(__name__)
 
@@ -145,7 +148,7 @@ class Subscriptions:
         self._allowed = allowed
         self._sock: socket.socket | None = None
         self._reader: Reader | None = None
-        self._say_at = 0.0
+        self._lines = Sparing(log, lines=1)  # one who comes and goes all the time must not fill the log
 
     @property
     def port(self) -> int:
@@ -206,6 +209,6 @@ class Subscriptions:
             before = len(self.leases)
             if (answer := self.leases.answer(peer, message, now)) is not None:
                 self._send(sock, encode(answer), peer)
-            if len(self.leases) != before and now >= self._say_at:
-                self._say_at = now + _SAY_S
-                log.info("pose datagrams: %d subscribers, last heard of %s:%d", len(self.leases), *peer[:2])
+            if (count := len(self.leases)) != before:
+                last = f"last heard of {peer[0]}:{peer[1]}"
+                self._lines.say(now, logging.INFO, f"pose datagrams: {count} subscribers, {last}")

@@ -13,15 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from daemon.endpoints import parse_endpoint
 from daemon.publish import registers
 from daemon.publish.snapshot import Snapshot
 from daemon.publish.subscribe import Subscriptions
 from hal import inet
-from hal.errors import DeviceMissing, DeviceRefused
+from hal.errors import DeviceMissing
 
 RETRY_S: Final = 5.0  # a name that could not be looked up (the network often comes up after the robot's programs)
 REFRESH_S: Final = 300.0  # a name's address may move to another computer
-_MAX_PORT: Final = 65_535
 
 log = logging.getLogger(__name__)
 
@@ -44,39 +44,25 @@ class Receiver:
     reachable: bool = True
 
 
-def parse_receiver(text: str) -> Receiver:
-    """A receiver from `host:port` or `[IPv6]:port`.
-
-    Raises:
-        DeviceRefused: not of that form.
-    """
-    host, colon, port = text.rpartition(":")
-    bracketed = host.startswith("[") and host.endswith("]")
-    good = colon and host and port.isascii() and port.isdigit() and 0 < int(port) <= _MAX_PORT
-    if not good or (":" in host and not bracketed):
-        raise DeviceRefused(f"pose receiver {text!r}", "not a receiver", "write host:port, as in 192.168.0.20:15020")
-    return Receiver(text, host[1:-1] if bracketed else host, int(port))
-
-
 class PoseSender:
     """Sends each snapshot as one datagram to every receiver.
 
     Args:
-        receivers: `host:port` each.
+        receivers: as `daemon.endpoints.parse_endpoint` takes them.
         interface: address of this computer from which groups are sent to; empty: as the system routes them.
         subscriptions: who has asked for datagrams; None: nobody can.
 
     Raises:
-        DeviceRefused: a receiver that is not of that form.
+        ValueError: a receiver that is not of that form.
     """
 
     def __init__(
         self, receivers: Sequence[str], interface: str = "", subscriptions: Subscriptions | None = None
     ) -> None:
-        self.receivers = [parse_receiver(text) for text in receivers]
+        self.receivers = [Receiver(text, *parse_endpoint(text)) for text in receivers]
         self._interface = interface
         self._subscriptions = subscriptions
-        self._sockets: dict[socket.AddressFamily, socket.socket] = {}
+        self._sockets: dict[tuple[socket.AddressFamily, int], socket.socket] = {}  # by network interface
         self._lookups: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
@@ -112,12 +98,12 @@ class PoseSender:
         if receiver.address is None:
             receiver.dropped += 1
             return
-        family, where = receiver.address
-        sock = self._sockets.get(family)
+        kind = receiver.address[0], inet.scope(receiver.address)
+        sock = self._sockets.get(kind)
         try:
             if sock is None:
-                sock = self._sockets[family] = self._open(family)
-            sock.sendto(data, where)
+                sock = self._sockets[kind] = self._open(*kind)
+            sock.sendto(data, receiver.address[1])
         except BlockingIOError:
             receiver.dropped += 1
         except OSError as error:
@@ -129,15 +115,17 @@ class PoseSender:
                 receiver.reachable = True
                 log.info("pose receiver %s can be reached again", receiver.name)
 
-    def _open(self, family: socket.AddressFamily) -> socket.socket:
+    def _open(self, family: socket.AddressFamily, interface: int) -> socket.socket:
         """A socket to send from; datagrams to groups leave by the interface that was named."""
         sock = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
-        if self._interface and family == socket.AF_INET:
-            try:
+        try:
+            if family == socket.AF_INET and self._interface:
                 sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._interface))
-            except OSError:
-                sock.close()
-                raise
+            elif family == socket.AF_INET6 and interface:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, interface)
+        except OSError:
+            sock.close()
+            raise
         return sock
 
     def _lost(self, receiver: Receiver, problem: str) -> None:

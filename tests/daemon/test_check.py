@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from daemon import cli
+from daemon.store import Store
+from tests.daemon.mapmaker import Shape, content
 
 SURVEY = """
 lamp = [
@@ -26,7 +28,7 @@ def write(folder: Path, survey: str = SURVEY, bus: str = "/dev/i2c-99") -> Path:
 def test_all_good_but_the_bus_is_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path)
     assert cli.main(["check", str(file)]) == cli.OK
-    good, survey, bus = capsys.readouterr().out.splitlines()
+    good, survey, bus, _ = capsys.readouterr().out.splitlines()
     assert good == f"{file}: good"
     assert survey == f"{tmp_path.resolve() / 'lights.toml'}: good, 2 lamps"
     assert bus.startswith("as seen from here, /dev/i2c-99: ")
@@ -75,3 +77,24 @@ def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pyte
     file = write(tmp_path, bus="")
     assert cli.main(["check", str(file)]) == cli.OK
     assert "the survey is not used: `photodiode.bus` is empty" in capsys.readouterr().out
+
+
+def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maps, file = tmp_path / "maps", tmp_path / "robot.toml"
+    file.write_text(f'[map]\nfolder = "{maps}"\n')
+
+    def said(*more: str, code: int = cli.OK) -> str:
+        assert cli.main(["check", str(file), *more]) == code
+        words = capsys.readouterr()
+        return words.out + words.err
+
+    alone = ("--set", "map.localise=true")
+    assert f"{maps}: not there yet" in said()
+    assert "`run` would be refused" in said(*alone, code=cli.FAILED)
+    Store(maps).save(whole := content(Shape(submaps=3, map_id=7)), 7)
+    assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is good" in said(*alone)
+    (maps / "map-00000007-00000002.lumimap").write_bytes(whole[:-1])
+    assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is good" in said(), "the generation before it"
+    (maps / "map-00000007-00000001.lumimap").unlink()
+    assert f"{maps}: no map in it can be used" in said()
+    assert [path.name for path in maps.glob("*.lumimap*")] == ["map-00000007-00000002.lumimap"], "nothing is moved"

@@ -32,6 +32,7 @@ from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
+from tests.daemon.driven import during
 
 DEVICE = "/dev/ttyACM0"
 PERIOD = URG_04LX_UG01.true_period_s
@@ -130,13 +131,9 @@ def run_daemon(
 
     async def go() -> Bench:
         bench = kind(**options)  # type: ignore[arg-type]  # test shorthand
-        stop = asyncio.Event()
-        running = asyncio.create_task(bench.daemon.run(stop))
         try:
-            await scenario(bench)
+            await during(bench.daemon, scenario(bench))
         finally:
-            stop.set()
-            await asyncio.wait_for(running, 10.0)
             bench.left = bench.device.state
         return bench
 

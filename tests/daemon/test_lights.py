@@ -26,6 +26,7 @@ from hal.fake.models import URG_04LX_UG01
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
+from tests.daemon.driven import during
 from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged
 
 LIDAR = "/dev/ttyACM0"
@@ -107,13 +108,7 @@ def run_daemon(scenario: Callable[[Bench], Awaitable[None]], **options: object) 
 
     async def go() -> Bench:
         bench = Bench(**options)  # type: ignore[arg-type]  # test shorthand
-        stop = asyncio.Event()
-        running = asyncio.create_task(bench.daemon.run(stop))
-        try:
-            await scenario(bench)
-        finally:
-            stop.set()
-            await asyncio.wait_for(running, 10.0)
+        await during(bench.daemon, scenario(bench))
         return bench
 
     return run_virtual(go(), start=100.0)

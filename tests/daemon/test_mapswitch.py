@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -20,9 +22,12 @@ from daemon.mapswitch import Maps, MapSwitch
 from daemon.publish.snapshot import Snapshot, State
 from daemon.record import Recorder
 from daemon.store import Store, started, unjudged
+from daemon.store_file import pack, unpack
 from daemon.store_keeper import About, Keeper
+from daemon.store_tables import read
 from daemon.worker import CycleWorker
 from estimator import se2
+from estimator.mapimage import MapImage, restored
 from hal.clock import LoopClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX_UG01
@@ -32,6 +37,7 @@ from tests.daemon.mapmaker import content
 from tests.daemon.test_imported_map import DEVICE, MOVED, draw, warm
 
 FIRST, SECOND = 0x1000, 0x2000
+BAD_SESSION = 77
 
 
 def folder_of_two(folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Path, int, int]:
@@ -141,6 +147,55 @@ def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
     assert summary["recorded_run"] == {"cycles": bench.daemon.cycle.cycles, "differ": 0, "first_difference": ""}
 
 
+@pytest.mark.jit
+@pytest.mark.parametrize("generations", [2, 1])
+def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_it_is_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, generations: int
+) -> None:
+    maps, first, _ = folder_of_two(tmp_path, capsys)
+    for path in maps.glob("*.lumimap"):
+        if f"{first:08x}" not in path.name:
+            path.unlink()
+    (before,) = maps.glob("*.lumimap")
+    tables = unpack(before.read_bytes())
+    tables["meta"] = msgspec.structs.replace(read(before.read_bytes()).meta, session=BAD_SESSION).packed()
+    store = Store(maps)
+    bad = store.save(pack(tables), first)
+    store.close()
+    if generations == 1:
+        before.unlink()
+
+    def raising(image: MapImage, *more: Any) -> Any:
+        if image.identity.session == BAD_SESSION:
+            raise IndexError("index 7 is out of bounds")
+        return restored(image, *more)
+
+    monkeypatch.setattr("estimator.mapimage.restored", raising)
+    settings = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0), map=MapConfig(folder=str(maps)))
+
+    async def go() -> Bench:
+        bench = Bench(settings, tmp_path / "rec")
+        stop = asyncio.Event()
+        running = asyncio.create_task(bench.daemon.run(stop))
+        await asyncio.sleep(6.0)
+        stop.set()
+        await asyncio.wait_for(running, 10.0)
+        return bench
+
+    bench = run_virtual(go())
+    assert bad.with_name(bad.name + ".broken").exists()
+    assert not bad.exists()
+    ids = {one.map_id for one in bench.snapshots[5:] if one.pose is not None}
+    if generations == 2:
+        assert ids == {first}, "the generation before it is gone on in"
+    else:
+        assert len(ids) == 1
+        assert ids.isdisjoint({first}), "the new map does not take its ID"
+    assert cli.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == cli.OK
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["recorded_run"] == {"cycles": bench.daemon.cycle.cycles, "differ": 0, "first_difference": ""}
+
+
 class Quiet:
     """A keeper that has nothing to save, or cannot."""
 
@@ -208,6 +263,58 @@ def test_a_defect_and_a_full_disk_change_nothing_and_are_told(tmp_path: Path, ca
     assert "No space left on device" in asyncio.run(go(keep=full))
     assert asyncio.run(go(make=defect)) == "ZeroDivisionError('a defect')"
     assert "the map cannot be switched" in caplog.text
+
+
+def test_a_map_that_no_cycle_takes_is_taken_back_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lidar and wheels are silent: no record comes, so nothing is stepped. The next order is free to be given."""
+    from daemon.store_tables import read
+
+    monkeypatch.setattr(mapswitch, "TAKEN_S", 0.05)
+    data = content()
+    map_id = read(data).meta.map_id
+    (tmp_path / f"map-{map_id:08x}-00000001.lumimap").write_bytes(data)
+    handed: list[mapswitch.Switch | None] = []
+
+    async def go() -> list[str]:
+        made = Maps(Store(tmp_path), unjudged, lambda start: start)  # type: ignore[arg-type,return-value]  # never used
+        switch = MapSwitch(made, Quiet(), lambda one, _: handed.append(one))  # type: ignore[arg-type]  # as above
+        ended: list[str] = []
+        for count in (1, 2):
+            switch.ask(map_id, ended.append)
+            while len(ended) < count:  # noqa: ASYNC110 - a thread ends it
+                await asyncio.sleep(0.005)
+            await asyncio.sleep(0)
+        return ended
+
+    assert asyncio.run(go()) == [mapswitch.NOTHING_COMES] * 2
+    assert [one if one is None else one.map_id for one in handed] == [map_id, None] * 2
+
+
+def test_a_start_waits_for_the_lidar_with_the_map_that_it_has_fallen_back_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lidar that is switched on with the robot, or later, gives no scan within the time that an order has."""
+    monkeypatch.setattr(mapswitch, "TAKEN_S", 0.01)
+    data = content()
+    map_id = read(data).meta.map_id
+    (tmp_path / f"map-{map_id:08x}-00000001.lumimap").write_bytes(data)
+    handed: list[mapswitch.Switch | None] = []
+
+    async def go() -> list[str]:
+        def put(one: mapswitch.Switch | None, taken: Callable[[], None]) -> None:
+            handed.append(one)
+            asyncio.get_running_loop().call_later(0.1, taken)
+
+        made = Maps(Store(tmp_path), unjudged, lambda start: start)  # type: ignore[arg-type,return-value]  # never used
+        switch = MapSwitch(made, Quiet(), put)  # type: ignore[arg-type]  # all that is asked of it
+        ended: list[str] = []
+        switch.ask(map_id, ended.append, patient=True)
+        while not ended:  # noqa: ASYNC110 - a thread ends it
+            await asyncio.sleep(0.005)
+        return ended
+
+    assert asyncio.run(go()) == [""]
+    assert len(handed) == 1
 
 
 class _Later:

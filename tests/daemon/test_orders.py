@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from daemon.network import Feeds
-from daemon.orders import ASKED, Orders
+from daemon.orders import ASKED, NOT_HERE, Orders
 from daemon.publish.holding import CommandCode, Outcome, Request
 from estimator.records import Command, Order
-from hal.clock import SystemClock
 from tests.daemon.publish.test_registers import snapshot
 
 Told = Callable[[str], None]
+
+
+class Clock:
+    """Stands still until it is moved on."""
+
+    t = 100.0
+
+    def now(self) -> float:
+        return self.t
+
+    def utc(self) -> float:
+        return self.t
 
 
 class Bench:
@@ -26,7 +38,8 @@ class Bench:
         self.saves: list[Told] = []
         feeds = Feeds(lambda _: None, lambda _: None, self.commands.append, self.saves.append, **able)
 
-        self.orders = Orders(SystemClock(), feeds, lambda number, outcome: self.ended.append((number, outcome)))
+        self.clock = Clock()
+        self.orders = Orders(self.clock, feeds, lambda number, outcome: self.ended.append((number, outcome)))
 
     def ask(self, number: int, code: CommandCode, map_id: int = 0) -> None:
         self.orders.take(Request(number, code, (1.0, 2.0, 0.5), map_id))
@@ -63,6 +76,29 @@ def test_orders_that_wait_for_a_pose_do_not_pile_up() -> None:
     bench.orders.published(snapshot())
     assert len(bench.ended) == ASKED
     assert bench.ended[-1] == (1000, Outcome.DONE)
+
+
+def test_orders_at_any_rate_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    """A controller that orders a hundred times a second for a minute, and is refused each time."""
+    bench = Bench()
+    clock = bench.clock
+
+    def go_on(seconds: int) -> list[str]:
+        caplog.clear()
+        with caplog.at_level(logging.INFO):
+            for number in range(100 * seconds):
+                clock.t += 0.01
+                bench.ask(1 + number, CommandCode.DUMP_RECORDER)
+        return [record.getMessage() for record in caplog.records]
+
+    lines = go_on(60)
+    assert len(lines) <= 70
+    assert lines[:2] == ["Modbus: DUMP_RECORDER", f"Modbus: DUMP_RECORDER refused: {NOT_HERE}"]
+    assert sum("more such lines were left out" in line for line in lines) == 5
+    assert "(1990 more such lines were left out before it)" in lines[10]
+    clock.t += 60.0
+    assert len(go_on(1)) == 10, "an order now and then is told as ever"
+    assert len(bench.ended) == 6100
 
 
 def test_what_takes_long_is_done_when_it_says_so(caplog: pytest.LogCaptureFixture) -> None:

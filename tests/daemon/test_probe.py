@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import msgspec
 import pytest
@@ -46,8 +47,8 @@ def run(
     monkeypatch.setattr(probe, "probe_bus", look)
     monkeypatch.setattr("hal.i2c_linux.buses", lambda: list(by_bus))
 
-    async def identify(opener: PortOpener, device: str) -> Finding:
-        return by_name[device]
+    async def identify(opener: PortOpener, device: str, baud: int) -> Finding:
+        return replace(by_name[device], baud=baud)
 
     monkeypatch.setattr(probe, "identify_at", identify)
     monkeypatch.setattr("hal.hokuyo.discover.candidates", lambda: list(by_name))
@@ -62,6 +63,17 @@ def test_a_lidar_is_described_with_how_to_use_it(
     assert "/dev/ttyACM0: URG-04LX, serial H0500000" in output
     assert "use it: lumiloop run --lidar /dev/ttyACM0" in output
     assert "no lidar: /dev/ttyS0: busy (stop the other program)" in output
+
+
+def test_a_line_is_named_with_its_rate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    line = replace(LIDAR, device="/tmp/lidar")
+    assert run(monkeypatch, [line], named=["/tmp/lidar@19200"]) == 0
+    output = capsys.readouterr().out
+    assert "/tmp/lidar: URG-04LX" in output
+    assert "19200 bit/s" in output
+    assert "use it: lumiloop run --lidar /tmp/lidar@19200\n" in output
+    assert run(monkeypatch, [line], named=["/tmp/lidar@1234"]) == 1
+    assert "line rate of 19200, 38400" in capsys.readouterr().err
 
 
 def test_programs_get_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

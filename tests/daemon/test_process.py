@@ -208,7 +208,7 @@ def test_a_tap_on_this_computer_gets_poses_and_scans(tmp_path: Path, monkeypatch
             assert tap.stdout is not None
             lines = [tap.stdout.readline() for _ in range(9)]
             tap.terminate()
-        assert "'schema': 1" in lines[0]
+        assert lines[0].startswith("this is lumiloop 'lumiloop', process ")
         assert sum(" scan " in line and "of 1081 beams" in line for line in lines) >= 3
         assert sum("MAPPING" in line or "TRACKING" in line for line in lines) >= 3
         assert not daemon.process.poll()

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from daemon.config import PhotodiodeConfig
-from daemon.sampleclock import FILE, MOVED_PPM, SampleClock, state_folder
+from daemon.folders import state_folder
+from daemon.sampleclock import FILE, MOVED_PPM, SampleClock
 
 CONFIG = PhotodiodeConfig(bus="/dev/i2c-1")
 OTHER = PhotodiodeConfig(bus="/dev/i2c-1", converter="adc121c021@0x54")

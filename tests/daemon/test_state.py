@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
@@ -14,37 +13,8 @@ from daemon.publish.snapshot import State
 from daemon.reasons import REASONS, Reason
 from daemon.state import judge
 from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, Evidence, Light, Match
-from daemon.state_memory import DARK_S, FAILED_SCANS, Memory
-
-PERIOD = 0.1
-ALL = (True, True, True)
-GOOD = Match(True, ALL)
-BAD = Match(False, (False, False, False))
-CORRIDOR = Match(True, (False, True, True))
-
-
-def seen(t: float, match: Match | None = GOOD, **more: object) -> Evidence:
-    return replace(Evidence(t, silence=0.5, match=match, mapped=True), **more)  # type: ignore[arg-type]  # test shorthand
-
-
-def run(memory: Memory, evidence: Iterable[Evidence]) -> Memory:
-    for item in evidence:
-        memory = judge(memory, item)
-    return memory
-
-
-def scans(begin: float, count: int, match: Match | None = GOOD, **more: object) -> list[Evidence]:
-    return [seen(begin + PERIOD * i, match, **more) for i in range(count)]
-
-
-def tracking(**more: object) -> Memory:
-    memory = run(Memory(), scans(0.0, 30, **more))
-    assert memory.state is State.TRACKING
-    return memory
-
-
-def said(memory: Memory) -> tuple[State, Reason]:
-    return memory.state, memory.reason
+from daemon.state_memory import FAILED_SCANS, Memory
+from tests.daemon.judged import ALL, BAD, CORRIDOR, LIT, PERIOD, run, said, scans, seen, tracking
 
 
 def test_before_the_first_scan() -> None:
@@ -208,99 +178,6 @@ def test_an_order_starts_the_proof_anew() -> None:
     assert memory.good == 1
     lost = run(tracking(), scans(3.0, 20, BAD))
     assert judge(lost, seen(5.0, ordered=True)).state is not State.LOST
-
-
-LIT = Light(alive=True, used=True, placed=True, agrees=True, known=ALL)
-
-
-def lit(count: int = 40, light: Light = LIT, **more: object) -> Memory:
-    """After some scans that light agrees with."""
-    return run(Memory(), scans(0.0, count, light=light, **more))
-
-
-def test_light_and_laser_that_agree_about_the_place_are_believed() -> None:
-    assert said(lit()) == (State.TRACKING, Reason.NONE)
-    assert lit(15).state is State.TRACKING
-    assert lit(8).state is State.MAPPING
-
-
-def test_before_light_has_told_where_the_map_lies_nothing_is_tracked() -> None:
-    unplaced = Light(alive=True)
-    assert said(lit(light=unplaced)) == (State.MAPPING, Reason.UNPLACED)
-    young = replace(LIT, known=(True, True, False))
-    assert said(lit(light=young, sigma_rad=1.8)) == (State.RELOCATING, Reason.UNPLACED)
-
-
-def test_a_pose_that_light_contradicts_is_not_tracked() -> None:
-    odd = replace(LIT, agrees=False)
-    memory = run(lit(), scans(4.0, 2, light=odd))
-    assert memory.state is State.TRACKING
-    memory = run(memory, scans(4.2, 3, light=odd))
-    assert said(memory) == (State.DEGRADED, Reason.LIGHT_DISAGREES)
-    assert run(memory, scans(4.5, 20, light=LIT)).state is State.TRACKING
-
-
-def test_after_light_has_moved_the_pose_the_place_is_proved_for_longer() -> None:
-    memory = run(lit(), scans(4.0, 10, light=replace(LIT, agrees=False)))
-    memory = run(memory, scans(5.0, 1, light=replace(LIT, moved=True)))
-    assert memory.doubt
-    assert run(memory, scans(5.1, 45, light=LIT)).state is State.DEGRADED
-    assert run(memory, scans(5.1, 60, light=LIT)).state is State.TRACKING
-
-
-def test_a_light_that_has_given_its_place_up_takes_the_state_with_it() -> None:
-    gone = replace(LIT, used=False, lost=True, agrees=None)
-    memory = run(lit(), scans(4.0, 3, light=gone))
-    assert said(memory) == (State.DEGRADED, Reason.LIGHT_LOST)
-    assert said(run(memory, scans(4.3, 3, BAD, light=gone, odometry=True))) == (State.RELOCATING, Reason.LIGHT_LOST)
-
-
-def test_a_photodiode_that_falls_silent_degrades_at_once_and_darkness_after_a_while() -> None:
-    silent = replace(LIT, alive=False, used=False, agrees=None)
-    assert said(run(lit(), scans(4.0, 1, light=silent))) == (State.DEGRADED, Reason.LIGHT_SILENT)
-    dark = replace(LIT, used=False, agrees=None)
-    soon = run(lit(), scans(4.0, round((DARK_S - 0.3) / PERIOD), light=dark))
-    assert soon.state is State.TRACKING
-    late = run(soon, scans(4.0 + DARK_S, 3, light=dark))
-    assert said(late) == (State.DEGRADED, Reason.LIGHT_DARK)
-    assert run(late, scans(10.0, 3, light=LIT)).state is State.TRACKING
-
-
-def quiet(t: float, light: Light = LIT, **more: object) -> Evidence:
-    """A cycle without a laser."""
-    return replace(Evidence(t, silence=5.0, mapped=True, light=light), **more)  # type: ignore[arg-type]  # as above
-
-
-def test_light_holds_the_pose_while_the_laser_is_silent() -> None:
-    memory = run(lit(), [quiet(4.0 + PERIOD * i) for i in range(50)])
-    assert said(memory) == (State.DEGRADED, Reason.LIDAR_SILENT)
-    assert memory.known == ALL
-    assert not memory.doubt
-    assert run(memory, scans(9.0, 15, light=LIT)).state is State.TRACKING
-    dark = replace(LIT, used=False, agrees=None)
-    assert said(run(memory, [quiet(9.0 + PERIOD * i, dark) for i in range(15)])) == (State.LOST, Reason.NO_WITNESS)
-    bridged = run(memory, [quiet(9.0 + PERIOD * i, dark, odometry=True) for i in range(15)])
-    assert said(bridged) == (State.DEGRADED, Reason.LIDAR_SILENT)
-    assert said(judge(memory, quiet(9.1, sigma_m=2.0, light=replace(LIT, agrees=None)))) == (
-        State.LOST,
-        Reason.UNCERTAIN,
-    )
-
-
-def test_light_alone_tracks_when_there_is_no_laser_to_wait_for() -> None:
-    def alone(begin: float, count: int, light: Light = LIT, **more: object) -> list[Evidence]:
-        return [quiet(begin + PERIOD * i, light, silence=None, lidar=False, **more) for i in range(count)]
-
-    assert said(run(Memory(), alone(0.0, 5, Light(alive=True)))) == (State.RELOCATING, Reason.UNPLACED)
-    assert said(run(Memory(), alone(0.0, 5, Light(alive=False)))) == (State.LOST, Reason.LIGHT_SILENT)
-    assert said(run(Memory(), alone(0.0, 5, Light(alive=True), places=2))) == (State.AMBIGUOUS, Reason.SEVERAL_PLACES)
-    memory = run(Memory(), alone(0.0, 25, odometry=True))
-    assert said(memory) == (State.TRACKING, Reason.NONE)
-    vague = replace(LIT, known=(True, False, True))
-    assert said(run(memory, alone(3.0, 3, vague, odometry=True))) == (State.DEGRADED, Reason.UNCERTAIN)
-    assert said(run(memory, alone(3.0, 3, odometry=False))) == (State.DEGRADED, Reason.ODOMETRY_SILENT)
-    lost = replace(LIT, lost=True, used=False, agrees=None)
-    assert said(run(memory, alone(3.0, 3, lost, odometry=True))) == (State.RELOCATING, Reason.LIGHT_LOST)
 
 
 NEAR = Match(True, ALL, 0.02, 0.01)

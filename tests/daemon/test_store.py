@@ -12,8 +12,9 @@ import pytest
 
 from daemon import store as module
 from daemon.config import MapConfig
+from daemon.folders import maps_folder
 from daemon.lights import Lights, new_state
-from daemon.store import NEWEST, NoMap, Store, folder_of, recorded_start, started
+from daemon.store import NEWEST, NoMap, Store, recorded_start, started
 from daemon.store_file import Damaged
 from daemon.store_tables import digest_of
 from estimator.cdma_profile import PROFILE_A
@@ -256,8 +257,8 @@ def test_a_recorded_map_must_be_the_one_that_the_run_began_with(tmp_path: Path) 
 
 def test_maps_are_kept_in_the_state_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    assert folder_of("") == tmp_path / "maps"
-    assert folder_of("/srv/maps") == Path("/srv/maps")
+    assert maps_folder("") == tmp_path / "maps"
+    assert maps_folder("/srv/maps") == Path("/srv/maps")
 
 
 def test_a_folder_that_cannot_be_read_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -189,7 +189,7 @@ def test_kernels_of_light_are_counted_only_where_there_is_a_photodiode() -> None
 
 
 def test_a_command_says_once_that_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warmup, "_mark", lambda what: tmp_path / what)
+    monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
     said: list[str] = []
     done: list[int] = []
 
@@ -206,7 +206,7 @@ def test_a_command_says_once_that_it_compiles(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_command_that_cannot_load_leaves_no_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warmup, "_mark", lambda what: tmp_path / what)
+    monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
 
     def full() -> None:
         raise OSError(28, "No space left on device")

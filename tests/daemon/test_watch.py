@@ -48,6 +48,19 @@ def test_readings_that_come_more_seldom_than_before(spells: tuple[tuple[float, f
     assert fed(*spells).seldom(sum(seconds for seconds, _ in spells), PERIOD) is seldom
 
 
+@pytest.mark.parametrize(("hz", "period", "seldom"), [(20.0, 0.025, False), (10.0, 0.025, False), (5.0, 0.025, True)])
+def test_wheels_that_are_slower_than_a_fast_lidar_are_no_fault(hz: float, period: float, seldom: bool) -> None:
+    watch = Watch()
+    for k in range(round(60.0 * hz)):
+        watch.on_odometry(reading(k / hz))
+        if k % round(hz) == 0 and k > 10.0 * hz:
+            assert watch.seldom(k / hz, period) is seldom
+
+
+def test_wheels_need_not_be_faster_than_a_slow_lidar() -> None:
+    assert not fed((30.0, 5.0)).seldom(30.0, 0.2)
+
+
 def test_lost_and_late_readings_are_counted_but_not_those_of_a_silence() -> None:
     watch = Watch()
     watch.on_odometry(reading(0.0))

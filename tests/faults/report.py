@@ -20,7 +20,7 @@ WORD: Final = {
     "stuck": "the same data again and again",
     "garbage": "random bytes",
     "wrong": "wrong values, correctly sent",
-    "slow": "slower",
+    "slow": "fewer scans, blocks, readings a second",
     "delayed": "0.3 s late",
     "intermittent": "half of it lost",
 }

@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 
 from daemon.health import Fault
+from daemon.heartbeat import BEAT_S, OVER_S
 from daemon.publish.holding import CommandCode, Outcome
 from daemon.publish.snapshot import State
 from tests.daemon.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
@@ -162,9 +163,10 @@ def test_one_process_survives_one_after_the_other(tmp_path: Path, monkeypatch: p
                 assert link.readlink() != before, "the lidar has come back as another tty"
                 tracking(daemon)
                 over(daemon, 40.0)
+                time.sleep(OVER_S + 2.0 * BEAT_S)  # so long a fault must be gone before the log says so
+                code, log, _ = daemon.stop()
             for end in other:
                 os.close(end)
-            code, log, _ = daemon.stop()
     assert code == 0, log
     assert "Traceback" not in log
     for fault in (Fault.LOOP_STALLED, Fault.MAP_NOT_SAVED, Fault.LIDAR_MISSING):

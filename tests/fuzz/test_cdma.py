@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimator.cdma import decode, new_decoder, search
@@ -62,6 +62,7 @@ BLOCK = st.tuples(
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(BLOCK, min_size=1, max_size=12))
+@example([("uniform", 1111, 0, RATE, 0.0, 0.05)] * 4 + [("uniform", 1111, 0, RATE, 0.0, 1e300)])
 def test_whatever_comes_is_answered(blocks: list[tuple[str, int, int, float, float, float]]) -> None:
     decoder, t = new_decoder(PROFILE_A, 0.0), 1.0
     for kind, size, seed, rate, pause, span in blocks:

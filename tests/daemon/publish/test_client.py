@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from daemon.config import Config, ModbusConfig
-from daemon.publish import client, registers
+from daemon.publish import client, lights, registers
 from daemon.publish.snapshot import Snapshot, State
 from tests.daemon.publish.network import publishing
 from tests.daemon.publish.test_lights import picture
@@ -88,7 +88,7 @@ def test_a_pose_whose_place_is_not_known_is_marked_as_a_guess(state: State, caps
 def test_a_daemon_of_a_version_without_the_block_of_lights_is_read_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("daemon.publish.modbus.encode_lights", lambda snapshot: b"")
+    monkeypatch.setattr(lights.BLOCK, "encode", lambda snapshot: b"")
     assert run_against(snapshot(light=picture(), links=3), advance=False) == 0
     shown = capsys.readouterr().out
     assert "lights     3 in view" in shown

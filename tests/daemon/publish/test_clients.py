@@ -83,7 +83,7 @@ def test_lights_reader() -> None:
     dark, reading = asyncio.run(run())
     assert dark["fix"] is None
     assert dark["links"] == []
-    told = lights.decode_lights(lights.encode_lights(snapshot(light=picture(), links=3)))
+    told = lights.BLOCK.decode(lights.BLOCK.encode(snapshot(light=picture(), links=3)))
     for name in ("x", "y", "yaw", "sigma_x", "sigma_y", "sigma_yaw", "used"):
         assert reading[name] == told[f"light_{name}"]
     assert reading["fix"] == "GOOD"
@@ -95,7 +95,7 @@ def test_lights_reader() -> None:
 
 
 def test_lights_reader_refuses_what_is_no_block_of_lights() -> None:
-    block = lights.encode_lights(snapshot(light=picture()))
+    block = lights.BLOCK.encode(snapshot(light=picture()))
     with pytest.raises(ValueError, match="torn"):
         read_lights.decode(bytes(9) + block[:-1] + bytes([block[-1] ^ 1]))
     with pytest.raises(ValueError, match="exception 2"):

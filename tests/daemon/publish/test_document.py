@@ -30,3 +30,15 @@ def test_every_point_is_documented_where_it_is() -> None:
 def test_writing_makes_the_pages(tmp_path: Path) -> None:
     document.write(tmp_path / "new")
     assert {path.name for path in (tmp_path / "new").iterdir()} == set(document.pages())
+
+
+@pytest.mark.parametrize(("words", "code"), [(["--help"], 0), (["--nothing-of-the-kind"], 2)])
+def test_asking_for_help_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["document", *words])
+    with pytest.raises(SystemExit) as ended:
+        document.main()
+    assert ended.value.code == code
+    assert list(tmp_path.iterdir()) == []

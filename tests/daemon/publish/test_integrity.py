@@ -19,7 +19,7 @@ from daemon.publish.snapshot import LoopReason, Trust
 from tests.daemon.publish.test_lights import ask, layout
 from tests.daemon.publish.test_registers import snapshot
 
-FROZEN = Path(__file__).parent / "frozen" / f"integrity_v{integrity.VERSION}.json"
+FROZEN = Path(__file__).parent / "frozen" / f"integrity_v{integrity.BLOCK.version}.json"
 
 TRUST = Trust(0.12301, 0.0351, 0.5, True, laser=True, wheels=True, gap=6.25, places=3)
 
@@ -32,7 +32,7 @@ def test_every_reason_of_the_estimator_has_a_number() -> None:
 def test_block_by_hand() -> None:
     """Numbers at places written down here, not taken from the table."""
     taken = snapshot(trust=TRUST, loop_reason=LoopReason.LIT, loop_residual=0.01234)
-    words = struct.unpack(">14H", integrity.encode_integrity(taken))
+    words = struct.unpack(">14H", integrity.BLOCK.encode(taken))
     assert words == (0x4C50, 1, 1, 4464, 124, 351, 500, 0b1101, 250, 3, 4, 124, 1, 4464)
 
 
@@ -48,15 +48,15 @@ def test_bits_of_the_first_block() -> None:
 
 
 def test_what_is_not_known_says_so() -> None:
-    reading = integrity.decode_integrity(integrity.encode_integrity(snapshot()))
+    reading = integrity.BLOCK.decode(integrity.BLOCK.encode(snapshot()))
     assert {name: value for name, value in reading.items() if value is not None} == {"seq": 70_000, "witnesses": 0}
 
 
 def test_a_bound_is_never_published_too_small() -> None:
-    reading = integrity.decode_integrity(integrity.encode_integrity(snapshot(trust=Trust(0.1230001, 0.03500001))))
+    reading = integrity.BLOCK.decode(integrity.BLOCK.encode(snapshot(trust=Trust(0.1230001, 0.03500001))))
     assert reading["protection"] == 0.124
     assert reading["protection_yaw"] == 0.0351
-    vast = integrity.decode_integrity(integrity.encode_integrity(snapshot(trust=Trust(1e9, float("inf")))))
+    vast = integrity.BLOCK.decode(integrity.BLOCK.encode(snapshot(trust=Trust(1e9, float("inf")))))
     assert vast["protection"] == 65.534
     assert vast["protection_yaw"] == 6.5534
 
@@ -81,21 +81,21 @@ def test_a_datagram_of_a_program_that_knew_no_bound_is_read() -> None:
     ("at", "word", "words"), [(0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (13, 1, "torn")]
 )
 def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> None:
-    block = bytearray(integrity.encode_integrity(snapshot()))
+    block = bytearray(integrity.BLOCK.encode(snapshot()))
     block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
     with pytest.raises(ValueError, match=words):
-        integrity.decode_integrity(bytes(block))
+        integrity.BLOCK.decode(bytes(block))
     with pytest.raises(ValueError, match="14 registers, got 4"):
-        integrity.decode_integrity(bytes(8))
+        integrity.BLOCK.decode(bytes(8))
 
 
 @pytest.mark.parametrize("function", [3, 4])
 def test_clients_read_all_of_it_or_a_part(function: int) -> None:
     responder, taken = Responder(), snapshot(trust=TRUST)
-    encoders = (registers.encode_mirror, lights.encode_lights, integrity.encode_integrity)
+    encoders = (registers.encode_mirror, lights.BLOCK.encode, integrity.BLOCK.encode)
     responder.show(registers.encode_block(taken), *[partial(encode, taken) for encode in encoders])
-    assert ask(responder, 340, 14, function)[9:] == integrity.encode_integrity(taken)
-    assert ask(responder, 344, 2, function)[9:] == integrity.encode_integrity(taken)[8:12]
+    assert ask(responder, 340, 14, function)[9:] == integrity.BLOCK.encode(taken)
+    assert ask(responder, 344, 2, function)[9:] == integrity.BLOCK.encode(taken)[8:12]
     for address, count in ((339, 2), (340, 15)):
         assert ask(responder, address, count, function)[7:] == bytes([function | 0x80, 2])
 
@@ -103,23 +103,23 @@ def test_clients_read_all_of_it_or_a_part(function: int) -> None:
 def test_status_shows_the_bound() -> None:
     taken = snapshot(trust=TRUST, loop_residual=0.0123)
     reading = registers.decode_block(registers.encode_block(taken))
-    reading |= integrity.decode_integrity(integrity.encode_integrity(taken))
+    reading |= integrity.BLOCK.decode(integrity.BLOCK.encode(taken))
     table = client.as_table(reading, stalled=False)
     assert "bound      0.124 m, 2.01 deg (laser, wheels)  ALERT, limit 0.500 m" in table
     assert "places     3 fit" in table
     assert "residual 0.0123 m" in table
     assert client.as_object(reading, stalled=False)["witnesses"]["alert"] is True
     reading = registers.decode_block(registers.encode_block(snapshot()))
-    reading |= integrity.decode_integrity(integrity.encode_integrity(snapshot()))
+    reading |= integrity.BLOCK.decode(integrity.BLOCK.encode(snapshot()))
     assert "bound      none" in client.as_table(reading, stalled=False)
 
 
 def contract() -> dict[str, Any]:
     return {
-        "version": integrity.VERSION,
-        "magic": integrity.MAGIC,
-        "address": integrity.ADDRESS,
-        "registers": integrity.BLOCK_WORDS,
+        "version": integrity.BLOCK.version,
+        "magic": integrity.BLOCK.magic,
+        "address": integrity.BLOCK.address,
+        "registers": integrity.BLOCK.registers,
         "datagram_from": registers.TRUST_OFFSET,
         "block": layout(integrity.BLOCK),
         "tail": layout(integrity.TAIL),

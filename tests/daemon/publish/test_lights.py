@@ -19,7 +19,7 @@ from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, 
 from estimator.result import Fix, LinkState
 from tests.daemon.publish.test_registers import snapshot
 
-FROZEN = Path(__file__).parent / "frozen" / f"lights_v{lights.VERSION}.json"
+FROZEN = Path(__file__).parent / "frozen" / f"lights_v{lights.BLOCK.version}.json"
 
 LINKS = (
     LightLink(17, 1017, LinkUse.ACCEPTED, 1.25e-6, -0.031),
@@ -51,7 +51,7 @@ def test_every_state_of_the_estimator_has_a_number() -> None:
 
 def test_block_by_hand() -> None:
     """Bytes at places written down here, not taken from the table."""
-    words = struct.unpack(">120H", lights.encode_lights(snapshot(light=picture())))
+    words = struct.unpack(">120H", lights.BLOCK.encode(snapshot(light=picture())))
     assert words[:4] == (0x4C49, 1, 1, 70_000 - 65_536)
     assert words[4:6] == (2, 5)
     assert struct.unpack(">iii", struct.pack(">6H", *words[6:12])) == (-12_345, 72_500, round(1e6 * (3.5 - math.tau)))
@@ -66,7 +66,7 @@ def test_block_by_hand() -> None:
 
 
 def test_a_reader_gets_values_in_si_units() -> None:
-    reading = lights.decode_lights(lights.encode_lights(snapshot(light=picture())))
+    reading = lights.BLOCK.decode(lights.BLOCK.encode(snapshot(light=picture())))
     assert (reading["light_fix"], reading["light_used"], reading["seq"]) == (2, 5, 70_000)
     assert reading["light_x"] == -1.2345
     assert reading["light_age"] == pytest.approx(0.05)
@@ -79,7 +79,7 @@ def test_a_reader_gets_values_in_si_units() -> None:
 
 @pytest.mark.parametrize("light", [None, LightPicture()])
 def test_what_is_not_known_says_so(light: LightPicture | None) -> None:
-    reading = lights.decode_lights(lights.encode_lights(snapshot(light=light)))
+    reading = lights.BLOCK.decode(lights.BLOCK.encode(snapshot(light=light)))
     counted = {"seq": 70_000, "blocks": 0, "blocks_lost": 0}
     known = {name: value for name, value in reading.items() if value is not None and name not in counted}
     assert known == ({} if light is None else {"light_fix": 0, "light_used": 0})
@@ -88,7 +88,7 @@ def test_what_is_not_known_says_so(light: LightPicture | None) -> None:
 
 def test_only_the_strongest_sixteen_are_shown() -> None:
     many = tuple(LightLink(code, code, LinkUse.ACCEPTED, 1e-6 / (code + 1)) for code in range(40))
-    reading = lights.decode_lights(lights.encode_lights(snapshot(light=picture(links=many))))
+    reading = lights.BLOCK.decode(lights.BLOCK.encode(snapshot(light=picture(links=many))))
     assert [reading[f"link_{row}_code"] for row in range(1, 17)] == list(range(16))
 
 
@@ -96,15 +96,15 @@ def test_only_the_strongest_sixteen_are_shown() -> None:
     ("at", "word", "words"), [(0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (119, 1, "torn")]
 )
 def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> None:
-    block = bytearray(lights.encode_lights(snapshot(light=picture())))
+    block = bytearray(lights.BLOCK.encode(snapshot(light=picture())))
     block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
     with pytest.raises(ValueError, match=words):
-        lights.decode_lights(bytes(block))
+        lights.BLOCK.decode(bytes(block))
 
 
 def test_the_wrong_size_is_refused() -> None:
     with pytest.raises(ValueError, match="120 registers, got 64"):
-        lights.decode_lights(bytes(128))
+        lights.BLOCK.decode(bytes(128))
 
 
 def test_the_end_of_the_datagram_by_hand() -> None:
@@ -135,13 +135,13 @@ def test_clients_read_all_of_it_or_a_part(function: int) -> None:
 
     def make() -> bytes:
         made.append(taken)
-        return lights.encode_lights(taken)
+        return lights.BLOCK.encode(taken)
 
     responder.show(registers.encode_block(taken), partial(registers.encode_mirror, taken), make)
     assert ask(responder, 0, 64, function)[9:] == registers.encode_block(taken)
     assert not made, "nobody has asked for the lights"
-    assert ask(responder, 200, 120, function)[9:] == lights.encode_lights(taken)
-    assert ask(responder, 222, 6, function)[9:] == lights.encode_lights(taken)[44:56]
+    assert ask(responder, 200, 120, function)[9:] == lights.BLOCK.encode(taken)
+    assert ask(responder, 222, 6, function)[9:] == lights.BLOCK.encode(taken)[44:56]
     assert len(made) == 1, "made once a snapshot, however often it is read"
     for address, count in ((199, 2), (200, 121), (320, 1), (319, 2)):
         assert ask(responder, address, count, function)[7:] == bytes([function | 0x80, 2])
@@ -159,10 +159,10 @@ def layout(points: Layout) -> list[dict[str, Any]]:
 
 def contract() -> dict[str, Any]:
     return {
-        "version": lights.VERSION,
-        "magic": lights.MAGIC,
-        "address": lights.ADDRESS,
-        "registers": lights.BLOCK_WORDS,
+        "version": lights.BLOCK.version,
+        "magic": lights.BLOCK.magic,
+        "address": lights.BLOCK.address,
+        "registers": lights.BLOCK.registers,
         "datagram_from": registers.TAIL_OFFSET,
         "block": layout(lights.BLOCK),
         "tail": layout(lights.TAIL),

@@ -12,12 +12,12 @@ import pytest
 
 from daemon.health import Fault
 from daemon.publish import client, document, integrity, lights, parts, pulse, registers
-from daemon.publish.requests import Responder
+from daemon.publish.requests import BLOCKS, Responder
 from daemon.publish.snapshot import Condition, Part, Thread
 from tests.daemon.publish.test_lights import ask, layout
 from tests.daemon.publish.test_registers import snapshot
 
-FROZEN = Path(__file__).parent / "frozen" / f"parts_v{parts.VERSION}.json"
+FROZEN = Path(__file__).parent / "frozen" / f"parts_v{parts.BLOCK.version}.json"
 
 CONDITION = Condition(
     uptime_s=70_001,
@@ -30,24 +30,24 @@ CONDITION = Condition(
 
 def test_block_by_hand() -> None:
     """Numbers at places written down here, not taken from the table."""
-    words = struct.unpack(">34H", parts.encode_parts(snapshot(condition=CONDITION)))
+    words = struct.unpack(">34H", parts.BLOCK.encode(snapshot(condition=CONDITION)))
     assert words[:7] == (0x4C46, 1, 1, 4464, 1, 4465, 3)
     assert words[7:19] == (104, 151, 201, *([0] * 9))
     assert words[19:30] == (1, 2, 0, 0, 0, 0, 1, 0, 0, 0, 9)
     assert words[30:32] == (0b10_0000_0001, 0b10_0000)
     assert words[32:] == (1, 4464)
-    assert parts.ADDRESS + len(words) == 434
+    assert parts.BLOCK.address + len(words) == 434
 
 
 def test_more_faults_than_can_be_named_are_counted() -> None:
     many = tuple(int(fault) for fault in Fault)[1:20]
-    reading = parts.decode_parts(parts.encode_parts(snapshot(condition=Condition(faults=many))))
+    reading = parts.BLOCK.decode(parts.BLOCK.encode(snapshot(condition=Condition(faults=many))))
     assert reading["faults"] == 19
     assert [reading[f"fault_{k + 1}"] for k in range(12)] == list(many[:12])
 
 
 def test_before_the_first_look_there_is_nothing() -> None:
-    reading = parts.decode_parts(parts.encode_parts(snapshot()))
+    reading = parts.BLOCK.decode(parts.BLOCK.encode(snapshot()))
     assert {name: value for name, value in reading.items() if value} == {"seq": 70_000}
 
 
@@ -55,33 +55,33 @@ def test_before_the_first_look_there_is_nothing() -> None:
     ("at", "word", "words"), [(0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (33, 1, "torn")]
 )
 def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> None:
-    block = bytearray(parts.encode_parts(snapshot()))
+    block = bytearray(parts.BLOCK.encode(snapshot()))
     block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
     with pytest.raises(ValueError, match=words):
-        parts.decode_parts(bytes(block))
+        parts.BLOCK.decode(bytes(block))
     with pytest.raises(ValueError, match="34 registers, got 4"):
-        parts.decode_parts(bytes(8))
+        parts.BLOCK.decode(bytes(8))
 
 
 @pytest.mark.parametrize("function", [3, 4])
 def test_clients_read_all_of_it_or_a_part(function: int) -> None:
     responder, taken = Responder(), snapshot(condition=CONDITION)
     encoders = (
-        *(registers.encode_mirror, lights.encode_lights, integrity.encode_integrity),
-        *(pulse.encode_pulse, parts.encode_parts),
+        *(registers.encode_mirror, lights.BLOCK.encode, integrity.BLOCK.encode),
+        *(pulse.BLOCK.encode, parts.BLOCK.encode),
     )
     responder.show(registers.encode_block(taken), *[partial(encode, taken) for encode in encoders])
-    assert ask(responder, 400, 34, function)[9:] == parts.encode_parts(taken)
+    assert ask(responder, 400, 34, function)[9:] == parts.BLOCK.encode(taken)
     assert ask(responder, 407, 1, function)[9:] == bytes((0, 104))
     assert ask(responder, 400, 35, function)[7:] == bytes([function | 0x80, 2])
 
 
 def contract() -> dict[str, Any]:
     return {
-        "version": parts.VERSION,
-        "magic": parts.MAGIC,
-        "address": parts.ADDRESS,
-        "registers": parts.BLOCK_WORDS,
+        "version": parts.BLOCK.version,
+        "magic": parts.BLOCK.magic,
+        "address": parts.BLOCK.address,
+        "registers": parts.BLOCK.registers,
         "block": layout(parts.BLOCK),
         "parts": {part.name: part.value for part in Part},
         "threads": {thread.name: thread.value for thread in Thread},
@@ -103,8 +103,8 @@ def test_everything_that_is_numbered_has_a_meaning_and_is_on_the_page() -> None:
 
 def test_status_tells_all_faults_and_what_was_restarted() -> None:
     reading = registers.decode_block(registers.encode_block(snapshot(fault=104)))
-    reading |= integrity.decode_integrity(integrity.encode_integrity(snapshot()))
-    table = client.as_table(reading | parts.decode_parts(parts.encode_parts(snapshot(condition=CONDITION))), False)
+    reading |= integrity.BLOCK.decode(integrity.BLOCK.encode(snapshot()))
+    table = client.as_table(reading | parts.BLOCK.decode(parts.BLOCK.encode(snapshot(condition=CONDITION))), False)
     for words in (
         "104: the lidar",
         "151: the photodiode",
@@ -117,6 +117,6 @@ def test_status_tells_all_faults_and_what_was_restarted() -> None:
 
 
 def test_no_two_blocks_have_one_magic_number() -> None:
-    magic = [block.MAGIC for block in (integrity, lights, parts, pulse)]
+    magic = [block.magic for block in BLOCKS]
     assert len({registers.MODBUS_MAGIC, *magic}) == 1 + len(magic)
-    assert f'0x{parts.MAGIC:04X} ("{parts.MAGIC.to_bytes(2, "big").decode()}")' in document.modbus_page()
+    assert f'0x{parts.BLOCK.magic:04X} ("{parts.BLOCK.magic.to_bytes(2, "big").decode()}")' in document.modbus_page()

@@ -17,7 +17,7 @@ from estimator.records import Rung
 from tests.daemon.publish.test_lights import ask, layout
 from tests.daemon.publish.test_registers import snapshot
 
-FROZEN = Path(__file__).parent / "frozen" / f"pulse_v{pulse.VERSION}.json"
+FROZEN = Path(__file__).parent / "frozen" / f"pulse_v{pulse.BLOCK.version}.json"
 
 PULSE = Pulse(
     rung=2,
@@ -39,18 +39,18 @@ def test_every_rung_of_the_estimator_has_a_meaning() -> None:
 
 def test_block_by_hand() -> None:
     """Numbers at places written down here, not taken from the table."""
-    words = struct.unpack(">46H", pulse.encode_pulse(snapshot(pulse=PULSE)))
+    words = struct.unpack(">46H", pulse.BLOCK.encode(snapshot(pulse=PULSE)))
     assert words[:14] == (0x4C43, 1, 1, 4464, 2, 1, 4465, 0, 2, 0, 3, 4, 123, 3)
     assert words[14:20] == (300, 800, 912, 10, 150, 65_534), "hundredths of a millisecond; the largest: this or more"
     assert words[20:26] == (0, 0, 0, 1, 2, 3)
     assert words[38:44] == (6, 12, 18, 0xFFFF, 0xFFFF, 0xFFFF)
     assert words[44:] == (1, 4464)
-    assert pulse.ADDRESS + len(words) == 400
+    assert pulse.BLOCK.address + len(words) == 400
 
 
 def test_what_is_not_known_says_so() -> None:
     for empty in (snapshot(), snapshot(pulse=Pulse())):
-        reading = pulse.decode_pulse(pulse.encode_pulse(empty))
+        reading = pulse.BLOCK.decode(pulse.BLOCK.encode(empty))
         known = {name: value for name, value in reading.items() if value is not None}
         assert known == {"seq": 70_000, "rung": 0, "thinned": 0, "without_map": 0, "carried": 0, "stalls": 0}
 
@@ -59,20 +59,20 @@ def test_what_is_not_known_says_so() -> None:
     ("at", "word", "words"), [(0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (45, 1, "torn")]
 )
 def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> None:
-    block = bytearray(pulse.encode_pulse(snapshot()))
+    block = bytearray(pulse.BLOCK.encode(snapshot()))
     block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
     with pytest.raises(ValueError, match=words):
-        pulse.decode_pulse(bytes(block))
+        pulse.BLOCK.decode(bytes(block))
     with pytest.raises(ValueError, match="46 registers, got 4"):
-        pulse.decode_pulse(bytes(8))
+        pulse.BLOCK.decode(bytes(8))
 
 
 @pytest.mark.parametrize("function", [3, 4])
 def test_clients_read_all_of_it_or_a_part(function: int) -> None:
     responder, taken = Responder(), snapshot(pulse=PULSE)
-    encoders = (registers.encode_mirror, lights.encode_lights, integrity.encode_integrity, pulse.encode_pulse)
+    encoders = (registers.encode_mirror, lights.BLOCK.encode, integrity.BLOCK.encode, pulse.BLOCK.encode)
     responder.show(registers.encode_block(taken), *[partial(encode, taken) for encode in encoders])
-    assert ask(responder, 354, 46, function)[9:] == pulse.encode_pulse(taken)
+    assert ask(responder, 354, 46, function)[9:] == pulse.BLOCK.encode(taken)
     assert ask(responder, 358, 1, function)[9:] == bytes((0, 2))
     for address, count in ((353, 2), (354, 47)):
         assert ask(responder, address, count, function)[7:] == bytes([function | 0x80, 2])
@@ -80,10 +80,10 @@ def test_clients_read_all_of_it_or_a_part(function: int) -> None:
 
 def contract() -> dict[str, Any]:
     return {
-        "version": pulse.VERSION,
-        "magic": pulse.MAGIC,
-        "address": pulse.ADDRESS,
-        "registers": pulse.BLOCK_WORDS,
+        "version": pulse.BLOCK.version,
+        "magic": pulse.BLOCK.magic,
+        "address": pulse.BLOCK.address,
+        "registers": pulse.BLOCK.registers,
         "block": layout(pulse.BLOCK),
         "rungs": len(pulse.RUNGS),
         "stages": {stage.name: stage.value for stage in Stage},
@@ -103,8 +103,8 @@ def test_the_page_says_where_everything_is() -> None:
 
 def test_status_tells_what_is_left_out_and_when_it_stood_still() -> None:
     reading = registers.decode_block(registers.encode_block(snapshot()))
-    reading |= integrity.decode_integrity(integrity.encode_integrity(snapshot()))
-    calm = client.as_table(reading | pulse.decode_pulse(pulse.encode_pulse(snapshot(pulse=Pulse()))), stalled=False)
+    reading |= integrity.BLOCK.decode(integrity.BLOCK.encode(snapshot()))
+    calm = client.as_table(reading | pulse.BLOCK.decode(pulse.BLOCK.encode(snapshot(pulse=Pulse()))), stalled=False)
     assert "over budget\n" in calm
-    table = client.as_table(reading | pulse.decode_pulse(pulse.encode_pulse(snapshot(pulse=PULSE))), stalled=False)
+    table = client.as_table(reading | pulse.BLOCK.decode(pulse.BLOCK.encode(snapshot(pulse=PULSE))), stalled=False)
     assert "99 of 100 within 0.00800 s; no map work either; stood still 4 times, latest 0.123 s in MATCH" in table

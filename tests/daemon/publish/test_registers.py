@@ -133,11 +133,11 @@ def test_sizes_are_those_promised() -> None:
     assert len(registers.encode_block(snapshot())) == 2 * registers.BLOCK_WORDS
     assert len(registers.encode_datagram(snapshot())) == registers.DATAGRAM_SIZE
     assert len(registers.encode_mirror(snapshot())) == 2 * registers.MIRROR_WORDS
-    assert len(lights.encode_lights(snapshot())) == 2 * lights.BLOCK_WORDS
-    assert lights.BLOCK_WORDS <= 125, "the lights must be readable in one request"
-    assert lights.ADDRESS + lights.BLOCK_WORDS <= integrity.ADDRESS
-    assert len(integrity.encode_integrity(snapshot())) == 2 * integrity.BLOCK_WORDS
-    assert registers.MIRROR_ADDRESS + registers.MIRROR_WORDS <= lights.ADDRESS
+    assert len(lights.BLOCK.encode(snapshot())) == 2 * lights.BLOCK.registers
+    assert lights.BLOCK.registers <= 125, "the lights must be readable in one request"
+    assert lights.BLOCK.address + lights.BLOCK.registers <= integrity.BLOCK.address
+    assert len(integrity.BLOCK.encode(snapshot())) == 2 * integrity.BLOCK.registers
+    assert lights.BLOCK.address >= registers.MIRROR_ADDRESS + registers.MIRROR_WORDS
     assert registers.BLOCK_WORDS <= registers.MIRROR_ADDRESS
     assert registers.MIRROR_WORDS <= 125, "the mirror must be readable in one request"
 
@@ -233,10 +233,10 @@ def test_no_snapshot_breaks_an_encoder(taken: Snapshot) -> None:
     block = registers.decode_block(registers.encode_block(taken))
     datagram = registers.decode_datagram(registers.encode_datagram(taken))
     assert block == {name: datagram[name] for name in block}
-    seen = lights.decode_lights(lights.encode_lights(taken))
+    seen = lights.BLOCK.decode(lights.BLOCK.encode(taken))
     assert {p.name: seen[p.name] for p in lights.TAIL.points} == {p.name: datagram[p.name] for p in lights.TAIL.points}
     assert all(value is None or math.isfinite(value) for value in seen.values())
-    trusted = integrity.decode_integrity(integrity.encode_integrity(taken))
+    trusted = integrity.BLOCK.decode(integrity.BLOCK.encode(taken))
     assert {p.name: trusted[p.name] for p in integrity.POINTS} == {p.name: datagram[p.name] for p in integrity.POINTS}
     assert all(value is None or math.isfinite(value) for value in trusted.values())
     mirror = registers.decode_mirror(registers.encode_mirror(taken))

@@ -1,4 +1,4 @@
-"""Modbus RTU: frames among noise and other devices' traffic, and a line that is a pseudo-terminal."""
+"""Modbus RTU: a line that is a pseudo-terminal, and one in memory."""
 
 from __future__ import annotations
 
@@ -8,84 +8,34 @@ import os
 import shutil
 import struct
 import subprocess
+import sys
+import termios
+import time
 import tty
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from daemon.endpoints import RtuLine
 from daemon.publish import registers, rtu
 from daemon.publish.modbus import ModbusPublisher
 from daemon.publish.rtu import RtuServer
-from daemon.publish.rtu_frames import MAX_FRAME, RtuFrames, framed
 from hal.clock import LoopClock, SystemClock, run_virtual
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.port import MemoryPort, memory_pair
 from tests.daemon.publish.network import publishing
 from tests.daemon.publish.test_registers import snapshot
+from tests.daemon.publish.test_rtu_frames import READ, UNIT, asked
 from tools.clients import read_rtu
-
-READ = struct.pack(">BHH", 4, 0, 64)
-UNIT = 17
-
-
-def crc(data: bytes) -> bytes:
-    """CRC-16 of the standard's appendix, bit by bit: polynomial 0xA001, low byte first."""
-    value = 0xFFFF
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ (0xA001 if value & 1 else 0)
-    return value.to_bytes(2, "little")
-
-
-def asked(body: bytes = READ, unit: int = UNIT) -> bytes:
-    frame = bytes([unit]) + body
-    return frame + crc(frame)
-
-
-def test_a_frame_of_the_standards_own_guide() -> None:
-    assert framed(17, bytes.fromhex("03006B0003")) == bytes.fromhex("1103006B00037687")
-    assert framed(UNIT, READ) == asked()
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 7, 100])
-def test_requests_in_pieces(size: int) -> None:
-    write = struct.pack(">BHHB6H", 16, 1000, 6, 12, *range(6))
-    stream = asked() + asked(write) + asked(b"\x06\x03\xe8\x00\x01") + asked(b"\x07")
-    frames = RtuFrames(UNIT)
-    found = [body for at in range(0, len(stream), size) for _, body in frames.take(stream[at : at + size])]
-    assert found == [READ, write, b"\x06\x03\xe8\x00\x01", b"\x07"]
-    assert frames.skipped == 0
-
-
-def test_what_is_for_others_is_passed_over() -> None:
-    frames = RtuFrames(UNIT)
-    answer = asked(b"\x04\x80" + registers.encode_block(snapshot()), unit=18)
-    assert frames.take(asked(unit=18) + answer + asked()) == [(UNIT, READ)]
-    assert frames.take(asked(unit=0)) == [(0, READ)], "0 is for all"
-    assert frames.take(asked()[:-1] + b"\x00") == []
-
-
-def test_a_good_request_is_found_at_once_after_any_garbage() -> None:
-    @given(st.binary(max_size=600) | st.lists(st.sampled_from([0, UNIT, 4, 16, 255]), max_size=600).map(bytes))
-    def run(garbage: bytes) -> None:
-        frames = RtuFrames(UNIT)
-        frames.take(garbage)
-        assert (UNIT, READ) in frames.take(asked())
-        assert len(frames._data) <= MAX_FRAME
-
-    run()
-
-
-# --- a line ----------------------------------------------------------------------------------------------------------
 
 
 @contextlib.asynccontextmanager
-async def line(baud: int = 115200) -> AsyncIterator[tuple[int, str, RtuServer, ModbusPublisher]]:
-    """A server on a pseudo-terminal: its other end, its name."""
+async def line(
+    baud: int = 115200, patience_s: float = 60.0
+) -> AsyncIterator[tuple[int, str, RtuServer, ModbusPublisher]]:
+    """A server on a pseudo-terminal: its other end, its name. It is patient: the tests' computer may be slow."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(rtu, "PATIENCE_S", patience_s)
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     tty.setraw(ours)
@@ -104,6 +54,7 @@ async def line(baud: int = 115200) -> AsyncIterator[tuple[int, str, RtuServer, M
         with contextlib.suppress(asyncio.CancelledError):
             await running
         os.close(ours)
+        patch.undo()
 
 
 @contextlib.contextmanager
@@ -168,6 +119,33 @@ def test_the_reference_client_reads_the_line() -> None:
         "seq": 70_000, "state": "TRACKING", "reason": 7, "fault": 9, "flags": 0b10111 | 1 << 5,
         "x": 1.2345, "y": -2.3456, "yaw": 3.0,
     }  # fmt: skip
+
+
+def test_the_reference_client_does_not_read_a_line_that_it_could_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adapter that cannot do parity would give nothing but damaged answers."""
+
+    def refuses(*_: object) -> None:
+        raise termios.error(22, "Invalid argument")
+
+    ours, theirs = os.openpty()
+    name = os.ttyname(theirs)
+    monkeypatch.setattr("tools.clients.read_rtu.termios.tcsetattr", refuses)
+    monkeypatch.setattr("tools.clients.read_rtu.tty.setraw", lambda _: None)
+    read_rtu.Line(name, 115200, UNIT).close()  # a pseudo-terminal has no parity
+    monkeypatch.setattr("tools.clients.read_rtu.os.ttyname", lambda _: "/dev/ttyUSB0")
+    with pytest.raises(OSError, match="cannot do 115200 bit/s with even parity: Invalid argument"):
+        read_rtu.Line(name, 115200, UNIT)
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.mark.parametrize("words", [["/dev/null"], ["/dev/nowhere"], ["/dev/pts/ptmx", "12345"], ["/dev/null", "fast"]])
+def test_the_reference_client_says_what_it_cannot_open(words: list[str]) -> None:
+    told = subprocess.run([sys.executable, read_rtu.__file__, *words], capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert "Traceback" not in told.stderr
+    assert told.stderr.startswith(words[0])
+    assert "19200" in told.stderr
 
 
 class Line:
@@ -246,6 +224,57 @@ def test_half_a_request_is_forgotten_when_the_line_falls_silent() -> None:
         running.cancel()
 
     run_virtual(run())
+
+
+def test_an_answer_for_which_the_master_waits_no_longer_is_not_sent() -> None:
+    """Its next request begins within the pause before the answer: what was sent then would collide with it."""
+
+    async def run() -> None:
+        at = Line()
+        running = asyncio.create_task(at.server.run())
+        await asyncio.sleep(1.0)
+        for first in (asked(), asked() + b"\x00"):  # and a stray byte where the direction changes
+            at.heard.clear()
+            at.master.write(first)
+            await asyncio.sleep(0.002)
+            at.master.write(asked(b"\x07")[:3])
+            await asyncio.sleep(0.02)
+            assert at.heard == []
+            at.master.write(asked(b"\x07")[3:])
+            await asyncio.sleep(1.0)
+            assert [data for _, data in at.heard] == [asked(b"\x07")]
+        assert at.server.late == 2
+        at.master.write(asked())
+        await asyncio.sleep(0.002)
+        at.master.write(b"\xff")
+        await asyncio.sleep(1.0)
+        assert at.heard[-1][1] == asked(), "a stray byte is no request"
+        running.cancel()
+
+    run_virtual(run())
+
+
+@pytest.mark.realtime
+def test_what_waited_while_the_computer_had_no_time_is_not_answered() -> None:
+    """On a pseudo-terminal: the loop stands still for longer than a master waits, then goes on as ever."""
+
+    async def run() -> None:
+        async with line(patience_s=rtu.PATIENCE_S) as (ours, _, server, publisher):
+            await asyncio.sleep(2 * rtu.TURN_S)
+            write = struct.pack(">BHHB4H", 16, 1000, 4, 8, 1, 2, 0, 0)  # a RESET that its master has given up
+            os.write(ours, asked(write))
+            time.sleep(rtu.PATIENCE_S + 0.2)  # noqa: ASYNC251 - it is to stand still
+            os.set_blocking(ours, False)
+            await asyncio.sleep(0.1)
+            with pytest.raises(BlockingIOError):
+                os.read(ours, 1)
+            os.set_blocking(ours, True)
+            assert (server.late, server.requests) == (1, 0)
+            assert publisher.answer(struct.pack(">BHH", 3, 1000, 1))[2:] == bytes(2), "it was not carried out, either"
+            os.write(ours, asked())
+            assert len(await answer(ours, 133)) == 133
+
+    asyncio.run(run())
 
 
 def test_a_line_that_goes_is_told_and_can_be_opened_anew() -> None:

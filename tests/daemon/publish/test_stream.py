@@ -126,6 +126,22 @@ def test_states_and_loops_are_said_when_they_change(tmp_path: Path) -> None:
     run(tmp_path / "stream", body)
 
 
+def test_who_asks_for_the_state_is_told_it_at_once(tmp_path: Path) -> None:
+    """It may not change for hours."""
+
+    async def body(server: StreamServer) -> None:
+        early = await wanting(server, "state")
+        server.publish(SNAPSHOT)
+        late = await connected(server)
+        late.ask({"want": ["state"]})
+        assert (await early.frame())["data"] == (await late.frame())["data"]
+        late.ask({"want": ["state", "loop"]})
+        server.publish(replace(SNAPSHOT, seq=8, state=State.LOST))
+        assert (await late.frame())["data"]["state_name"] == "LOST", "and not again with the next request"
+
+    run(tmp_path / "stream", body)
+
+
 def test_without_clients_nothing_is_encoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serve(tmp_path / "stream")
     monkeypatch.setattr(stream, "_encode", lambda message: pytest.fail("encoded"))
@@ -166,11 +182,11 @@ def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(stream, "STUCK_S", 0.05)
 
     async def body(server: StreamServer) -> None:
-        await wanting(server, "pose")
+        tap = await wanting(server, "pose")
+        tap.writer.transport.pause_reading()
         for seq in range(3000):
             server.publish(replace(SNAPSHOT, seq=seq))
-        await asyncio.sleep(0.2)
-        assert not server.clients
+        await until(lambda: not server.clients)
 
     run(tmp_path / "stream", body)
 
@@ -269,16 +285,27 @@ def test_any_bytes_from_a_client_do_no_harm(chunks: list[bytes]) -> None:
 
 
 def test_a_scan_message_names_everything_a_reader_needs() -> None:
-    assert set(scan_message(raw_scan())) == {"seq", "t_mono", "bearing_first", "bearing_step", "ranges"}
+    told = scan_message(raw_scan())
+    assert set(told) == {
+        *("seq", "t_mono", "bearing_first", "bearing_step", "ranges"),
+        *("range_min", "range_max", "beam_dt", "period"),
+    }
+    assert (told["range_min"], told["range_max"], told["beam_dt"], told["period"]) == (0.023, 60.0, 0.0, 0.025)
 
 
 def test_the_reference_client_reads_it(tmp_path: Path) -> None:
     async def body(server: StreamServer) -> None:
-        command = [str(ROOT / "tools/clients/watch_stream.py"), str(server.path), "pose", "scan", "loop"]
+        command = [str(ROOT / "tools/clients/watch_stream.py"), str(server.path), "pose", "scan", "state", "faults"]
+        server.publish(SNAPSHOT)
+        server.on_faults(1.0, [(104, "no valid scan", "check the cable")])
         process = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=asyncio.subprocess.PIPE)
         assert process.stdout is not None
-        assert b"'schema': 1" in await asyncio.wait_for(process.stdout.readline(), 10.0)
+        hello = await asyncio.wait_for(process.stdout.readline(), 10.0)
+        assert hello.startswith(b"this is lumiloop 'agv', process ")
         await until(lambda: any(client.wants for client in server.clients))
+        assert await asyncio.wait_for(process.stdout.readline(), 10.0) == b"1.000 TRACKING: meaning 3 (remedy)\n"
+        faults = await asyncio.wait_for(process.stdout.readline(), 10.0)
+        assert faults == b"faults: 104 no valid scan (check the cable)\n"
         server.publish(SNAPSHOT)
         server.on_scan(raw_scan())
         pose = await asyncio.wait_for(process.stdout.readline(), 10.0)

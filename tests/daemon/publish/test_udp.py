@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from daemon.publish import registers, udp
-from daemon.publish.udp import PoseSender, parse_receiver
+from daemon.publish.udp import PoseSender
 from hal import inet
 from hal.clock import run_virtual
-from hal.errors import DeviceMissing, DeviceRefused
+from hal.errors import DeviceMissing
 from tests.daemon.publish.network import until
 from tests.daemon.publish.test_registers import snapshot
 
@@ -117,7 +117,7 @@ def test_what_the_kernel_does_not_take_is_dropped_and_said_once(caplog: pytest.L
     async def run() -> PoseSender:
         sender = PoseSender(["192.0.2.1:15020"])
         await sender.start()
-        sender._sockets[socket.AF_INET] = Failing(errors)  # type: ignore[assignment]  # all that is asked of a socket
+        sender._sockets[socket.AF_INET, 0] = Failing(errors)  # type: ignore[assignment]  # all that is asked of a socket
         for _ in range(6):
             sender.publish(snapshot())
         await sender.close()
@@ -138,18 +138,9 @@ def test_a_receiver_that_never_reads_does_not_block() -> None:
         assert sender.receivers[0].sent + sender.receivers[0].dropped == 2000
 
 
-@pytest.mark.parametrize(
-    ("text", "host", "port"),
-    [("192.168.0.20:15020", "192.168.0.20", 15020), ("plc:1", "plc", 1), ("[fe80::1]:65535", "fe80::1", 65535)],
-)
-def test_receivers(text: str, host: str, port: int) -> None:
-    receiver = parse_receiver(text)
-    assert (receiver.host, receiver.port) == (host, port)
-
-
 @pytest.mark.parametrize("text", ["", "plc", "plc:", ":15020", "plc:0", "plc:65536", "plc:x", "fe80::1:15020", "plc:¹"])
 def test_what_is_not_a_receiver_is_refused(text: str) -> None:
-    with pytest.raises(DeviceRefused, match="write host:port"):
+    with pytest.raises(ValueError, match="Expected"):
         PoseSender([text])
 
 
@@ -168,5 +159,43 @@ def test_ipv6() -> None:
     except OSError:
         pytest.skip("this computer has no IPv6 loopback address")
     with sock:
-        asyncio.run(sent_to([f"[::1]:{sock.getsockname()[1]}"]))
-        assert registers.decode_datagram(sock.recv(512))["seq"] == 0
+        asyncio.run(sent_to([f"[::1]:{sock.getsockname()[1]}", f"[::1%lo]:{sock.getsockname()[1]}"]))
+        for _ in range(2):
+            assert registers.decode_datagram(sock.recv(512))["seq"] == 0
+
+
+LOOPBACK = socket.if_nametoindex("lo")
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="this computer has no IPv6")
+def test_a_group_of_a_named_network_interface_is_sent_to_by_that() -> None:
+    """The loopback interface has no groups: it is asked for what the kernel would use."""
+
+    async def run() -> None:
+        sender = PoseSender(["[ff15::42%lo]:5000", f"[fe80::1%{LOOPBACK}]:5000", "[ff15::42]:5000"])
+        await sender.start()
+        addresses = [receiver.address for receiver in sender.receivers]
+        assert addresses == [
+            (socket.AF_INET6, ("ff15::42", 5000, 0, LOOPBACK)),
+            (socket.AF_INET6, ("fe80::1", 5000, 0, LOOPBACK)),
+            (socket.AF_INET6, ("ff15::42", 5000)),
+        ]
+        for interface in (LOOPBACK, 0):
+            with sender._open(socket.AF_INET6, interface) as sock:
+                assert sock.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF) == interface
+        await sender.close()
+
+    asyncio.run(run())
+
+
+def test_an_interface_that_is_not_there_is_named_with_those_that_are(caplog: pytest.LogCaptureFixture) -> None:
+    async def run() -> None:
+        with pytest.raises(DeviceMissing, match=r"no network interface eth77 on this computer \(name one .*lo"):
+            await inet.resolve("ff15::42%eth77", 5000)
+        sender = PoseSender(["[ff15::42%eth77]:5000"])
+        await sender.start()
+        await asyncio.sleep(0.01)
+        await sender.close()
+
+    asyncio.run(run())
+    assert "pose receiver [ff15::42%eth77]:5000: no network interface eth77" in caplog.text

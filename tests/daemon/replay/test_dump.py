@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from daemon import blackbox, checkpoint, cli, disk
-from daemon.checkpoint import ROOT, CannotRestore, Piece, restore
 from daemon.config import Config
 from daemon.disk import SegmentWriter
 from daemon.flight import ABOUT, DUMP, Flight
 from daemon.health import Fault
+from daemon.moment import CYCLE_PARTS
 from daemon.replay import replay
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
@@ -74,6 +74,10 @@ def test_every_state_is_a_beginning(tmp_path: Path) -> None:
         assert 0 < said["recorded_run"]["cycles"] < whole["cycles"]
 
 
+def broken(*_: object) -> None:
+    raise KeyError("a defect")
+
+
 async def asked(bench: Bench) -> None:
     """Command 7 in the middle of a drive."""
     await long(bench)
@@ -88,6 +92,13 @@ async def asked(bench: Bench) -> None:
         if said:
             break
     assert said == [""]
+    bench.recorder.box.dump(refused.append)
+    assert refused[1].startswith("one was made a moment ago; another can be made in ")
+    bench.recorder.box._ask_from = 0.0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.recorder.box, "_begin", broken)
+        bench.recorder.box.dump(refused.append)
+    assert refused[2] == "KeyError('a defect')"
     await bench.drive(1.0)
 
 
@@ -171,7 +182,7 @@ def test_everything_that_a_cycle_remembers_is_kept_or_left_out_on_purpose() -> N
         return set(vars(bench.daemon.cycle))
 
     left_out = {"parts", "cycle_us", "failing", "laps", "taker", "_switch", "_switched", "_held"}  # their jobs are kept
-    assert run_virtual(cycle()) == {*blackbox.CYCLE_PARTS, *left_out}
+    assert run_virtual(cycle()) == {*CYCLE_PARTS, *left_out}
 
 
 def test_a_ring_whose_run_was_killed_is_kept_as_a_dump_and_one_that_ended_goes(tmp_path: Path) -> None:
@@ -192,36 +203,9 @@ def test_a_ring_whose_run_was_killed_is_kept_as_a_dump_and_one_that_ended_goes(t
     assert frame.payload == b"abc"
 
 
-@pytest.mark.parametrize(
-    ("module", "name"),
-    [
-        ("os", "system"),
-        ("subprocess", "Popen"),
-        ("builtins", "eval"),
-        ("daemon.cli", "main"),
-        ("daemon.disk", "SegmentWriter"),
-        ("daemon.bridge", "re"),
-        ("estimator.records", "np"),
-        ("estimator.records", "np.ctypeslib.os.system"),
-    ],
-)
-def test_a_state_makes_nothing_but_what_a_state_consists_of(module: str, name: str) -> None:
-    content = b"\x80\x04" + f"c{module}\n{name}\n(S'true'\ntR.".encode()
-    with pytest.raises(CannotRestore, match="does not belong"):
-        restore(iter([Piece(ROOT, "", content)]))
-
-
-def test_a_state_takes_no_functions_from_elsewhere() -> None:
-    with pytest.raises(CannotRestore, match="does not belong"):
-        checkpoint._function("os", "popen.<locals>.x", 1, (), None)
-
-
 def test_a_defect_of_the_flight_recorder_is_a_fault_and_the_cycle_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def broken(*_: object) -> None:
-        raise KeyError("a defect")
-
     monkeypatch.setattr(checkpoint, "take", broken)
     bench = record(tmp_path / "rec", long)
     assert bench.snapshots[-1].pose is not None

@@ -32,6 +32,7 @@ from hal.clock import run_virtual
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
 from hal.replay.report import LogReport
+from tests.daemon.driven import during
 from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.test_lights import LIDAR, Bench, decoded, settings
 from tests.daemon.test_lights_residuals import even_map
@@ -77,13 +78,7 @@ def record(
 ) -> Recorded:
     async def go() -> Recorded:
         bench = Recorded(folder, lidar, lights or Lights(SURVEY, PROFILE_A, 12.5))
-        stop = asyncio.Event()
-        running = asyncio.create_task(bench.daemon.run(stop))
-        try:
-            await scenario(bench)
-        finally:
-            stop.set()
-            await asyncio.wait_for(running, 10.0)
+        await during(bench.daemon, scenario(bench))
         return bench
 
     return run_virtual(go(), start=100.0)

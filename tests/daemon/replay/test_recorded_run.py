@@ -32,6 +32,7 @@ from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
+from tests.daemon.driven import during
 from tests.daemon.replay.room import read_tum
 
 USB, SERIAL = "/dev/ttyACM0", "/dev/ttyUSB0"
@@ -121,13 +122,7 @@ def record(
 ) -> Bench:
     async def go() -> Bench:
         bench = Bench(folder, device, start, keep_s)
-        stop = asyncio.Event()
-        running = asyncio.create_task(bench.daemon.run(stop))
-        try:
-            await scenario(bench)
-        finally:
-            stop.set()
-            await asyncio.wait_for(running, 10.0)
+        await during(bench.daemon, scenario(bench))
         return bench
 
     return run_virtual(go())

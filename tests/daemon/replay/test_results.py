@@ -133,6 +133,16 @@ def test_no_poses_no_lines() -> None:
     assert tum(Trajectory(np.empty(0), np.empty((0, 3)))).decode().count("\n") == 1
 
 
+def test_no_line_is_drawn_where_the_robot_was_carried() -> None:
+    grid = Grid(np.zeros(2), 0.05, np.full((100, 200), -3.0, np.float32))
+    ways = [np.column_stack((np.arange(begin, begin + 2.0, 0.02), np.full(100, 2.5))) for begin in (1.0, 7.0)]
+    pixels = draw(grid, np.vstack(ways)).astype(int)
+    coloured = (np.ptp(pixels, axis=2) > 60).any(axis=0)
+    scale = pixels.shape[1] / 10.0
+    for x, drawn in ((1.5, True), (2.5, True), (4.0, False), (5.5, False), (7.5, True), (8.5, True)):
+        assert coloured[round(x * scale)] == drawn
+
+
 def test_folder_problems_are_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputRefused, match=r"file is a file; name a folder"):

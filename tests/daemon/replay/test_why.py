@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from daemon import blackbox, cli, disk
+from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
 from daemon.why import NoMoment, Span, find, meant
 from daemon.witness import Told
 from hal.odometry import RawOdometry
+from hal.replay.recording import Kind
 from tests.daemon.replay.test_dump import let_write, unplugged
 from tests.daemon.replay.test_recorded_run import Bench, record
 
@@ -112,6 +114,25 @@ def test_it_is_drawn(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     asked("9", recorded, capsys, "--out", str(tmp_path / "why.png"))
     with Image.open(tmp_path / "why.png") as image:
         assert min(image.size) > 700
+
+
+@pytest.mark.parametrize("lost", [{"t_utc": None}, {"t_mono": "soon"}, {"t_utc": float("nan")}, {"t_utc": 1e300}])
+def test_a_recording_whose_head_says_no_time_is_named_and_passed_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], lost: dict[str, object]
+) -> None:
+    """Records come a second apart; the second recording is whole."""
+    for name, header in (("bad", lost), ("good", {})):
+        writer = SegmentWriter(tmp_path, name, {"recording": name, "t_mono": 5.0, "t_utc": AT, **header})
+        writer.put(Kind.RX, 0, 6.0, b"abc")
+        writer.close()
+    assert cli.main(["why", "3600", str(tmp_path / "bad")]) == 1
+    said = capsys.readouterr().err
+    assert "bad: its head" in said
+    assert "lumiloop replay" in said
+    assert cli.main(["why", "3600", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "passed over" in said
+    assert "there is" in said
 
 
 async def slipping(bench: Bench) -> None:

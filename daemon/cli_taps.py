@@ -1,0 +1,123 @@
+"""Commands that listen to a running daemon's local stream, or need a library of their own: words and options.
+
+Their bodies are in the room `taps`, which is loaded only when one of them runs; what it needs beyond the core is an
+extra of the package, and who lacks it is told which.
+"""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from pathlib import Path
+
+from daemon import cli
+
+Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
+OURS = ("daemon", "estimator", "hal", "taps")
+
+
+def add(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add them all."""
+    _export(commands.add_parser("export", help="write a recording as MCAP (ROS 2, Foxglove), TUM or KITTI"))
+    _record_mcap(commands.add_parser("record-mcap", help="record a running daemon as MCAP, until interrupted"))
+    _view(commands.add_parser("view", help="show a running daemon, or a recording, as a web page"))
+    _doctor(commands.add_parser("doctor", help="say what is wrong with this installation, and what to fix first"))
+    _plan(commands.add_parser("plan", help="where to hang how many lamps over a floor, and what comes of it"))
+    _metrics(commands.add_parser("metrics", help="serve Prometheus metrics and VDA 5050's position, on this computer"))
+    _foxglove(commands.add_parser("foxglove", help="serve a running daemon live for the Foxglove app"))
+    _lamps(commands.add_parser("lamps", help="which lamps are dead, dimming or moved, and when to replace them"))
+
+
+def _lamps(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--history", type=Path, metavar="FILE", help="default: lamps.csv beside the folder of maps")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    listening(parser)
+    parser.set_defaults(body=cli.later("taps.lamps.command", "main"))
+
+
+def _metrics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--listen", default="127.0.0.1:9464", metavar="HOST:PORT", help="default: 127.0.0.1:9464")
+    listening(parser)
+    parser.set_defaults(body=cli.later("taps.serve_metrics", "main"))
+
+
+def _foxglove(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
+    listening(parser)
+    parser.set_defaults(body=needing("foxglove", "taps.foxglove_live", "main"))
+
+
+def _plan(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("map", type=Path, metavar="MAP", help="floor plan: map_server's YAML or PGM, or a *.lumimap")
+    parser.add_argument("--height", type=float, default=2.5, metavar="M", help="of the lamps above the floor; 2.5")
+    parser.add_argument("--accuracy", type=float, default=0.10, metavar="M", help="wanted from light alone; 0.10")
+    parser.add_argument("--links", type=int, default=4, metavar="N", help="lamps that a place should see; 4")
+    parser.add_argument("--share", type=float, default=95.0, metavar="PERCENT", help="of places where both hold; 95")
+    parser.add_argument("--spacing", type=float, default=0.5, metavar="M", help="between spots for lamps; 0.5")
+    parser.add_argument("--reach", type=float, default=10.0, metavar="M", help="of the lidar; 10")
+    parser.add_argument("--lamps", type=int, metavar="N", help="as many, whatever is wanted")
+    parser.add_argument("--survey", type=Path, metavar="FILE", help="judge these lamps instead, in the map's frame")
+    parser.add_argument(
+        "--out", type=Path, default=Path("plan"), metavar="DIR", help="for lights.toml and plan.png; plan"
+    )
+    cli.config_arguments(parser)
+    parser.set_defaults(body=cli.later("daemon.planning.command", "main"))
+
+
+def _doctor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    listening(parser)
+    parser.set_defaults(body=cli.loaded("taps.doctor.report", "main"))
+
+
+def _export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="RECORDING", help="recording or dump; or an unfinished MCAP file")
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="ROS 2 messages; needs lumiloop[mcap]")
+    parser.add_argument("--tum", type=Path, metavar="FILE", help="trajectory: stamp x y z qx qy qz qw")
+    parser.add_argument("--kitti", type=Path, metavar="FILE", help="trajectory: 12 numbers of a matrix a line")
+    parser.add_argument("--online", action="store_true", help="trajectories as published, not as known at the end")
+    cli.config_arguments(parser)
+    parser.set_defaults(body=cli.estimating("taps.export", "main"))
+
+
+def _record_mcap(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", type=Path, metavar="FILE", help="MCAP file to write")
+    parser.add_argument("--raw", action="store_true", help="also the bytes between daemon and devices")
+    parser.add_argument("--seconds", type=float, metavar="S", help="stop after so long; default: when interrupted")
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    listening(parser)
+    parser.set_defaults(body=needing("mcap", "taps.record_mcap", "main"))
+
+
+def _view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", nargs="?", type=Path, metavar="REC", help="a recording or a log; default: the daemon")
+    parser.add_argument("--bind", default="127.0.0.1", metavar="ADDR", help="address to serve at; default: %(default)s")
+    parser.add_argument("--port", type=int, default=8090, help="default: %(default)s; 0: any that is free")
+    parser.add_argument("--write", action="store_true", help="take orders from those who have the token")
+    parser.add_argument("--token", type=Path, metavar="FILE", help="that holds the token; default: a new one each time")
+    listening(parser)
+    parser.set_defaults(body=needing("view", "taps.view.command", "main"))
+
+
+def listening(parser: argparse.ArgumentParser) -> None:
+    """The options that say which daemon to listen to; ``args.stream``: Path or None for the configuration's."""
+    parser.add_argument(
+        "--stream", type=Path, metavar="SOCKET", help="the daemon's local stream; default: that of the configured name"
+    )
+    cli.config_arguments(parser)
+
+
+def needing(extra: str, module: str, name: str) -> cli.Body:
+    """A body that resolves the configuration and then loads its module, which needs an extra of the package."""
+
+    def body(args: argparse.Namespace) -> int:
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing in OURS:
+                raise
+            return cli.fail(f"this command needs {missing}, which is not installed: pip install 'lumiloop[{extra}]'")
+        return cli.loaded(module, name)(args)
+
+    return cli.configured(body)

@@ -1,0 +1,28 @@
+"""Where the daemon keeps things: what it learns, its maps, its sockets."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+
+def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where what is learned is kept: the service manager's StateDirectory, else the user's own."""
+    if named := environment.get("STATE_DIRECTORY", "").partition(":")[0]:
+        return Path(named)
+    home = environment.get("XDG_STATE_HOME") or str(Path(environment.get("HOME", "/")) / ".local" / "state")
+    return Path(home) / "lumiloop"
+
+
+def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where sockets are: the service manager's RuntimeDirectory, else the user's own, else beside what is learned."""
+    if named := environment.get("RUNTIME_DIRECTORY", "").partition(":")[0]:
+        return Path(named)
+    user = environment.get("XDG_RUNTIME_DIR", "")
+    return Path(user) / "lumiloop" if user else state_folder(environment)
+
+
+def maps_folder(configured: str) -> Path:
+    """Where maps are kept: as ``map.folder`` says, else beside what is learned."""
+    return Path(configured) if configured else state_folder() / "maps"
