@@ -1,0 +1,154 @@
+"""What a check may ask: of the computer, of its devices, and of the daemon, if one runs. Tests have their own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import resource
+import shutil
+import socket
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from hal import i2c_linux
+from hal.hokuyo import discover
+from hal.opening import open_bus, open_port
+from hal.photodiode.probe import BusFinding, probe_bus
+from hal.probe import Finding, identify_at
+from taps.frames import Faults, Hello, Lights, NotTheStream, Pose, StateChange
+from taps.stream import Stream
+
+LISTEN_S: Final = 3.0
+TIME_ERROR: Final = 5
+"""adjtimex(2): the clock is not synchronised."""
+_TIMEX_BYTES: Final = 512  # more than struct timex on any architecture
+
+
+@dataclass(slots=True)
+class Heard:
+    """What a running daemon has told: latest pose, faults, and every lamp with what it was last used for.
+
+    ``lamps``: (code, lamp ID or None) to the use, as `daemon.publish.snapshot.LinkUse` numbers it.
+    """
+
+    name: str = ""
+    pid: int = 0
+    pose: Pose | None = None
+    faults: Faults | None = None
+    lights: Lights | None = None
+    lamps: dict[tuple[int, int | None], int] = field(default_factory=dict)
+
+
+class Host:
+    """The computer that the program runs on."""
+
+    def utc(self) -> float:
+        """Seconds since the Unix epoch, by the calendar of the computer."""
+        return time.time()
+
+    def synchronised(self) -> bool | None:
+        """Whether the calendar follows a time server; None where the system does not say."""
+        try:
+            state = int(ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
+        except (OSError, AttributeError):
+            return None
+        return None if state < 0 else state != TIME_ERROR
+
+    def user(self) -> str:
+        """Who we are."""
+        import pwd
+
+        try:
+            return pwd.getpwuid(os.geteuid()).pw_name
+        except KeyError:
+            return str(os.geteuid())
+
+    def exists(self, path: str) -> bool:
+        """Whether there is something at a path."""
+        return Path(path).exists()
+
+    def usable(self, path: str) -> bool:
+        """Whether it may be read and written by us."""
+        return os.access(path, os.R_OK | os.W_OK)
+
+    def lidars(self) -> list[str]:
+        """Ports at which a HOKUYO may be."""
+        return discover.candidates()
+
+    def buses(self) -> list[str]:
+        """I2C buses of this computer."""
+        return list(i2c_linux.buses())
+
+    def lidar_at(self, device: str) -> Finding:
+        """Who is at a port."""
+        return asyncio.run(identify_at(open_port, device))
+
+    def chips_on(self, bus: str) -> BusFinding:
+        """What answers on a bus."""
+        return asyncio.run(probe_bus(open_bus, bus))
+
+    def free_bytes(self, folder: Path) -> int:
+        """Room on the disk that a folder, or what there is of the way to it, is on."""
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        return shutil.disk_usage(folder).free
+
+    def taken(self, kind: socket.SocketKind, host: str, port: int) -> str:
+        """Why a server could not listen there; empty: it could."""
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, kind) as sock:
+            if kind is socket.SOCK_STREAM:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                sock.bind((host, port))
+            except OSError as error:
+                return error.strerror or str(error)
+        return ""
+
+    def warm(self, lights: bool) -> bool:
+        """Whether the kernels of this version have been compiled here.
+
+        Raises:
+            OSError, RuntimeError: there is nowhere to keep them.
+        """
+        from daemon.warmup import mark_of
+
+        return mark_of("warm-lights" if lights else "warm").exists()
+
+    def realtime(self) -> bool:
+        """Whether we may take a real-time priority."""
+        return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
+
+    def listen(self, path: Path) -> Heard | str:
+        """What a running daemon tells for some seconds; a text: why nothing."""
+        return asyncio.run(_listen(path))
+
+
+async def _listen(path: Path) -> Heard | str:
+    heard, why = Heard(), ""
+    stream = Stream(path, ("pose", "faults", "lights", "state"), patient=False)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LISTEN_S), contextlib.aclosing(stream.frames()) as frames:
+            try:
+                async for frame in frames:
+                    match frame:
+                        case Hello():
+                            heard.name, heard.pid = frame.name, frame.pid
+                        case Pose():
+                            heard.pose = frame
+                        case Faults():
+                            heard.faults = frame
+                        case Lights():
+                            heard.lights = frame
+                            heard.lamps |= {(link.code, link.lamp_id): link.use for link in frame.links}
+                        case StateChange():
+                            continue
+                        case _:
+                            why = getattr(frame, "text", "")
+            except NotTheStream as error:
+                why = str(error)
+    return heard if heard.pid else why or "nobody answers"

@@ -1,0 +1,143 @@
+"""`lumiloop export RECORDING --mcap OUT.mcap`: a recording, or a dump of a flight recorder, in other formats.
+
+The recording is replayed, so that what is written is what the daemon said then, covariances and all. What stops it
+early is said, and what was read until then is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon import cli, warmup
+from daemon.replay import Given
+from daemon.results import OutputRefused, kitti, tum
+from daemon.wholefile import write_whole
+from hal.errors import HalError
+from taps.inside import Retold
+
+if TYPE_CHECKING:  # needs an extra, which who wants a trajectory alone does not
+    from taps.mcapfile import McapFile
+    from taps.ros import Translator
+
+GROWTH: Final = 1.25
+"""The map is written when it has so many times the keyframes of the one before: a long drive has few pictures of it."""
+FIRST_MAP: Final = 5
+MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    if args.mcap is None and args.tum is None and args.kitti is None:
+        return cli.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", cli.USAGE)
+    try:
+        if args.mcap is not None and _is_mcap(args.log):
+            return _save(args)
+        return _export(args)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
+            raise
+        return cli.fail(f"MCAP files need {error.name}, which is not installed: pip install 'lumiloop[mcap]'")
+    except (HalError, OutputRefused, warmup.CannotLoad) as error:
+        return cli.fail(str(error))
+    except OSError as error:
+        return cli.fail(f"{error.filename or args.log}: {error.strerror}; free space or name another file")
+
+
+def _is_mcap(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+
+
+def _save(args: argparse.Namespace) -> int:
+    """An MCAP file is the source: what is whole in it is copied."""
+    from taps.recover import NotMcap, recover
+
+    if args.tum or args.kitti:
+        return cli.fail(f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole", cli.USAGE)
+    try:
+        found = recover(args.log, args.mcap)
+    except NotMcap as error:
+        return cli.fail(str(error))
+    cli.say(f"{args.mcap}: {found.sentence()}")
+    return cli.OK
+
+
+def _export(args: argparse.Namespace) -> int:
+    keys = tuple(override.partition("=")[0].strip() for override in args.set)
+    told = Retold(args.log, args.settings, Given(args.config is not None, keys))
+    stopped = ""
+    if args.mcap is None:
+        stopped = _run(told, None, None)
+    else:
+        from taps.mcapfile import McapFile
+        from taps.ros import Translator
+
+        with _beside(args.mcap) as path, McapFile(path, flush_s=0.0) as file:
+            translator = Translator(told.config.lidar.mount, told.source.utc)
+            stopped = _run(told, translator, file)
+            _draw(told, translator, file)
+        cli.say(f"{args.mcap}: {file.messages} messages")
+    final = told.rerun.ledger.online() if args.online else told.rerun.ledger.final()
+    for path, text in ((args.tum, tum), (args.kitti, kitti)):
+        if path is not None:
+            write_whole(path, text(final))
+            cli.say(f"{path}: {len(final.stamps)} poses")
+    for sentence in told.source.report.sentences():
+        cli.say(f"{args.log}: {sentence}")
+    if told.rerun.comparison.differ:
+        cli.say(f"the replay is not the recorded run ({told.rerun.comparison.first}): other software, or records lost")
+    return cli.fail(f"{stopped}; what was read until then is written") if stopped else cli.OK
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A path beside, which takes its place when all went well."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _run(told: Retold, translator: Translator | None, file: McapFile | None) -> str:
+    """Play it; returns why it ended before its end, empty if it did not."""
+    due, shown = FIRST_MAP, time.monotonic()
+    try:
+        for frame in told.frames(raw=file is not None):
+            if translator is None or file is None:
+                continue
+            for out in translator.take(frame):
+                file.write(out)
+            if told.rerun.ledger.keyframes >= due:
+                due = int(GROWTH * told.rerun.ledger.keyframes) + 1
+                _draw(told, translator, file)
+            if time.monotonic() - shown > 1.0:
+                shown = time.monotonic()
+                _say(f"export: {100 * told.source.done // max(1, told.source.total)} %")
+    except HalError as error:
+        return str(error)
+    finally:
+        if sys.stderr.isatty():
+            _say("")
+    return ""
+
+
+def _draw(told: Retold, translator: Translator, file: McapFile) -> None:
+    grid = told.rerun.render()
+    corner = (float(grid.origin[0]), float(grid.origin[1]))
+    for out in translator.grid(told.rerun.t_mono, corner, grid.resolution, grid.log_odds):
+        file.write(out)
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"\r\x1b[K{text}" if sys.stderr.isatty() else f"{text}\n")
+    sys.stderr.flush()

@@ -1,0 +1,131 @@
+"""`lumiloop foxglove`: a running daemon, live, for the Foxglove app: open a connection to ws://ADDRESS:8765.
+
+The messages are those of the MCAP files. What stands still (map, mount, state) is said again to whoever subscribes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import signal
+import threading
+from typing import Final
+
+import foxglove
+from foxglove.websocket import ChannelView, Client, ServerListener
+
+from daemon import cli
+from daemon.config import Config
+from daemon.endpoints import parse_endpoint
+from taps import rostypes
+from taps.frames import Hello, NotTheStream
+from taps.ros import TOPICS, Out, Translator
+from taps.stream import Lost, Stream, path_of
+
+WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    try:
+        host, port = parse_endpoint(args.listen)
+        bridge = Bridge(host, port, args.settings.name)
+    except ValueError as error:
+        return cli.fail(f"--listen: {error}", cli.USAGE)
+    except (OSError, RuntimeError) as error:
+        return cli.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
+    cli.say(f"ws://{host}:{bridge.port}")
+    try:
+        stream = Stream(args.stream or path_of(args.settings.name), WANTED)
+        asyncio.run(_until_stopped(stream, args.settings, bridge))
+    except NotTheStream as error:
+        return cli.fail(str(error))
+    finally:
+        bridge.close()
+    return cli.OK
+
+
+class Bridge(ServerListener):
+    """The live server, and a channel for each topic."""
+
+    def __init__(self, host: str, port: int, name: str) -> None:
+        """Begin to serve; raises OSError or RuntimeError where it cannot be listened."""
+        self._context = foxglove.Context()
+        self._latest: dict[str, Out] = {}
+        self._again: set[str] = set()
+        self._lock = threading.Lock()
+        self._channels = {
+            topic: foxglove.Channel(
+                topic,
+                schema=foxglove.Schema(
+                    name=about.kind, encoding="ros2msg", data=rostypes.definition(about.kind).encode()
+                ),
+                message_encoding="cdr",
+                context=self._context,
+            )
+            for topic, about in TOPICS.items()
+            if topic != "/lumiloop/raw"
+        }
+        self._server = foxglove.start_server(
+            name=f"lumiloop {name}", host=host, port=port, server_listener=self, context=self._context
+        )
+        self.port = int(self._server.port)
+
+    def send(self, out: Out) -> None:
+        """One message to whoever has subscribed; before it what those who are new have missed."""
+        if self._again:
+            with self._lock:
+                again, self._again = self._again, set()
+            for topic in again & set(self._latest):
+                self._channels[topic].log(self._latest[topic].data, log_time=self._latest[topic].t_ns)
+        channel = self._channels.get(out.topic)
+        if channel is None:
+            return
+        if TOPICS[out.topic].latched:
+            self._latest[out.topic] = out
+        if channel.has_sinks():
+            channel.log(out.data, log_time=out.t_ns)
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """A client wants a topic: what was said of it last will be said again; called by the server's thread."""
+        with self._lock:
+            self._again.add(channel.topic)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.stop()
+
+
+async def _until_stopped(stream: Stream, settings: Config, bridge: Bridge) -> None:
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    running = asyncio.ensure_future(follow(stream, settings, bridge))
+    stopping = asyncio.ensure_future(stop.wait())
+    try:
+        await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if running.done():
+            running.result()
+    finally:
+        for task in (running, stopping):
+            task.cancel()
+        await asyncio.gather(running, stopping, return_exceptions=True)
+
+
+async def follow(stream: Stream, settings: Config, bridge: Bridge) -> None:
+    """Pass on all that is told, until cancelled.
+
+    Raises:
+        NotTheStream: the other end is no daemon of this version.
+    """
+    translator = Translator(settings.lidar.mount)
+    async with contextlib.aclosing(stream.frames()) as frames:
+        async for frame in frames:
+            if isinstance(frame, Lost):
+                cli.say(f"{frame.text}; waiting")
+            elif isinstance(frame, Hello):
+                translator = Translator(settings.lidar.mount)
+            else:
+                for out in translator.take(frame):
+                    bridge.send(out)

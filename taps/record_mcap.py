@@ -1,0 +1,92 @@
+"""`lumiloop record-mcap OUT.mcap`: what a running daemon tells, as an MCAP file of ROS 2 messages, until interrupted.
+
+A recorder that is killed leaves a file without an index, which lacks at most half a second; `lumiloop export FILE.mcap
+--mcap WHOLE.mcap` makes a whole one of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import signal
+from typing import Final
+
+from daemon import cli
+from daemon.config import Config
+from taps.frames import Hello, NotTheStream
+from taps.mcapfile import FLUSH_S, McapFile
+from taps.ros import Translator
+from taps.stream import Lost, Stream, path_of
+
+TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    if args.out.exists() and not args.force:
+        return cli.fail(f"{args.out} is there already; name another file, or replace it with --force", cli.USAGE)
+    stream = Stream(args.stream or path_of(args.settings.name), (*TOPICS, *(["raw"] if args.raw else [])))
+    try:
+        with McapFile(args.out) as file:
+            asyncio.run(_until_stopped(stream, args.settings, file, args.seconds))
+    except NotTheStream as error:
+        return cli.fail(str(error))
+    except OSError as error:
+        return cli.fail(f"{args.out}: {error.strerror}; free space or name another file")
+    cli.say(f"{args.out}: {file.messages} messages")
+    if not file.messages:
+        return cli.fail("nothing was told; is the daemon running?")
+    return cli.OK
+
+
+async def _until_stopped(stream: Stream, settings: Config, file: McapFile, seconds: float | None) -> None:
+    """Record until interrupted, or for so long."""
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    recording = asyncio.ensure_future(record(stream, settings, file))
+    stopping = asyncio.ensure_future(stop.wait())
+    try:
+        await asyncio.wait({recording, stopping}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        if recording.done():
+            recording.result()  # it never ends but by an error
+    finally:
+        for task in (recording, stopping):
+            task.cancel()
+        await asyncio.gather(recording, stopping, return_exceptions=True)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+async def record(stream: Stream, settings: Config, file: McapFile) -> None:
+    """Write all that is told, until cancelled.
+
+    Raises:
+        NotTheStream: the other end is no daemon of this version.
+        OSError: the file cannot be written.
+    """
+    translator = Translator(settings.lidar.mount)
+    flushing = asyncio.ensure_future(_flush(file))
+    try:
+        async with contextlib.aclosing(stream.frames()) as frames:
+            async for frame in frames:
+                if isinstance(frame, Lost):
+                    cli.say(f"{frame.text}; waiting")
+                elif isinstance(frame, Hello):
+                    cli.say(f"recording {frame.name} into {file.path}")
+                    translator = Translator(settings.lidar.mount)
+                else:
+                    for out in translator.take(frame):
+                        file.write(out)
+    finally:
+        flushing.cancel()
+        await asyncio.gather(flushing, return_exceptions=True)
+
+
+async def _flush(file: McapFile) -> None:
+    """What has been told reaches the kernel also when nothing more comes."""
+    while True:
+        await asyncio.sleep(FLUSH_S)
+        if file.waiting:
+            file.flush()

@@ -1,0 +1,146 @@
+"""`lumiloop metrics`: Prometheus' /metrics and VDA 5050's position object, over HTTP, on this computer only by default.
+
+A server of its own in a few lines: two documents that are made when somebody asks, one request a connection.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import signal
+import time
+from typing import Final
+
+from daemon import cli
+from daemon.endpoints import parse_endpoint
+from taps import vda5050
+from taps.frames import NotTheStream
+from taps.metrics import CONTENT_TYPE, Told, exposition
+from taps.stream import Stream, path_of
+
+LONGEST_REQUEST: Final = 8192
+PATIENCE_S: Final = 5.0
+CLIENTS: Final = 32
+TOPICS: Final = ("pose", "lights", "faults", "statistics")
+_JSON: Final = "application/json"
+_REASONS: Final = {
+    200: "OK",
+    400: "Bad Request",
+    404: "Not Found",
+    405: "Method Not Allowed",
+    503: "Service Unavailable",
+}
+INDEX: Final = "/metrics: Prometheus\n/vda5050: position, version 3\n/vda5050/2: position, version 2\n"
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    try:
+        host, port = parse_endpoint(args.listen)
+        asyncio.run(_until_stopped(Stream(args.stream or path_of(args.settings.name), TOPICS), host, port))
+    except ValueError as error:
+        return cli.fail(f"--listen: {error}", cli.USAGE)
+    except NotTheStream as error:
+        return cli.fail(str(error))
+    except OSError as error:
+        return cli.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
+    return cli.OK
+
+
+async def _until_stopped(stream: Stream, host: str, port: int) -> None:
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    running = asyncio.ensure_future(serve(stream, host, port))
+    stopping = asyncio.ensure_future(stop.wait())
+    try:
+        await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if running.done():
+            running.result()
+    finally:
+        for task in (running, stopping):
+            task.cancel()
+        await asyncio.gather(running, stopping, return_exceptions=True)
+
+
+async def serve(stream: Stream, host: str, port: int) -> None:
+    """Listen to the daemon and answer until cancelled.
+
+    Raises:
+        OSError: it cannot be listened there. NotTheStream: the other end is no daemon of this version.
+    """
+    told = Told()
+    answering = Answering(told)
+    server = await asyncio.start_server(answering, host, port, limit=LONGEST_REQUEST)
+    cli.say(f"http://{host}:{server.sockets[0].getsockname()[1]}/metrics")
+    try:
+        async with contextlib.aclosing(stream.frames()) as frames:
+            async for frame in frames:
+                told.take(frame, time.monotonic())
+    finally:
+        server.close()
+
+
+class Answering:
+    """Answers requests of what has been told."""
+
+    def __init__(self, told: Told) -> None:
+        self._told = told
+        self._clients = 0
+
+    async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One request; whoever sends none in time, or is one too many, is let go."""
+        self._clients += 1
+        try:
+            if self._clients <= CLIENTS:
+                async with asyncio.timeout(PATIENCE_S):
+                    request = await reader.readuntil(b"\r\n\r\n")
+                    writer.write(self._answer(request))
+                    await writer.drain()
+        except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
+            return
+        finally:
+            self._clients -= 1
+            writer.close()
+
+    def _answer(self, request: bytes) -> bytes:
+        words = request.partition(b"\r\n")[0].decode("latin-1").split(" ")
+        if len(words) != 3 or not words[2].startswith("HTTP/1."):
+            return _response(400, "text/plain", "not a request of HTTP/1\n")
+        method, path = words[0], words[1].partition("?")[0]
+        if method not in ("GET", "HEAD"):
+            return _response(405, "text/plain", "this only tells: GET\n")
+        status, kind, body = self._document(path)
+        return _response(status, kind, body, head=method == "HEAD")
+
+    def _document(self, path: str) -> tuple[int, str, str]:
+        told = self._told
+        match path:
+            case "/metrics":
+                return 200, CONTENT_TYPE, exposition(told, time.monotonic())
+            case "/vda5050" | "/vda5050/2":
+                second = path.endswith("2")
+                make = vda5050.position_v2 if second else vda5050.position
+                latest = told.latest(time.monotonic())
+                made = None if latest is None else make(latest, told.held)
+                if made is None:
+                    why = "the daemon does not answer" if not told.up else "there is no pose yet"
+                    return 503, _JSON, json.dumps({"error": why}) + "\n"
+                return 200, _JSON, json.dumps({"agvPosition" if second else "mobileRobotPosition": made}) + "\n"
+            case "/":
+                return 200, "text/plain", INDEX
+        return 404, "text/plain", INDEX
+
+
+def _response(status: int, kind: str, body: str, head: bool = False) -> bytes:
+    content = body.encode()
+    lines = (
+        f"HTTP/1.1 {status} {_REASONS[status]}",
+        f"Content-Type: {kind}",
+        f"Content-Length: {len(content)}",
+        "Cache-Control: no-store",
+        "Connection: close",
+    )
+    return "\r\n".join(lines).encode() + b"\r\n\r\n" + (b"" if head else content)

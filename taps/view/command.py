@@ -1,0 +1,162 @@
+"""`lumiloop view`: the web page of a running daemon, or of a recording."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import errno
+import logging
+import multiprocessing
+import os
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from aiohttp import web
+
+from daemon import cli
+from daemon.config import Config
+from daemon.lights import SurveyError
+from daemon.publish.client import NoAnswer, address_of
+from taps.stream import Stream, path_of
+from taps.view.film import Film
+from taps.view.guard import Guard, TokenRefused, token_for
+from taps.view.server import TOPICS, View
+from taps.view.words import Scene, scene_of
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
+
+PORT: Final = 8090
+NICENESS: Final = 5
+"""A page is never worth a late pose."""
+
+
+def main(args: argparse.Namespace) -> int:
+    """Body of the command; returns the exit code."""
+    with contextlib.suppress(OSError):
+        os.nice(NICENESS)
+    try:
+        token = token_for(args.bind, args.write, args.token)
+        return _show(args, Guard(args.bind, token, args.write))
+    except (TokenRefused, SurveyError, NoAnswer, CannotServe) as error:
+        return cli.fail(str(error))
+
+
+class CannotServe(Exception):
+    """The page cannot be served; the text says why and what to do."""
+
+
+def _show(args: argparse.Namespace, guard: Guard) -> int:
+    settings: Config = args.settings
+    if args.log is None:
+        modbus = address_of(None, settings) if settings.modbus.port else ("127.0.0.1", 0)
+        view = View(guard, scene_of(settings), Stream(args.stream or path_of(settings.name), TOPICS), modbus=modbus)
+        return _serve(view, guard, args.port, f"lumiloop {settings.name}")
+    if args.write:
+        return cli.fail("a recording takes no orders: leave --write out", cli.USAGE)
+    if not args.log.exists():
+        return cli.fail(f"{args.log}: there is no such recording")
+    with _film(args) as film:
+        return _serve(View(guard, Scene(settings.name), film=film), guard, args.port, f"recording {args.log}")
+
+
+@contextlib.contextmanager
+def _film(args: argparse.Namespace) -> Iterator[Film]:
+    """A film of the recording, which another process goes on making.
+
+    Raises:
+        CannotServe: the recording cannot be read.
+    """
+    keys = tuple(override.partition("=")[0].strip() for override in args.set)
+    with tempfile.TemporaryDirectory(prefix="lumiloop-view-") as folder:
+        file = Path(folder) / "film"
+        file.touch()
+        given = args.config is not None, keys
+        maker = multiprocessing.get_context("spawn").Process(
+            target=_shoot, args=(args.log, args.settings, given, file), name="film", daemon=True
+        )
+        maker.start()
+        film = Film(args.log, file)
+        try:
+            _wait(film, maker)
+            yield film
+        finally:
+            maker.terminate()
+            maker.join()
+            film.close()
+
+
+def _shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
+    """The other process: it alone loads the estimator, which may have to be compiled."""
+    from daemon import warmup
+
+    try:
+        warmup.load_aloud(cli.say, "warm", lambda: (warmup.load(), import_module("taps.view.camera")))
+    except warmup.CannotLoad as error:
+        cli.fail(str(error))
+        return
+    import_module("taps.view.camera").shoot(log, settings, given, out)
+
+
+def _wait(film: Film, maker: BaseProcess) -> None:
+    """Until the recording is known to be one."""
+    cli.say("replaying the recording; it can be watched meanwhile")
+    while film.scene is None and not film.done:
+        if not maker.is_alive():
+            film.look()
+            if film.scene is None and not film.done:
+                raise CannotServe("the replay has ended at once; try `lumiloop replay` on it")
+        time.sleep(0.05)
+        film.look()
+    if film.error:
+        raise CannotServe(film.error)
+
+
+def _serve(view: View, guard: Guard, port: int, what: str) -> int:
+    """Serve until somebody stops it."""
+    logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s")
+    try:
+        asyncio.run(_until_signal(view, guard, port, what))
+    except OSError as error:
+        taken = error.errno == errno.EADDRINUSE
+        remedy = "name another with --port" if taken else "name an address of this computer with --bind"
+        raise CannotServe(f"{guard.bind} port {port}: {error.strerror or error}; {remedy}") from None
+    return cli.OK
+
+
+async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        site = web.TCPSite(runner, guard.bind, port)
+        await site.start()
+        cli.say(f"{what}: {address(guard, _port_of(runner))}")
+        await stop.wait()
+    finally:
+        await runner.cleanup()
+
+
+def _port_of(runner: web.AppRunner) -> int:
+    """The port that was taken, where any was asked for."""
+    return int(runner.addresses[0][1])
+
+
+def address(guard: Guard, port: int) -> str:
+    """What a person opens; the token stands behind the #, which browsers tell no server."""
+    host = guard.bind
+    if host in ("0.0.0.0", "::", ""):
+        host = socket.gethostname()
+    if ":" in host:
+        host = f"[{host}]"
+    return f"http://{host}:{port}/" + (f"#token={guard.token}" if guard.token else "")

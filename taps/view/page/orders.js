@@ -1,0 +1,89 @@
+// Buttons that order something of the daemon, the pose that is dragged, and what became of orders.
+
+import { $, element } from "./panel.js";
+
+const KEPT = 4;
+const SAID = { relocalise: "Relocalise", set_pose: "Set pose", save_map: "Save map", dump_recorder: "Dump recorder", pause: "Pause", resume: "Resume" };
+
+export class Orders {
+  constructor(link, camera, toast) {
+    this.link = link;
+    this.camera = camera;
+    this.toast = toast;
+    this.told = [];
+    for (const button of document.querySelectorAll("[data-order]")) button.addEventListener("click", () => this.press(button.dataset.order));
+    $("ask-yes").addEventListener("click", () => this.send("set_pose", this.pose));
+    $("ask-no").addEventListener("click", () => this.aim(false));
+    addEventListener("keydown", (event) => { if (event.key === "Escape") this.aim(false); });
+    camera.onaimed = (aim) => this.aimed(aim);
+  }
+
+  welcome(words) {
+    this.you = words.you;
+    const may = Object.keys(words.orders);
+    $("card-orders").hidden = !may.length;
+    for (const button of document.querySelectorAll("[data-order]")) {
+      button.hidden = !may.includes(button.dataset.order);
+      button.title = (words.orders[button.dataset.order] || "").replaceAll("`", "");
+    }
+    $("mode").hidden = Boolean(words.recording);
+    $("mode").textContent = may.length ? "may order" : "read-only";
+    $("mode").classList.toggle("write", may.length > 0);
+    $("write-note").textContent = may.length ? `you are viewer ${this.you}` : "";
+  }
+
+  press(name) {
+    if (name === "set_pose") this.aim(!this.camera.aiming);
+    else this.send(name);
+  }
+
+  send(name, pose) {
+    this.link.say({ order: name, pose });
+    this.aim(false);
+  }
+
+  // From here on hands drag a pose, or the map again.
+  aim(on) {
+    this.camera.aiming = on;
+    this.camera.aim = null;
+    $("stage").classList.toggle("aim", on);
+    $("ask").hidden = !on;
+    $("ask-yes").hidden = true;
+    $("ask-text").textContent = "Press where the robot stands, drag to where it looks";
+    document.querySelector("[data-order=set_pose]").classList.toggle("on", on);
+    this.camera.changed();
+  }
+
+  aimed({ from, to }) {
+    const yaw = Math.atan2(to[1] - from[1], to[0] - from[0]);
+    this.pose = [from[0], from[1], yaw];
+    $("ask-text").textContent = `${from[0].toFixed(2)}, ${from[1].toFixed(2)} m, ${(180 / Math.PI * yaw).toFixed(0)}°`;
+    $("ask-yes").hidden = false;
+  }
+
+  take(order) {
+    const key = order.number === undefined ? null : `${order.number},${order.viewer}`;
+    const known = key && this.told.find((one) => one.key === key);
+    if (known) Object.assign(known, order);
+    else this.told.unshift({ ...order, key });
+    this.told.length = Math.min(this.told.length, KEPT);
+    const ended = order.outcome !== "running";
+    const who = order.viewer === this.you ? "" : ` by viewer ${order.viewer}`;
+    if (ended || who) this.toast(`${SAID[order.order] || order.order}${who}: ${said(order)}`, order.outcome === "done" ? "good" : order.outcome === "running" ? "" : "bad");
+    this.show();
+  }
+
+  show() {
+    $("told").replaceChildren(...this.told.map((order) => {
+      const item = element("li"), words = ["done", "refused", "running", "replaced"];
+      item.append(element("b", "", SAID[order.order] || order.order), order.viewer === this.you ? " (you): " : ` (viewer ${order.viewer}): `, element("span", words.includes(order.outcome) ? order.outcome : "refused", said(order)));
+      return item;
+    }));
+  }
+}
+
+function said(order) {
+  if (order.outcome === "replaced") return order.by ? `replaced by viewer ${order.by}` : "replaced by another client";
+  if (order.outcome === "refused") return "refused; the daemon's log says why";
+  return order.outcome;
+}

@@ -1,0 +1,74 @@
+"""Commands in the documents of the taps are commands: each is understood, and those that need no daemon are run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from daemon import cli
+from taps.doctor.host import Host
+from tests.daemon.planning.test_planning import room, write_pgm
+from tests.taps.test_doctor import Computer
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """What stands behind `lumiloop` in blocks of code, without comments and pipes; what may be left out is there."""
+    found = []
+    text = page.read_text().replace("\\\n", "")
+    for line in re.findall(r"^ {4,}(?:sudo )?lumiloop (.+)$", text, re.MULTILINE):
+        words = shlex.split(re.sub(r"\[(--[^\]]*)\]", r"\1", line), comments=True)
+        ends = [words.index(word) for word in ("|", ">", ">>", "&", "&&", ";") if word in words]
+        found.append(words[: min(ends, default=len(words))])
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_in_the_documents_is_understood(page: Path) -> None:
+    for words in commands(page):
+        if words != ["--help"]:
+            assert cli.parser().parse_args(words).body is not None, f"{page.name}: {words}"
+
+
+def test_the_doctor_of_the_documents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (words,) = (words for words in commands(ROOT / "docs" / "installation.md") if words[0] == "doctor")
+    (tmp_path / "lumiloop.toml").write_text("")
+    monkeypatch.setattr("taps.doctor.report.Host", Computer)
+    assert cli.main([str(tmp_path / Path(word).name) if word.startswith("/") else word for word in words]) == cli.OK
+    assert "nothing has to be fixed" in capsys.readouterr().out
+    assert issubclass(Computer, Host)
+
+
+@pytest.mark.system
+def test_the_plans_of_the_documents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_pgm(tmp_path, room(5.0, 4.0))
+    ran = 0
+    for words in commands(ROOT / "docs" / "planning.md"):
+        if words[0] == "plan":
+            assert cli.main(words) == cli.OK, words
+            ran += 1
+    assert ran == 3
+    assert (tmp_path / "plan" / "lights.toml").exists()
+
+
+@pytest.mark.system
+def test_the_exports_of_the_documents(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive").symlink_to(recording)
+    ran = 0
+    for words in commands(ROOT / "docs" / "formats.md"):
+        if words[0] == "export":
+            assert cli.main(words) == cli.OK, words
+            (tmp_path / "torn.mcap").write_bytes((tmp_path / "drive.mcap").read_bytes()[:-500])
+            ran += 1
+    assert ran == 2
+    assert {path.name for path in tmp_path.iterdir()} >= {"drive.mcap", "drive.tum", "whole.mcap"}

@@ -1,0 +1,53 @@
+"""A running daemon recorded as MCAP."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import cli
+
+pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
+from taps.ros import TOPICS
+from tests.taps.serving import served
+from tests.taps.test_mcap import messages
+
+
+def record(path: Path, out: Path, *words: str) -> int:
+    return cli.main(["record-mcap", str(out), "--stream", str(path), "--seconds", "1.2", *words])
+
+
+def test_all_that_a_daemon_tells_is_in_the_file(tmp_path: Path) -> None:
+    with served(tmp_path / "s"):
+        assert record(tmp_path / "s", tmp_path / "a.mcap", "--raw") == cli.OK
+    told = messages(tmp_path / "a.mcap")
+    assert set(told) == set(TOPICS)
+    assert 15 < len(told["/pose"]) < 80
+    (_, lights) = told["/lumiloop/lights"][0]
+    assert [(link.code, link.lamp_id) for link in lights.links] == [(5, 12), (6, -1)]
+    (_, grid) = told["/map"][0]
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == pytest.approx((0.0, -6.4))
+    cells = grid.data.reshape(grid.info.height, grid.info.width)
+    np.testing.assert_array_equal(cells[:, 0], 100)
+    np.testing.assert_array_equal(cells[:, 1:], 0)
+    faults = [s.name for _, m in told["/diagnostics"] for s in m.status if s.name.startswith("lumiloop: fault")]
+    assert set(faults) == {"lumiloop: fault 104"}
+    (stamp, pose) = told["/pose"][0]
+    assert 1.7e9 < pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec < 1.7e9 + 60
+    assert stamp == pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
+
+
+def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    assert record(tmp_path / "s", tmp_path / "a.mcap") == cli.USAGE
+    assert (tmp_path / "a.mcap").read_bytes() == b"precious"
+    assert record(tmp_path / "s", tmp_path / "b.mcap") == cli.FAILED
+    assert record(tmp_path / "s", tmp_path / "none" / "b.mcap") == cli.FAILED
+    said = capsys.readouterr().err
+    assert "replace it with --force" in said
+    assert "is the daemon running?" in said
+    assert "No such file" in said

@@ -1,0 +1,23 @@
+"""Commands of the taps: what is missing is named, with what to do."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from daemon import cli_taps
+
+ARGS = argparse.Namespace(config=None, set=[], print_config=False)
+
+
+def test_a_missing_extra_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli_taps.needing("view", "tests.taps.wanting", "main")(ARGS) == 1
+    said = capsys.readouterr().err
+    assert "needs a_library_that_nobody_has" in said
+    assert "pip install 'lumiloop[view]'" in said
+
+
+def test_what_is_missing_of_our_own_is_a_defect() -> None:
+    with pytest.raises(ModuleNotFoundError):
+        cli_taps.needing("view", "taps.of_tomorrow", "main")(ARGS)

@@ -1,0 +1,193 @@
+"""The page in a real browser: Debian's chromium, over the protocol of its developer tools, on a simulated robot."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tools.browser import CHROMIUM, Robot, Tab, chromium, robot, tab, view
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt-get install chromium"),
+]
+POSE = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose"
+PHONE = (390, 844)
+FIRST_PAINT_MS, SHOWN_MS = 1000.0, 150.0
+SLACK = 4.0
+"""Of times that are measured on a machine that others use."""
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """A robot that drives, whose daemon takes orders."""
+    with robot(tmp_path_factory.mktemp("robot")) as one:
+        one.drive()
+        yield one
+
+
+@pytest.fixture(scope="module")
+def address(driven: Robot) -> Iterator[str]:
+    with view(driven.env, driven.folder, "--config", str(driven.config), "--write") as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with chromium(tmp_path_factory.mktemp("browser")) as one:
+        yield one
+
+
+def look(browser: str, address: str, body: Callable[[Tab], Awaitable[Any]], **options: Any) -> Any:
+    """What a body finds on the page; the browser has nothing to complain of."""
+
+    async def all_of_it() -> Any:
+        async with tab(browser, address, **options) as page:
+            await page.until(POSE, 60.0)
+            found = await body(page)
+            assert page.said == []
+            return found
+
+    return asyncio.run(all_of_it())
+
+
+async def shown(page: Tab, name: str) -> Any:
+    return await page.js(f"document.getElementById({name!r}).textContent")
+
+
+def test_the_page_loads_and_the_pose_moves(browser: str, address: str) -> None:
+    async def body(page: Tab) -> dict[str, float]:
+        first = await page.js("lumiloop.world.pose.pose")
+        await page.until(
+            f"Math.hypot(lumiloop.world.pose.pose[0] - {first[0]}, lumiloop.world.pose.pose[1] - {first[1]}) > 0.3"
+        )
+        await page.until("[...lumiloop.world.tiles.all.values()].some((tile) => tile.picture)")
+        await page.until("lumiloop.world.points() && lumiloop.world.points().length > 400")
+        await page.until(
+            "document.querySelectorAll('.link').length >= 4 && document.querySelectorAll('.bars .row').length >= 5"
+        )
+        for name in ("x", "y", "yaw", "sx"):
+            assert any(letter.isdigit() for letter in await shown(page, name)), name
+        assert await page.js("location.hash") == ""  # the token is not left in the address
+        await page.until("lumiloop.late.length >= 100")
+        paint = await page.js("performance.getEntriesByType('paint')[0].startTime")
+        late = await page.js("[...lumiloop.late].sort((a, b) => a - b)")
+        return {"first paint, ms": paint, "scan to screen, median, ms": late[len(late) // 2]}
+
+    found = look(browser, address, body)
+    sys.stdout.write(f"{found}\n")
+    assert found["first paint, ms"] < SLACK * FIRST_PAINT_MS
+    assert 0.0 < found["scan to screen, median, ms"] < SLACK * SHOWN_MS
+
+
+def test_a_click_relocalises_and_who_only_looks_sees_it(browser: str, address: str) -> None:
+    async def body(page: Tab) -> None:
+        async with tab(browser, address.partition("#")[0]) as other:
+            await other.until(POSE)
+            assert await other.js("document.getElementById('card-orders').hidden")
+            await page.js("globalThis.seen = []; lumiloop.world.on_state = (told) => seen.push(told.state_name)")
+            await page.click("[data-order=relocalise]")
+            await page.until("document.querySelector('#told li')")
+            await page.until("seen.includes('RELOCATING')")
+            await other.until(
+                "[...document.querySelectorAll('#told li')].length >= 1 || document.querySelector('.toast')"
+            )
+            await page.until("document.querySelector('#told .done')", 60.0)
+
+    look(browser, address, body)
+
+
+def test_a_pose_is_set_by_dragging(browser: str, address: str) -> None:
+    async def body(page: Tab) -> None:
+        await page.click("[data-order=set_pose]")
+        where, ahead = await page.js(
+            "(() => { const b = document.getElementById('stage').getBoundingClientRect(), c = lumiloop.camera,"
+            "p = lumiloop.world.pose.pose, at = c.screen(p[0], p[1]),"
+            "to = c.screen(p[0] + Math.cos(p[2]), p[1] + Math.sin(p[2]));"
+            "return [[b.x + at[0], b.y + at[1]], [b.x + to[0], b.y + to[1]]]; })()"
+        )
+        await page.drag([tuple(where), tuple(ahead)])
+        await page.until("!document.getElementById('ask-yes').hidden")
+        await page.click("#ask-yes")
+        await page.until("document.querySelector('#told .done')", 30.0)
+        assert await page.js("document.getElementById('ask').hidden")
+
+    look(browser, address, body)
+
+
+def test_a_phone(browser: str, address: str) -> None:
+    async def body(page: Tab) -> None:
+        wide = await page.js("[document.documentElement.scrollWidth, innerWidth]")
+        assert wide[0] <= wide[1]  # nothing to be moved aside
+        box = await page.js(
+            "(({width, height}) => [width, height])(document.getElementById('stage').getBoundingClientRect())"
+        )
+        assert box[0] == PHONE[0]
+        assert 0.3 * PHONE[1] < box[1] < 0.7 * PHONE[1]
+        small = await page.js(
+            "[...document.querySelectorAll('header button, .tools button, [data-order]')].filter((e) => e.offsetParent)"
+            ".filter((e) => e.getBoundingClientRect().height < 32).map((e) => e.outerHTML)"
+        )
+        assert small == []  # a finger finds them
+        edge = await page.js("document.getElementById('theme').getBoundingClientRect().right")
+        assert edge <= PHONE[0]
+
+    look(browser, address, body, size=PHONE, phone=True)
+
+
+def test_an_old_tab_on_another_version_loads_itself_anew(browser: str, address: str) -> None:
+    async def body(page: Tab) -> None:
+        await page.js("globalThis.mark = 1")
+        await page.js("lumiloop.link.page = 'of-last-year'; lumiloop.link.socket.close()")
+        await page.until("document.getElementById('banner').textContent.includes('another version')")
+        await page.until(f"globalThis.mark === undefined && {POSE}")
+
+    look(browser, address, body)
+
+
+def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -> None:
+    async def body(page: Tab) -> None:
+        assert await page.js("document.getElementById('card-orders').hidden")
+        assert await shown(page, "mode") == "read-only"
+
+    look(browser, address.partition("#")[0] + "#token=not-the-right-one", body)
+
+
+def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -> None:
+    env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+
+    async def body(address: str) -> None:
+        async with tab(browser, address) as page:
+            await page.until("globalThis.lumiloop")
+            await page.until("document.getElementById('banner').textContent.includes('is the daemon running?')")
+            await page.until("document.getElementById('state-name').textContent === 'NO DAEMON'")
+            assert page.said == []
+
+    with view(env, tmp_path) as address:
+        asyncio.run(body(address))
+
+
+def test_a_recording_has_a_time_bar(browser: str, recording: Path, tmp_path: Path) -> None:
+    with view(dict(os.environ), tmp_path, str(recording)) as address:
+
+        async def body(page: Tab) -> None:
+            await page.until("!document.getElementById('timebar').hidden")
+            await page.until(
+                "Number(document.getElementById('seek').max) - Number(document.getElementById('seek').min) > 7"
+            )
+            await page.click("#play")
+            await page.until(
+                "document.getElementById('play').querySelector('path').getAttribute('d').includes('l12 7')"
+            )
+            before = await page.js("lumiloop.world.pose.t_mono")
+            await page.click("#seek")  # its middle
+            await page.until(f"lumiloop.world.pose && Math.abs(lumiloop.world.pose.t_mono - {before}) > 0.5")
+            assert await page.js("document.getElementById('card-orders').hidden")
+
+        look(browser, address, body)

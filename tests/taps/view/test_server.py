@@ -1,0 +1,416 @@
+"""The web page's server: what it serves, to whom, and what of the daemon's it hands on."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import socket
+from collections.abc import Awaitable, Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from aiohttp import WSServerHandshakeError
+
+from daemon.publish import stream as daemon_stream
+from daemon.publish.holding import CommandCode, Outcome, Request
+from daemon.publish.snapshot import State
+from taps.frames import Loop, MapTiles, Scan
+from taps.view import server, viewers
+from taps.view.guard import Guard
+from taps.view.orders import Orders
+from tests.daemon.publish.network import publishing
+from tests.daemon.publish.test_stream import raw_scan, until
+from tests.taps.view.house import TOKEN, House, Page, serving, snapshot
+
+
+def run(folder: Path, body: Callable[[House], Awaitable[None]], **options: Any) -> None:
+    async def all_of_it() -> None:
+        async with serving(folder, **options) as house:
+            await body(house)
+
+    asyncio.run(all_of_it())
+
+
+def test_the_page_is_whole_and_fetches_nothing_from_elsewhere(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with house.session.get(house.address) as answer:
+            page = await answer.text()
+            policy = answer.headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert f'content="{house.view.page}"' in page
+        named = re.findall(r'(?:src|href)="/([^"]+)"', page)
+        assert {"main.js", "style.css", "icon.svg"} <= set(named)
+        for name in named:
+            async with house.session.get(f"{house.address}/{name}") as answer:
+                assert answer.status == 200, name
+                assert answer.headers["X-Content-Type-Options"] == "nosniff"
+                text = await answer.text()
+            for module in re.findall(r'from "\./([^"]+)"', text):
+                assert module in named, f"{name} takes {module}, which the page does not load beforehand"
+        async with house.session.get(house.address, headers={"If-None-Match": f'"{house.view.page}"'}) as answer:
+            assert answer.status == 304
+        for missing in ("nothing.js", "../server.py", "%2e%2e/guard.py", "index.HTML"):
+            async with house.session.get(f"{house.address}/{missing}") as answer:
+                assert answer.status == 404
+                assert "Content-Security-Policy" in answer.headers
+
+    run(tmp_path, body)
+    folder = resources.files("taps.view").joinpath("page")
+    for entry in folder.iterdir():
+        text = entry.read_text().replace("http://www.w3.org/2000/svg", "").replace("https://msgpack.org", "")
+        assert not re.search(r"https?://|//cdn|@import|\son[a-z]+=|<style|style=\"|innerHTML|eval\(", text), entry.name
+
+
+def test_a_name_that_is_not_ours_is_not_answered(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        for host, status in (("evil.example", 421), ("evil.example:8090", 421), ("localhost:1", 200), ("[::1]", 200)):
+            async with house.session.get(house.address, headers={"Host": host}) as answer:
+                assert answer.status == status, host
+        for origin in ("http://evil.example", "null", "http://localhost:1", "http://127.0.0.1"):
+            with pytest.raises(WSServerHandshakeError) as refused:
+                await house.session.ws_connect(f"{house.address}/ws", headers={"Origin": origin})
+            assert refused.value.status == 403, origin
+        async with house.page(Origin=house.address) as page:
+            assert (await page.welcome())["kind"] == "welcome"
+
+    run(tmp_path, body)
+
+
+def test_without_the_token_one_may_not_look_from_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "WRONG_TOKEN_S", 0.01)
+
+    async def body(house: House) -> None:
+        for token in (None, TOKEN[:-1], "", 7, TOKEN * 9):
+            async with house.page(token) as page:  # type: ignore[arg-type]  # as a stranger may send it
+                assert (await page.welcome())["what"] == "token"
+                assert not await page.read()
+        async with house.page(TOKEN) as page:
+            told = await page.welcome()
+            assert (told["kind"], told["orders"]) == ("welcome", {})
+
+    run(tmp_path, body, guard=Guard("0.0.0.0", TOKEN))
+
+
+def test_what_the_stream_tells_is_handed_on(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with house.page() as page:
+            told = await page.welcome()
+            assert (told["name"], told["states"]["3"][0]) == ("agv", "TRACKING")
+            assert (await page.until("daemon"))["up"]
+            house.stream.publish(snapshot(1))
+            house.stream.on_scan(raw_scan())
+            pose = await page.until("pose")
+            assert (pose["pose"], pose["state_name"]) == ([0.01, 0.0, 0.1], "TRACKING")
+            scan = await page.until("scan")
+            assert np.frombuffer(scan["ranges"], "<f4")[0] == pytest.approx(1.0)
+            house.stream.place = lambda keyframe: (float(keyframe), 2.0, 3.0)
+            house.stream.publish(snapshot(2, loop_counter=1, loop_new=9, loop_old=4, loop_residual=0.02))
+            loop = await page.until("loop")
+            assert (loop["at_new"], loop["at_old"]) == ([9.0, 2.0, 3.0], [4.0, 2.0, 3.0])
+        async with house.page() as late:
+            await late.welcome()
+            rows = await late.until("history")
+            assert rows[0][:4] == [pytest.approx(100.025), 0.01, 0.0, 0.1]
+            assert rows[0][viewers.History.COLUMNS.index("used")] in (None, 2)
+            assert (await late.until("loop"))["counter"] == 1
+            assert (await late.until("pose"))["seq"] == 2
+
+    run(tmp_path, body)
+
+
+def test_a_daemon_that_goes_and_comes_again(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with house.page() as page:
+            await page.welcome()
+            first = await page.until("daemon", lambda told: told["up"])
+            for client in list(house.stream.clients):
+                client.drop()
+            assert "closed the stream" in (await page.until("daemon", lambda told: not told["up"]))["why"]
+            again = await page.until("daemon", lambda told: told["up"])
+            assert again["session"] == first["session"] + 1
+
+    run(tmp_path, body)
+
+
+def test_a_daemon_of_another_version_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(house: House) -> None:
+        monkeypatch.setattr(daemon_stream, "SCHEMA", 2)
+        async with house.page() as page:
+            await page.welcome()
+            await page.until("daemon", lambda told: told["up"])
+            for client in list(house.stream.clients):
+                client.drop()
+            await page.until("daemon", lambda told: "version 2 of the stream" in told["why"])
+
+    run(tmp_path, body)
+
+
+def test_too_many_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "VIEWERS", 1)
+
+    async def body(house: House) -> None:
+        async with house.page() as page:
+            await page.welcome()
+            with pytest.raises(WSServerHandshakeError) as refused:
+                await house.session.ws_connect(f"{house.address}/ws")
+            assert refused.value.status == 503
+
+    run(tmp_path, body)
+
+
+@pytest.mark.parametrize("words", ["no JSON", "[1]", '{"order": "save_map"', "[" * 3000, r'{"order": "\ud800"}'])
+def test_nonsense_ends_a_connection_and_nothing_else(
+    tmp_path: Path, words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def body(house: House) -> None:
+        async with house.page() as page, house.page() as other:
+            await page.welcome()
+            await other.welcome()
+            await page.socket.send_str(words)
+            while await page.read():
+                pass
+            house.stream.publish(snapshot(1))
+            await other.until("pose")
+
+    run(tmp_path, body)
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR], "it is no defect of ours"
+
+
+def test_a_browser_that_takes_nothing_gets_the_latest() -> None:
+    async def body() -> None:
+        viewer = viewers.Viewer(1)
+        for number in range(100):
+            viewer.put("pose", viewers.frame("pose", number))
+            viewer.put("loop", viewers.frame("loop", number), once=True)
+            viewer.put_tiles({"side": 2}, [((0, 0), bytes([number])), ((number % 3, 1), bytes(40_000))])
+        message = viewer.take()
+        assert message is not None
+        told = msgspec.msgpack.decode(message)
+        loops = [one["data"] for one in told if one["topic"] == "loop"]
+        assert loops == list(range(100 - viewers.KEPT, 100))
+        assert [one["data"] for one in told if one["topic"] == "pose"] == [99]
+        tiles = [one for one in told if one["topic"] == "map"]
+        assert tiles[0]["data"]["tiles"][0] == [0, 0, bytes([99])]
+        assert viewer.some.is_set()  # there are more tiles than fit into one message
+        rest = viewer.take()
+        assert rest is not None
+        assert len(msgspec.msgpack.decode(rest)[0]["data"]["tiles"]) == 1
+        assert viewer.take() is None
+        assert viewer.replaced == 99 + 100 - viewers.KEPT
+
+    asyncio.run(body())
+
+
+def test_little_that_is_old_is_on_its_way_to_a_slow_browser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "PACE_S", 0.001)
+    scan = {"seq": 1, "t_mono": 1.0, "bearing_first": 0.0, "bearing_step": 0.01, "ranges": bytes(40_000)}
+    told = msgspec.convert(scan, Scan)
+
+    async def body(house: House) -> None:
+        host, port = house.address.removeprefix("http://").split(":")
+        reader, writer = await asyncio.open_connection(host, int(port), limit=1 << 14)
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+        head = f"GET /ws HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        writer.write(f"{head}Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {'A' * 22}==\r\n\r\n".encode())
+        writer.write(b"\x81\x82\0\0\0\0{}")  # its first words, masked with nothing
+        await reader.readuntil(b"welcome")
+        for _ in range(300):  # 12 MB
+            house.view.hub.take(told)
+            await asyncio.sleep(0.002)
+        house.view.hub.tell("row", "the end")
+        came = 0
+        while b"the end" not in (data := await asyncio.wait_for(reader.read(1 << 16), 5.0)):
+            came += len(data)
+        assert 80_000 < came < 1_500_000
+        writer.close()
+
+    run(tmp_path, body)
+
+
+def test_what_cannot_be_shown_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "TRY_AGAIN_S", 0.01)
+
+    async def body(house: House) -> None:
+        async with house.page() as page:
+            await page.welcome()
+            monkeypatch.setattr(house.view.hub, "take", lambda data: 1 / 0)
+            house.stream.publish(snapshot(1))
+            await page.until("daemon", lambda told: "could not be shown" in told["why"])
+            monkeypatch.undo()
+            await page.until("daemon", lambda told: told["up"])
+            await until(lambda: house.stream.wanted("pose"))
+            house.stream.publish(snapshot(2))
+            await page.until("pose")
+
+    run(tmp_path, body)
+
+
+def test_a_newcomer_gets_every_tile(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        hub = house.view.hub
+        about = {"map_id": 1, "resolution": 0.05, "side": 128, "unit": 0.1}
+        tiles = [(column, 0, bytes(50_000)) for column in range(5)]
+        hub.take(msgspec.convert({**about, "version": 1, "more": False, "tiles": tiles}, MapTiles))
+        async with house.page() as page:
+            await page.welcome()
+            seen: set[int] = set()
+            while len(seen) < 5:
+                told = await page.until("map")
+                assert told["resolution"] == 0.05
+                seen |= {tile[0] for tile in told["tiles"]}
+
+    run(tmp_path, body)
+
+
+def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Path) -> None:
+    async def body() -> None:
+        hub, viewer = viewers.Hub(), viewers.Viewer(1)
+        for number in range(2 * viewers.KEPT):
+            hub.take(Loop(t_mono=float(number), counter=number))
+        hub.lost("nobody listens there")
+        hub.welcome(viewer)
+        message = viewer.take()
+        assert message is not None
+        told = msgspec.msgpack.decode(message)
+        assert [one["topic"] for one in told[:2]] == ["daemon", "history"]
+        assert not told[0]["data"]["up"]
+        assert told[-1]["data"]["counter"] == 2 * viewers.KEPT - 1
+
+    asyncio.run(body())
+
+
+# orders
+
+
+async def order(page: Page, name: str, **other: object) -> None:
+    await page.socket.send_json({"order": name, **other})
+
+
+def ordering(tmp_path: Path, body: Callable[[House, list[Request], Any], Awaitable[None]], write: bool = True) -> None:
+    """Run a test beside a daemon's Modbus server."""
+
+    async def all_of_it() -> None:
+        asked: list[Request] = []
+        async with (
+            publishing(write=write, on_command=asked.append) as modbus,
+            serving(tmp_path, Guard("127.0.0.1", TOKEN, True), modbus=modbus.port) as house,
+        ):
+            await body(house, asked, modbus)
+
+    asyncio.run(all_of_it())
+
+
+def test_an_order_reaches_the_daemon_and_all_are_told(tmp_path: Path) -> None:
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        async with house.page(TOKEN) as page, house.page() as other:
+            told = await page.welcome()
+            assert set(told["orders"]) >= {"relocalise", "save_map", "set_pose", "dump_recorder"}
+            assert (await other.welcome())["orders"] == {}
+            await order(page, "set_pose", pose=[1.25, -2.5, 7.0])
+            running = await other.until("order")
+            assert (running["order"], running["outcome"], running["viewer"]) == ("set_pose", "running", told["you"])
+            assert asked[0].code is CommandCode.SET_POSE
+            assert asked[0].pose == pytest.approx((1.25, -2.5, 7.0 - 2 * np.pi), abs=1e-4)
+            modbus.acknowledge(asked[0].number, Outcome.DONE)
+            assert (await other.until("order"))["outcome"] == "done"
+            assert (await page.until("order", lambda one: one["outcome"] == "done"))["number"] == asked[0].number
+
+    ordering(tmp_path, body)
+
+
+def test_the_last_of_two_orders_wins_and_both_are_told(tmp_path: Path) -> None:
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        async with house.page(TOKEN) as page, house.page(TOKEN) as other:
+            await page.welcome()
+            second = (await other.welcome())["you"]
+            await order(page, "save_map")
+            await page.until("order")
+            await order(other, "relocalise")
+            replaced = await page.until("order", lambda one: one["outcome"] == "replaced")
+            assert (replaced["order"], replaced["by"]) == ("save_map", second)
+            await other.until("order", lambda one: one["outcome"] == "replaced")
+            modbus.acknowledge(asked[1].number, Outcome.REFUSED)
+            for one in (page, other):
+                assert (await one.until("order", lambda o: o["outcome"] == "refused"))["order"] == "relocalise"
+
+    ordering(tmp_path, body)
+
+
+def test_an_order_that_another_client_replaces(tmp_path: Path) -> None:
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        async with house.page(TOKEN) as page:
+            await page.welcome()
+            await order(page, "relocalise")
+            await page.until("order")
+            machine = Orders("127.0.0.1", modbus.port, lambda told: None)
+            try:
+                await machine.give(0, {"order": "save_map"})
+                assert "by" not in await page.until("order", lambda one: one["outcome"] == "replaced")
+            finally:
+                await machine.close()
+
+    ordering(tmp_path, body)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"order": "reset"}, "no order"),
+        ({"order": "set_pose"}, "wants a pose"),
+        ({"order": "set_pose", "pose": [1, 2, "3"]}, "wants a pose"),
+        ({"order": "set_pose", "pose": [1, 2, float("nan")]}, "wants a pose"),
+        ({"order": "set_pose", "pose": [1e9, 2, 0]}, "away"),
+        ({"order": "set_pose", "pose": [10**400, 2, 0]}, "wants a pose"),
+        ({"order": ["x"]}, "no order"),
+    ],
+)
+def test_orders_that_cannot_be_given(tmp_path: Path, words: dict[str, Any], said: str) -> None:
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        async with house.page(TOKEN) as page:
+            await page.welcome()
+            await page.socket.send_json(words)
+            assert said in (await page.until("order"))["outcome"]
+            assert asked == []
+
+    ordering(tmp_path, body)
+
+
+def test_a_daemon_that_takes_no_orders_says_so(tmp_path: Path) -> None:
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        async with house.page(TOKEN) as page, house.page() as other:
+            for one in (page, other):
+                await one.welcome()
+                await order(one, "relocalise")
+            assert "modbus.write = true" in (await page.until("order"))["outcome"]
+            assert "--write" in (await other.until("order"))["outcome"]
+            assert asked == []
+
+    ordering(tmp_path, body, write=False)
+
+
+def test_a_daemon_without_modbus_takes_no_orders(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with house.page(TOKEN) as page:
+            await page.welcome()
+            await order(page, "save_map")
+            assert "modbus.port" in (await page.until("order"))["outcome"]
+
+    run(tmp_path, body, guard=Guard("127.0.0.1", TOKEN, True))
+
+
+def test_the_state_is_told_once_each(tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with house.page() as page:
+            await page.welcome()
+            for number, state in enumerate((State.MAPPING, State.MAPPING, State.TRACKING)):
+                house.stream.publish(snapshot(number, state=state))
+            assert (await page.until("state"))["state_name"] == "MAPPING"
+            assert (await page.until("state"))["state_name"] == "TRACKING"
+
+    run(tmp_path, body)
