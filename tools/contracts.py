@@ -1,31 +1,53 @@
 """Every contract with the outside as plain data, and what has changed of it since the release before.
 
-    python -m tools.contracts                    what differs from the frozen ones
+    python -m tools.contracts                    what is broken, and what is new
+    python -m tools.contracts --update           write down what is there now, beside the release before
     python -m tools.contracts --freeze VERSION   at a release: freeze what is there now
 
 A register, a byte, a number of a state or a key of the configuration that was there stays what it was; more may come.
-A contract breaks only under a new version number of its own. Only tables are read here, nothing runs.
+A contract breaks only under a new version number of its own. What is new since that release may still change, but not
+unnoticed: it is written down beside it. Only tables are read here, nothing runs.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import re
+import struct
 import sys
+import typing
 from collections.abc import Iterable
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
+
 from daemon import configfile, store_file
 from daemon.health import FAULTS
-from daemon.publish import holding, integrity, lights, parts, pulse, registers, snapshot, stream, subscribe
+from daemon.publish import (
+    holding,
+    integrity,
+    lights,
+    parts,
+    pulse,
+    registers,
+    snapshot,
+    stream,
+    stream_fields,
+    subscribe,
+)
+from daemon.publish.block import Block
 from daemon.publish.points import Layout
 from daemon.reasons import REASONS
+from daemon.record import CommandEntry, CycleEntry
 from hal import input_codec
 from hal.replay import recording
 
 FROZEN: Final = Path(__file__).parent.parent / "tests" / "daemon" / "publish" / "frozen" / "release.json"
+NOW: Final = FROZEN.with_name("unreleased.json")
 ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason", "Part", "Thread")
 
 Items = dict[str, str]
@@ -37,17 +59,17 @@ def contracts() -> Contracts:
     return {
         "configuration": _contract(0, _keys()),
         "modbus": _contract(registers.VERSION, _input_registers() | _mirror() | _bits()),
-        "modbus lights": _contract(lights.VERSION, _points("register", lights.BLOCK, lights.BODY_ADDRESS)),
-        "modbus integrity": _contract(integrity.VERSION, _points("register", integrity.BLOCK, integrity.BODY_ADDRESS)),
-        "modbus cycle": _contract(pulse.VERSION, _points("register", pulse.BLOCK, pulse.BODY_ADDRESS)),
-        "modbus parts": _contract(parts.VERSION, _points("register", parts.BLOCK, parts.BODY_ADDRESS)),
+        "modbus lights": _block(lights.BLOCK),
+        "modbus integrity": _block(integrity.BLOCK),
+        "modbus cycle": _block(pulse.BLOCK),
+        "modbus parts": _block(parts.BLOCK),
         "modbus holding": _contract(0, _holding_registers()),
         "numbers": _contract(0, _numbers()),
         "pose datagram": _contract(registers.VERSION, _datagram()),
         "input datagrams": _contract(input_codec.VERSION, _sizes()),
-        "subscription": _contract(subscribe.VERSION, _named("status", subscribe.Status)),
-        "stream": _contract(stream.SCHEMA, {f"topic {name}": "" for name in stream.TOPICS}),
-        "recordings": _contract(recording.VERSION, {}),
+        "subscription": _contract(subscribe.VERSION, _named("status", subscribe.Status) | _subscription()),
+        "stream": _contract(stream.SCHEMA, {f"topic {name}": "" for name in stream.TOPICS} | _stream()),
+        "recordings": _contract(recording.VERSION, _named("kind", recording.Kind) | _records()),
         "map files": _contract(store_file.VERSION, {}),
     }
 
@@ -62,6 +84,22 @@ def differences(frozen: Contracts, now: Contracts) -> list[str]:
             found.append(f"{name}: version {before['version']} has become {after['version']}; versions only count up")
         elif after["version"] == before["version"]:
             found += [f"{name}: {text}" for text in _broken(before["items"], after["items"])]
+    return found
+
+
+def additions(frozen: Contracts, now: Contracts) -> list[str]:
+    """What there was not in the frozen contracts, under the same version numbers."""
+    found = []
+    for name, after in now.items():
+        before = frozen.get(name)
+        if before is None:
+            found.append(f"{name}: the whole contract, {len(after['items'])} items")
+        elif after["version"] > before["version"]:
+            found.append(f"{name}: version {after['version']}, which was {before['version']}")
+        else:
+            items = after["items"].items()
+            found += [f"{name}: {key} ({value})" if value else f"{name}: {key}" for key, value in items
+                      if key not in before["items"]]  # fmt: skip
     return found
 
 
@@ -91,8 +129,17 @@ def _points(place: str, layout: Layout, start: int, step: int = 1) -> Items:
     }
 
 
+def _magic(address: int, magic: int) -> Items:
+    return {f"register {address}": f"magic: {magic:#06x}"}
+
+
+def _block(block: Block) -> dict[str, Any]:
+    points = _points("register", block, block.body)
+    return _contract(block.version, _magic(block.address, block.magic) | points)
+
+
 def _input_registers() -> Items:
-    return _points("register", registers.BODY, registers.BODY_ADDRESS)
+    return _magic(0, registers.MODBUS_MAGIC) | _points("register", registers.BODY, registers.BODY_ADDRESS)
 
 
 def _mirror() -> Items:
@@ -132,18 +179,73 @@ def _sizes() -> Items:
     return {"odometry": f"{input_codec.ODOMETRY_SIZE} bytes", "imu": f"{input_codec.IMU_SIZE} bytes"}
 
 
+def _subscription() -> Items:
+    """Bytes of a request and of its answer, which have one layout."""
+    found, at = {"magic": subscribe.MAGIC.decode(), "length": f"{subscribe.SIZE} bytes"}, 0
+    for name, code in (*subscribe.LAYOUT, ("CRC-32 of what is before it", "I")):
+        found[f"byte {at}"] = f"{name}: <{code}"
+        at += struct.calcsize(f"<{code}")
+    return found
+
+
+def _stream() -> Items:
+    found = {
+        f"field {name} of {topic}": kind
+        for topic, table in stream_fields.FIELDS.items()
+        for name, kind in table.items()
+    }
+    for topic, record in stream_fields.RECORDS.items():
+        found |= {f"field {name} of {topic}": kind for name, kind in _fields("", record)}
+    return found
+
+
+def _fields(before: str, record: type) -> Iterable[tuple[str, str]]:
+    """Names and types of a record, and of the records within it."""
+    for field in dataclasses.fields(record):
+        kind = str(field.type)
+        yield before + field.name, kind
+        for name in re.findall(r"[A-Z]\w+", kind):
+            if dataclasses.is_dataclass(inner := getattr(snapshot, name, None)):
+                yield from _fields(f"{before}{field.name}.", inner)  # type: ignore[arg-type]  # a class: the module's
+
+
+def _records() -> Items:
+    layouts = {f"{name}": layout for name, layout in recording.HEAD.items()}
+    layouts |= {f"payload of {kind.name}": f"{layout}: {names}" for kind, (layout, names) in recording.LAYOUTS.items()}
+    for name, entry in (("CYCLE", CycleEntry), ("a command of CYCLE", CommandEntry)):
+        for number, field in enumerate(msgspec.structs.fields(entry)):
+            kind = str(field.type) if typing.get_args(field.type) else field.type.__name__
+            layouts[f"field {number} of {name}"] = f"{field.name}: {kind}"
+    return layouts
+
+
 def main() -> int:
     """Exit status 1 where something is broken."""
     parser = argparse.ArgumentParser(prog="python -m tools.contracts", description=__doc__)
     parser.add_argument("--freeze", metavar="VERSION", help="write what is there now as that release's contracts")
+    parser.add_argument("--update", action="store_true", help=f"write what is there now into {NOW.name}")
     options = parser.parse_args()
+    now = contracts()
     if options.freeze:
-        FROZEN.write_text(json.dumps({"release": options.freeze, "contracts": contracts()}, indent=1) + "\n")
+        _write(FROZEN, options.freeze, now)
+    if options.freeze or options.update:
+        _write(NOW, "unreleased", now)
         return 0
     frozen = json.loads(FROZEN.read_text())
-    found = differences(frozen["contracts"], contracts())
-    print("\n".join(found) or f"nothing is broken since {frozen['release']}")
+    new = additions(frozen["contracts"], now)
+    found = differences(frozen["contracts"], now)
+    print(
+        *(f"new: {text}" for text in new),
+        *(f"BROKEN: {text}" for text in found),
+        sep="\n",
+        end="\n" * bool(new + found),
+    )
+    print(f"{len(found) or 'nothing'} broken since {frozen['release']}, {len(new) or 'nothing'} new")
     return int(bool(found))
+
+
+def _write(path: Path, release: str, now: Contracts) -> None:
+    path.write_text(json.dumps({"release": release, "contracts": now}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

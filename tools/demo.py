@@ -1,16 +1,18 @@
 """``make demo``: the real daemon and a simulated robot under coded lamps; live pose against truth, a map picture.
 
 The simulator is one process (a lidar on a pty, a photodiode's converter on an I2C bus behind a socket, odometry and
-truth as datagrams), the daemon another (``lumiloop run``). This process reads the pose and the links over Modbus, as
-any PLC would, and compares the pose with the truth of the same instant. On the way the photodiode and then the lidar
-are switched off and on again, or, with --kidnap, the robot is carried away; keys do the same at any time. At the end
-the map is taken from the daemon's own recording. Loopback only; nothing is left running.
+truth as datagrams), the daemon another (``lumiloop run``), its web page a third (``lumiloop view``). This process reads
+the pose and the links over Modbus, as any PLC would, and compares the pose with the truth of the same instant. On the
+way the photodiode and then the lidar are switched off and on again, or, with --kidnap, the robot is carried away; keys
+do the same at any time. At the end the map is taken from the daemon's own recording. Loopback only; nothing is left
+running.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import json
 import math
 import os
@@ -42,6 +44,7 @@ TELL_S: Final = 4.0
 STOP_S: Final = 10.0
 INTERRUPTED: Final = 130
 CONFIG: Final = "demo.toml"
+PAGE_LOG: Final = "page.log"
 RECORDING: Final = "recording"
 BUS: Final = "i2c"
 SURVEY: Final = "lamps.toml"
@@ -50,6 +53,9 @@ OLD_S: Final = 1.0
 """Links that have not been told anew for so long are not shown."""
 SHOWN: Final = 4
 """Links in a line, the strongest."""
+PAGE_PORT: Final = 8090
+"""Where the web page is, if nobody else is there. After `PAGE_S` the robot drives off without it."""
+PAGE_S: Final = 5.0
 LIDAR_X: Final = 0.15
 """Where the simulated robot carries its lidar (:class:`tools.sim.robot.Body`), told to the daemon as `lidar.mount`."""
 
@@ -105,7 +111,7 @@ def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) 
     text = (
         f'name = "demo"\nbind = "127.0.0.1"\n\n'
         f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
-        f'[map]\nfolder = "none"\n\n[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\n'
+        f'[map]\nfolder = "none"\n\n[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\nwrite = true\n'
     )
     if lights:
         text += f'\n[photodiode]\nbus = "unix:{folder / BUS}"\n\n[lights]\nsurvey = "{SURVEY}"\n'
@@ -150,6 +156,30 @@ def wait_for_pose(daemon: subprocess.Popen[str], reader: Reader, patience: Patie
             if int(reader.read()["state"] or 0) in READY:
                 return
         patience.wait(daemon, "daemon.log")
+
+
+@contextlib.contextmanager
+def web_page(config: Path, log: Path) -> Iterator[subprocess.Popen[str] | None]:
+    """Serves the web page of the daemon, and says in its log where; None where the library is missing that it needs."""
+    if importlib.util.find_spec("aiohttp") is None:
+        yield None
+        return
+    with socket.socket() as probe:
+        port = 0 if probe.connect_ex(("127.0.0.1", PAGE_PORT)) == 0 else PAGE_PORT
+    words = [sys.executable, "-m", "daemon", "view", "--config", str(config), "--port", str(port), "--write"]
+    with running(words, log, stdout=subprocess.DEVNULL) as server:
+        yield server
+
+
+def page_address(server: subprocess.Popen[str] | None, log: Path) -> str:
+    """Where the page is, as its server says; empty: there is none."""
+    end = time.monotonic() + PAGE_S
+    while server is not None and server.poll() is None and time.monotonic() < end:
+        address = log.read_text().partition("http://")[2]
+        if address.endswith("\n"):
+            return f"http://{address.split()[0]}"
+        time.sleep(0.05)
+    return ""
 
 
 # the show
@@ -265,9 +295,12 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
         simulator = stack.enter_context(running(words, out / "simulator.log", stdout=subprocess.PIPE))
         wait_for_simulator(simulator, patience)
         daemon = stack.enter_context(running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL))
+        page = stack.enter_context(web_page(config, out / PAGE_LOG))
         reader = stack.enter_context(Reader("127.0.0.1", modbus))
         wait_for_pose(daemon, reader, patience)
         print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
+        if address := page_address(page, out / PAGE_LOG):
+            print(f"watch it in a browser: {address}")
         if sys.stdin.isatty() and not options.dark:
             print("keys: p switches the photodiode off or on, l the lidar, c carries the robot away")
         simulator.send_signal(signal.SIGUSR1)

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import struct
 import subprocess
 import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
-from tools.bench.vm import bench, image, places
+from tools.bench.vm import bench, image, places, world
 from tools.bench.vm.guest import agent
 from tools.bench.vm.machine import Ports, _words
-from tools.bench.vm.report import Result, junit, page, regressions, write
 from tools.bench.vm.scenarios import PARTS, SCENARIOS, WRITTEN
+from tools.bench.world import agreement
+from tools.bench.world.room import room
+from tools.sim.harness import run
+from tools.sim.scene import SimulatedScene
 
 ROOT = Path(__file__).parents[2]
-GOOD = Result("boots", "Debian boots", True, 20.0, "up after 20 s")
-BAD = Result("drives", "A lap", False, 31.0, "0.300 m\nlog <of> the daemon")
 
 
 def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
@@ -65,6 +65,40 @@ def test_the_image_depends_on_what_is_in_it_and_on_nothing_else() -> None:
     assert key == image.digest(ROOT / "systemd")
     assert key != image.digest(ROOT / "systemd", ROOT / "pyproject.toml")
     assert key != image.digest(ROOT / "systemd", extra="another recipe")
+
+
+def test_an_image_that_is_not_whole_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(image, "missing", lambda build: "" if not build else "it would be made anew")
+    half = image.Image(image.cache() / f"image-{image.image_key()}")
+    half.folder.mkdir(parents=True)
+    half.kernel.write_bytes(b"x")
+    half.disk.touch()
+    left = (image.cache() / "part-999999999", image.cache() / "part-999999999.tar")
+    left[0].mkdir()
+    left[1].touch()
+    said: list[str] = []
+    with pytest.raises(places.CannotBench, match="it would be made anew"):
+        image.image(said.append)
+    assert "no disk, no initrd" in said[-1]
+    assert [path.name for path in image.cache().iterdir()] == []
+    half.folder.mkdir()
+    for path in (half.disk, half.kernel, half.initrd):
+        path.write_bytes(b"x")
+    assert image.image(said.append) == half
+
+
+def test_what_was_published_inside_is_compared_with_outside() -> None:
+    """The scenario's own arithmetic: a drive in virtual time against itself as the bench would hear it."""
+    seconds = 14.0
+    scene = SimulatedScene(world.scenario(), room())
+    made = run(seconds, scene=scene)
+    outside = agreement.reference_of(SimulatedScene(world.scenario(), room()), seconds)
+    fine = np.arange(made.t_mono[0], made.t_mono[-1], 0.01)
+    inside = agreement.trace_of(made.t_mono, made.pose, fine, scene.truth(fine))
+    assert agreement.differences(inside, outside)[1].max() < 2e-3
+    off = agreement.trace_of(made.t_mono, made.pose + np.array((0.02, 0.0, 0.0)), fine, scene.truth(fine))
+    assert agreement.differences(off, outside)[1].max() > 0.015
 
 
 def test_the_disk_is_never_written_to_and_only_loopback_is_listened_on(tmp_path: Path) -> None:
@@ -122,29 +156,6 @@ def test_the_truth_is_interpolated() -> None:
     pose = ears.true_pose(1.5)
     assert pose == pytest.approx((0.5, 1.0, math.pi), abs=1e-9)
     assert ears.true_pose(0.5) is None
-
-
-def test_the_report_names_what_failed(tmp_path: Path) -> None:
-    suite = ElementTree.fromstring(junit([GOOD, BAD]))
-    assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
-    assert [case.get("name") for case in suite if case.find("failure") is not None] == ["drives"]
-    text = page([GOOD, BAD], {"version": "1"}, [])
-    assert "1 of 2 scenarios passed" in text
-    assert "log &lt;of&gt; the daemon" in text
-    assert write(tmp_path, [GOOD, BAD], {}, None) == []
-    assert json.loads((tmp_path / "results.json").read_text())["results"][0]["name"] == "boots"
-
-
-def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
-    slow = Result("boots", "Debian boots", True, 60.0, "up after 60 s")
-    fine = Result("drives", "A lap", True, 31.0, "")
-    assert regressions([slow, BAD], [GOOD, fine]) == ["boots takes 60 s, 20 s then", "drives passed then"]
-    assert regressions([GOOD, fine], [GOOD, BAD]) == []
-    write(tmp_path, [GOOD, fine], {}, None)
-    assert write(tmp_path / "now", [slow, BAD], {}, tmp_path / "results.json") == [
-        "boots takes 60 s, 20 s then",
-        "drives passed then",
-    ]
 
 
 @pytest.mark.system

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tools import contracts
-from tools.contracts import FROZEN, differences
+from tools.contracts import FROZEN, NOW, additions, differences
 
 NUMBER = "uint16, 1/1 , saturates, always known"
 MAP_X = "map_x: int32, 1/10000 m, saturates, may be not known"
@@ -39,6 +39,12 @@ def test_the_release_before_is_kept_to() -> None:
         ("modbus holding", "holding 1100", "x", f"holding 1100 was 'number: {NUMBER}' and is 'x'"),
         ("configuration", "key modbus.port", "default 502", "key modbus.port was 'default 1502' and is 'default 502'"),
         ("stream", "topic scan", None, "topic scan is gone"),
+        ("stream", "field unit of map", None, "field unit of map (float) is gone"),
+        ("stream", "field trust.gap of pose", "int", "field trust.gap of pose was 'float | None' and is 'int'"),
+        ("subscription", "byte 12", "cookie: <I", "byte 12 was 'cookie: <Q' and is 'cookie: <I'"),
+        ("recordings", "kind 9", "SCAN", "kind 9 was 'SAMPLES' and is 'SCAN'"),
+        ("recordings", "field 4 of CYCLE", "x: int", "field 4 of CYCLE was 'imu: int' and is 'x: int'"),
+        ("recordings", "payload of IMU", None, "payload of IMU (<3d: t_rx t_mono yaw_rate) is gone"),
     ],
 )  # fmt: skip
 def test_what_breaks_a_client_is_named(now: Any, contract: str, key: str, value: str | None, said: str) -> None:
@@ -51,11 +57,24 @@ def test_what_breaks_a_client_is_named(now: Any, contract: str, key: str, value:
     assert differences(frozen, now) == [], "a new version may do what it likes"
 
 
-def test_more_may_come(now: Any) -> None:
+def test_what_is_new_since_the_release_changes_only_with_what_is_written_down_of_it() -> None:
+    kept = json.loads(NOW.read_text())["contracts"]
+    remedy = "run `python -m tools.contracts --update`, and look at what that changes: somebody may use it already"
+    assert kept == contracts.contracts(), remedy
+
+
+def test_more_may_come_and_is_listed(now: Any) -> None:
     frozen = copy.deepcopy(now)
+    assert additions(frozen, now) == []
     now["modbus"]["items"]["register 998"] = "later"
     now["another"] = {"version": 1, "items": {}}
+    now["stream"]["version"] = 2
     assert differences(frozen, now) == []
+    assert additions(frozen, now) == [
+        "modbus: register 998 (later)",
+        "stream: version 2, which was 1",
+        "another: the whole contract, 0 items",
+    ]
 
 
 def test_a_contract_that_is_gone_or_counted_down_is_named(now: Any) -> None:
@@ -81,13 +100,23 @@ def test_the_command_says_what_is_broken(
 ) -> None:
     path = tmp_path / "release.json"
     monkeypatch.setattr(contracts, "FROZEN", path)
+    monkeypatch.setattr(contracts, "NOW", tmp_path / "now.json")
     monkeypatch.setattr("sys.argv", ["contracts", "--freeze", "1.2.3"])
     assert contracts.main() == 0
     monkeypatch.setattr("sys.argv", ["contracts"])
     assert contracts.main() == 0
-    assert "nothing is broken since 1.2.3" in capsys.readouterr().out
+    assert capsys.readouterr().out == "nothing broken since 1.2.3, nothing new\n"
     kept = json.loads(path.read_text())
     kept["contracts"]["numbers"]["items"]["command 99"] = "DANCE"
+    del kept["contracts"]["numbers"]["items"]["command 1"]
     path.write_text(json.dumps(kept))
     assert contracts.main() == 1
-    assert "numbers: command 99 (DANCE) is gone" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "BROKEN: numbers: command 99 (DANCE) is gone" in said
+    assert "new: numbers: command 1 (SET_POSE)" in said
+    assert said.endswith("1 broken since 1.2.3, 1 new\n")
+    (tmp_path / "now.json").unlink()
+    monkeypatch.setattr("sys.argv", ["contracts", "--update"])
+    assert contracts.main() == 0
+    assert json.loads((tmp_path / "now.json").read_text())["release"] == "unreleased"
+    assert json.loads(path.read_text()) == kept, "the release before stays what it was"

@@ -231,8 +231,11 @@ def left_behind(mark: str) -> list[str]:
 
 
 def start(folder: Path, *words: str) -> subprocess.Popen[str]:
-    """A demo whose temporary files are below ``folder``, which is how its children are told from others."""
-    command = [sys.executable, "-m", "tools.demo", "--out", str(folder / "out"), *words]
+    """A demo whose temporary files are below ``folder``, which is how its children are told from others.
+
+    Where the tests run in the background, an interrupt is ignored; the demo must not inherit that.
+    """
+    command = ["env", "--default-signal=INT", sys.executable, "-m", "tools.demo", "--out", str(folder / "out"), *words]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, "TMPDIR": str(folder)}
     )
@@ -245,6 +248,7 @@ def test_half_a_minute(tmp_path: Path) -> None:
     text, _ = demo.communicate(timeout=240)
     assert demo.returncode == 0, text
     assert "TRACKING" in text
+    assert "watch it in a browser: http://127.0.0.1:" in text
     figures = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert figures["ok"]
     assert figures["driven_m"] > 3.0

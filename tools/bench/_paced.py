@@ -48,7 +48,10 @@ SETTLE_S: Final = 8.0
 
 @dataclass(slots=True)
 class Wanted:
-    """What the parent asks for. ``turns``: pairs of a stretch alone and one loaded, each of ``stretch_s``."""
+    """What the parent asks for.
+
+    ``turns``: pairs of a stretch alone and one loaded, each of ``stretch_s``. ``solve``: loaded with the graph, too.
+    """
 
     drive: str
     stream: str
@@ -57,6 +60,7 @@ class Wanted:
     fifo: bool
     turns: int
     stretch_s: float
+    solve: bool = True
 
 
 @dataclass(slots=True)
@@ -179,7 +183,7 @@ class Feeder:
         assert self.daemon is not None
         solver = self.daemon.cycle.parts.worker
         assert isinstance(solver, Solver)
-        solver.busy, self.told.solved = stretch == "loaded", solver.solved
+        solver.busy, self.told.solved = stretch == "loaded" and self._wanted.solve, solver.solved
         os.write(1, f"{stretch or 'alone'}\n".encode())
 
     def _timed(self, run: Callable[[], object]) -> object:

@@ -7,7 +7,6 @@ Written from docs/modbus.md alone: it shares no code with the daemon, so it can 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import struct
@@ -17,8 +16,8 @@ import time
 import tty
 
 STATES = ("STARTING", "NO_LIDAR", "MAPPING", "TRACKING", "DEGRADED", "AMBIGUOUS", "LOST", "RELOCATING")
-REGISTERS = 64
-INT32 = -(2**31)  # what "not known" reads as
+RATES = {int(name[1:]): code for name, code in vars(termios).items() if name[0] == "B" and name[1:].isdigit()}
+REGISTERS, INT32 = 64, -(2**31)  # to be read at once; what "not known" reads as
 
 
 def crc16(data: bytes) -> bytes:
@@ -39,11 +38,15 @@ class Line:
         self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(self._fd)
         settings = termios.tcgetattr(self._fd)
-        settings[2] = settings[2] & ~termios.CSTOPB | termios.CS8 | termios.PARENB | termios.CLOCAL | termios.CREAD
-        settings[2] &= ~termios.PARODD
-        settings[4] = settings[5] = getattr(termios, f"B{baud}")
-        with contextlib.suppress(termios.error):  # a pseudo-terminal has no parity
+        settings[2] &= ~(termios.CSTOPB | termios.PARODD)
+        settings[2] |= termios.CS8 | termios.PARENB | termios.CLOCAL | termios.CREAD
+        settings[4] = settings[5] = RATES[baud]
+        try:
             termios.tcsetattr(self._fd, termios.TCSANOW, settings)
+        except termios.error as error:
+            if not os.ttyname(self._fd).startswith("/dev/pts/"):  # a pseudo-terminal has no parity, and needs none
+                os.close(self._fd)
+                raise OSError(f"the port cannot do {baud} bit/s with even parity: {error.args[-1]}") from error
 
     def read(self, patience_s: float = 1.0) -> dict[str, float | int | str | None]:
         """The latest snapshot. Raises TimeoutError (ask again) or ValueError (damaged, or not a lumiloop)."""
@@ -57,9 +60,7 @@ class Line:
 
     def _exactly(self, size: int, end: float) -> bytes:
         data = b""
-        while len(data) < size:
-            if data[1:2] and data[1] & 0x80 and len(data) >= 5:
-                return data  # an exception is short
+        while len(data) < size and not (len(data) >= 5 and data[1] & 0x80):  # an exception is short
             if not select.select([self._fd], [], [], max(0.0, end - time.monotonic()))[0]:
                 raise TimeoutError("no answer")
             data += os.read(self._fd, size - len(data))
@@ -87,11 +88,12 @@ if __name__ == "__main__":
     words = sys.argv[1:] or sys.exit(__doc__)
     try:
         line = Line(words[0], *map(int, words[1:3]))
-    except (OSError, termios.error) as error:
-        sys.exit(f"{words[0]}: {error}")
-    while True:
-        try:
-            print(line.read())
-        except TimeoutError:
-            print("no answer")
-        time.sleep(0.1)
+        while time.sleep(0.1) is None:
+            try:
+                print(line.read())
+            except (TimeoutError, ValueError) as error:
+                print(error)
+    except (OSError, KeyError, ValueError, termios.error) as error:
+        sys.exit(
+            f"{words[0]}: {error.args[-1]} (a serial port; a rate of {', '.join(map(str, sorted(RATES)[8:]))}; a unit)"
+        )

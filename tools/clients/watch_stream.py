@@ -47,7 +47,22 @@ def line_of(topic: str, data: dict[str, Any]) -> str:
         return f"{data['t_mono']:.3f} scan {data['seq']}: {len(seen)} of {len(ranges)} beams, nearest {nearest:.2f} m"
     if topic == "map":
         return f"map {data['map_id']:08x} version {data['version']}: {len(data['tiles'])} tiles" + " ..." * data["more"]
+    if topic == "state":
+        remedy = f" ({data['remedy']})" if data["remedy"] else ""
+        return f"{data['t_mono']:.3f} {data['state_name']}: {data['meaning']}{remedy}"
+    if topic == "faults":
+        said = [f"{one['fault']} {one['meaning']} ({one['remedy']})" for one in data["present"]]
+        return "faults: " + ("; ".join(said) or "none")
     return f"{topic}: {data}"
+
+
+def told(frame: dict[str, Any]) -> str:
+    """One line for a person, of any frame."""
+    if frame["topic"] == "hello":
+        return f"this is lumiloop {frame['name']!r}, process {frame['pid']}; topics: {', '.join(frame['topics'])}"
+    if frame["topic"] == "error":
+        return f"refused: {frame['text']}"
+    return line_of(frame["topic"], frame["data"])
 
 
 def main() -> int:
@@ -59,10 +74,7 @@ def main() -> int:
         sock.connect(sys.argv[1])
         ask(sock, sys.argv[2:] or ["pose", "state", "loop"])
         for frame in frames(sock):
-            if frame["topic"] in ("hello", "error"):
-                print(frame, flush=True)
-            else:
-                print(line_of(frame["topic"], frame["data"]), flush=True)
+            print(told(frame), flush=True)
     return 0
 
 

@@ -20,8 +20,8 @@ from tools.figures import table
 
 GROUPS: Final = {
     "lights": (
-        "fig4", "fig5", "fig5_loops", "fig6", "islands", "claim", "adaptive", "room", "tones", "static", "walks",
-        "survey", "beamquality", "relocate", "relocate_real",
+        "fig4", "fig5", "fig5_loops", "fig6", "corridor", "islands", "claim", "adaptive", "room", "tones", "static",
+        "walks", "survey", "beamquality", "relocate", "relocate_real",
     ),
 }  # fmt: skip
 

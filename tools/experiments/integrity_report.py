@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +36,7 @@ class Found:
     Attributes:
         wrong_s: longest stretch of wrong TRACKING. limit_s: what is allowed. worst_m, worst_deg: in TRACKING.
         tracking, recoverable: share of the time after the start, and of that in which the place could be known.
-        beyond_sigma, beyond_bound, bounded, tracked: cycles.
+        beyond_sigma, beyond_bound, bounded, tracked: cycles. means: what the robot has: lamps, wheels.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Found:
     bounded: int
     tracked: int
     facts: str
+    means: str
 
     @property
     def wrong(self) -> bool:
@@ -108,7 +110,30 @@ class Summary:
             f"TRACKING in clean drives {np.mean(clean) if clean else np.nan:.1%}, of recoverable time {recovered:.1%}",
             f"median error {100 * error:.1f} cm, median sigma {100 * sigma:.1f} cm ({sigma / error:.2f} times); "
             f"heading {np.degrees(turned):.2f} deg, {np.degrees(spread):.2f} deg ({spread / turned:.2f} times)",
+            *self._by_means(),
         ]  # fmt: skip
+
+    def _by_means(self) -> list[str]:
+        """Of each equipment: clean drives, and how far what is said of the error is true of it.
+
+        Of independent errors along two equal axes 86.5 % are within two deviations; along one axis 95.4 %.
+        """
+        lines = []
+        for means in sorted({each.means for each in self.found}):
+            own = [(each, track) for each, track in zip(self.found, self.cycles, strict=True) if each.means == means]
+            clean = [each.tracking for each, _ in own if each.clean]
+            rows = np.concatenate([track for _, track in own])
+            rows = rows[rows[:, _AT["state"]] == State.TRACKING]
+            if not len(rows):
+                continue
+            error, sigma = rows[:, _AT["error_m"]], rows[:, _AT["sigma_m"]]
+            share = f"{np.mean(clean):.1%} of {len(clean)}" if clean else "none"
+            lines.append(
+                f"  {means}: TRACKING in clean drives {share}; median error {100 * np.median(error):.1f} cm, sigma "
+                f"{100 * np.median(sigma):.1f} cm; within two sigmas {np.mean(error <= 2.0 * sigma):.1%}, three "
+                f"{np.mean(error <= 3.0 * sigma):.1%}"
+            )
+        return lines
 
     def _listed(self) -> list[str]:
         odd = [e for e in self.found if e.wrong or e.beyond_bound or e.beyond_sigma]
@@ -161,7 +186,14 @@ def judged(name: str, track: Array, recoverable: Array, facts: tuple[bool, bool,
         bounded=int(bounded.sum()),
         tracked=int(tracked.sum()),
         facts=said,
+        means=means_of(said),
     )
+
+
+def means_of(facts: str) -> str:
+    """What a robot tells its place by, from the facts of its scenario."""
+    known = ast.literal_eval(facts or "{}")
+    return f"{'lit' if known.get('lit') else 'laser only'}, {'with' if known.get('wheels') else 'without'} wheels"
 
 
 def longest(t: Array, on: npt.NDArray[np.bool_]) -> float:

@@ -9,18 +9,22 @@ said of the submaps out of the pose graph (and out of the judgement of loops).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from heapq import merge
 from typing import Any, Final
 
 import numpy as np
 
+from daemon.evidence import Observer
 from estimator.light import LightsSetup
 from estimator.pipeline import Settings, State, keyframe_poses, new_state
+from estimator.records import Job, Record, Scan
 from estimator.result import StepResult
 from tools.experiments.fig6_curves import Point, counted
 from tools.experiments.fig6_trial import FROM_S, Watcher
-from tools.experiments.loop_drives import BODY, half, play, scans
+from tools.experiments.loop_drives import BODY, RATE_HZ, half, scans
+from tools.experiments.relocate_trial import Moment, Robot, Said, longest
 from tools.experiments.report import COMMAND, Report, Table, Work
 from tools.experiments.trajectory import Errors, Track, errors, started
 from tools.figures import Figure, bounded
@@ -72,12 +76,54 @@ CASES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a drive came to. along: RMSE in the driving direction, m. live: as published; kept: of the keyframes."""
+    """What a drive came to.
+
+    Attributes:
+        along: RMSE in the driving direction, m. live: as published; kept: of the keyframes.
+        tracking: share of the time in which TRACKING was said. astray_s: longest time for which it was with a pose off
+            by more than 0.5 m or 5 deg. sure: largest error (m) in TRACKING.
+    """
 
     loops: Point
     along: float
     live: Errors
     kept: Errors
+    tracking: float = math.nan
+    astray_s: float = math.nan
+    sure: float = math.nan
+
+
+@dataclass(eq=False)
+class Judged(Robot):
+    """A robot as the daemon judges it; ``done``: jobs of the latest cycle with what they have found."""
+
+    done: list[tuple[Any, Any]] = field(default_factory=list)
+
+    def take(self, t: float, records: list[Record]) -> StepResult:
+        """One cycle; what it asks for is done at once, and answered with the next."""
+        result = super().take(t, records)
+        self.done = [(job, job.run()) for job in self.waiting]
+        return result
+
+    def _run(self, job: Job) -> object:
+        return next(payload for one, payload in self.done if one is job)
+
+
+def driven(
+    robot: Judged, streams: Iterable[Iterable[Record]], watch: Callable[..., None], run: LightRun
+) -> list[Moment]:
+    """All records through the robot, one cycle a scan; what was said after each."""
+    pending: list[Record] = []
+    moments = []
+    ordered: Iterable[Any] = merge(*streams, key=lambda record: record.t_end)  # type: ignore[union-attr]  # no orders
+    for record in ordered:
+        pending.append(record)
+        if isinstance(record, Scan):
+            result = robot.take(record.t_end, pending)
+            pending = []
+            watch(robot.state, result, robot.done)
+            moments.append(robot.moment(record.t_end, run.truth(np.array([robot.t_mono]))[0]))
+    return moments
 
 
 def ceiling_for(case: Case, seed: int) -> Ceiling:
@@ -132,7 +178,8 @@ def trial(task: tuple[Case, int, float]) -> Outcome:
     state = new_state(Settings(history=True), LightsSetup(run.survey, clock_ppm=0.0) if case.lit else None)
     watch = Watcher(run, False)
     streams = (run.odometry(), scans(run), half(run.light())) if case.lit else (run.odometry(), scans(run))
-    play(state, streams, watch if case.factors else without_light(watch))
+    robot = Judged(state, Observer(0.0, odometry=True, lidar=True, lights=case.lit), period_s=1.0 / RATE_HZ)
+    moments = driven(robot, streams, watch if case.factors else without_light(watch), run)
     t = np.array(watch.t)
     live = Track(t, np.array(watch.pose), run.truth(t))
     live = live.since(min(FROM_S, 0.3 * seconds)) if case.lit else started(live)
@@ -142,7 +189,13 @@ def trial(task: tuple[Case, int, float]) -> Outcome:
         np.array(laid, float), np.array([where[k] for k in laid]), np.array([watch.truth.pose[k] for k in laid])
     )
     loops = Point(*counted(watch.loops, watch.asked))
-    return Outcome(loops, along(live), errors(live), errors(kept if case.lit else started(kept)))
+    found = Outcome(loops, along(live), errors(live), errors(kept if case.lit else started(kept)))
+    if not case.lit:
+        return found  # whose map has a frame of its own
+    tracking = [one for one in moments if one.state == Said.TRACKING]
+    share = len(tracking) / len(moments)
+    sure = max((one.off_m for one in tracking), default=0.0)
+    return replace(found, tracking=share, astray_s=longest(moments, [one.astray for one in moments]), sure=sure)
 
 
 def along(track: Track) -> float:
@@ -165,6 +218,11 @@ def run(quick: bool, work: Work) -> Report:
             figures.append(
                 bounded("corridors, lamps 2.9 m apart: along, worst", worst, "cm", "<= 5", f"{COMMAND} islands")
             )
+        if case.lit:
+            astray = max(one.astray_s for one in mine)
+            figures.append(
+                bounded(f"{case.name}: TRACKING wrongly, longest", astray, "s", "<= 0.5", f"{COMMAND} islands")
+            )
     figures += [
         Figure(f"corridors, {row[0]}: RMSE, median", float(row[6]), "cm", command=f"{COMMAND} islands") for row in rows
     ]
@@ -173,7 +231,7 @@ def run(quick: bool, work: Work) -> Report:
 
 HEAD: Final = (
     "", "loops", "precision %", "recall %", "along, median cm", "worst", "RMSE, median cm", "worst", "heading, deg",
-    "map RMSE, median cm", "worst",
+    "map RMSE, median cm", "worst", "TRACKING, %", "wrongly, longest s", "largest error in TRACKING, cm",
 )  # fmt: skip
 
 
@@ -184,4 +242,6 @@ def row_of(case: Case, done: list[Outcome]) -> tuple[str | float | int, ...]:
     cells = [100.0 * v for part in (ahead, live) for v in (float(np.median(part)), max(part))]
     heading = float(np.median([o.live.heading for o in done]))
     last = [100.0 * float(np.median(kept)), 100.0 * max(kept)]
-    return (case.name, p.accepted, 100.0 * p.precision, 100.0 * p.recall, *cells, heading, *last)
+    said = [100.0 * float(np.median([o.tracking for o in done])), max(o.astray_s for o in done)]
+    said.append(100.0 * max(o.sure for o in done))
+    return (case.name, p.accepted, 100.0 * p.precision, 100.0 * p.recall, *cells, heading, *last, *said)

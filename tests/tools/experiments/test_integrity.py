@@ -10,7 +10,7 @@ import pytest
 from daemon.publish.snapshot import State
 from tools.experiments import integrity
 from tools.experiments.integrity_plot import stanford
-from tools.experiments.integrity_report import COLUMNS, Array, judged, longest, report
+from tools.experiments.integrity_report import COLUMNS, Array, Summary, judged, longest, report
 from tools.experiments.integrity_run import run
 from tools.experiments.integrity_scene import KINDS, draw
 
@@ -56,6 +56,16 @@ def test_bounds_and_shares_are_counted() -> None:
     assert (found.beyond_bound, found.bounded) == (10, 550)
     assert found.tracking == pytest.approx(0.8)
     assert found.recoverable == 1.0
+
+
+def test_what_a_robot_tells_its_place_by_is_reported_apart() -> None:
+    said = [judged("a-0", track(), ALL, (True, True, facts)) for facts in ("", "{'lit': True}")]
+    often = track(15.0, error_m=0.015, error_rad=0.01, sigma_m=0.01)
+    seldom = track(5.0, error_m=0.025, error_rad=0.01, sigma_m=0.01)
+    text = Summary(said, [np.vstack([often, seldom]), often]).text()
+    assert "laser only, without wheels: TRACKING in clean drives 100.0% of 1; median error 1.5 cm" in text
+    assert "within two sigmas 75.0%, three 100.0%" in text
+    assert "lit, without wheels" in text
 
 
 def test_a_stretch_ends_where_cycles_are_missing() -> None:

@@ -7,25 +7,22 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
 
+from tools.bench.report import About, CannotCompare, Result, Seen, facts, read, write
 from tools.bench.vm.bench import Bench, bench
 from tools.bench.vm.common import Scenario
-from tools.bench.vm.image import ROOT, Image, image
+from tools.bench.vm.image import Image, image
 from tools.bench.vm.machine import Order
 from tools.bench.vm.places import CannotBench, workspace
-from tools.bench.vm.report import Result, write
 from tools.bench.vm.scenarios import SCENARIOS
 
 ROOM = 2_000_000_000
 CANNOT = 2
-BUSY = 2.0
-"""Load for each processor; the bench itself makes about one."""
+CONFIGURATION = Path(__file__).parent / "guest" / "lumiloop.toml"
 
 
 def say(text: str) -> None:
@@ -38,11 +35,13 @@ def tried(scenario: Scenario, bench: Bench) -> Result:
     title = (scenario.__doc__ or scenario.__name__).splitlines()[0].rstrip(".")
     begun = time.monotonic()
     try:
-        said, passed = scenario(bench), True
+        told, passed = scenario(bench), True
+        seen = told if isinstance(told, Seen) else Seen(told)
     except (Order, OSError, ValueError, StopIteration) as error:
-        said, passed = f"{error}" or repr(error), False
-    result = Result(scenario.__name__, title, passed, time.monotonic() - begun, said)
-    say(f"{'passed' if passed else 'FAILED'} {result.seconds:6.1f} s  {title}\n{' ' * 17}{said}")
+        seen, passed = Seen(f"{error}" or repr(error)), False
+    seconds = time.monotonic() - begun
+    result = Result(scenario.__name__, title, passed, seconds, seen.said, figures=seen.figures, plots=seen.plots)
+    say(f"{result.outcome} {seconds:6.1f} s  {title}\n{' ' * 17}{seen.said}")
     return result
 
 
@@ -74,17 +73,6 @@ def run(made: Image, scenarios: list[Scenario], out: Path) -> list[Result]:
                     (out / f"{name}.log").write_bytes((folder / name).read_bytes())
 
 
-def version() -> str:
-    """What was tried."""
-    said = subprocess.run(["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True)
-    return said.stdout.strip() or "unknown"
-
-
-def load() -> str:
-    """How busy this computer is with other things, too: the emulated one takes two processors."""
-    return f"{os.getloadavg()[1]:.1f} on {os.cpu_count()} processors"
-
-
 def main() -> int:
     """Make what is missing, run, report."""
     parser = argparse.ArgumentParser(prog="python -m tools.bench.vm", description=__doc__)
@@ -101,16 +89,18 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     begun = time.monotonic()
     try:
+        if options.against is not None:
+            read(options.against)  # what is wrong with it is told now, not in eight minutes
         made = image(say)
         if options.image_only:
             return 0
         results = run(made, chosen(options.scenario), options.out)
-    except CannotBench as reason:
+    except (CannotBench, CannotCompare) as reason:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT
     seconds = f"{time.monotonic() - begun:.0f}"
-    about = {"version": version(), "image": made.folder.name, "seconds in all": seconds, "load": load()}
-    worse = write(options.out, results, about, options.against)
+    told = facts(image=made.folder.name, configuration=CONFIGURATION.read_text(), **{"seconds in all": seconds})
+    worse = write(options.out, results, About("bench-vm", "Virtual bench", told), options.against)
     failed = [one.name for one in results if not one.passed]
     for text in worse:
         say(f"worse than before: {text}")

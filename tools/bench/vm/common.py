@@ -6,10 +6,11 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Final
 
+from tools.bench.report import Seen
 from tools.bench.vm.bench import Bench, Heard
 from tools.bench.vm.machine import Order
 
-Scenario = Callable[[Bench], str]
+Scenario = Callable[[Bench], str | Seen]
 WRITTEN: Final[list[Scenario]] = []
 """All scenarios, module by module in the order of their lines."""
 TRACKING_S: Final = 60.0

@@ -70,6 +70,19 @@ class Image:
         """With what it takes to find the disk."""
         return self.folder / "initrd"
 
+    def lacks(self) -> str:
+        """What is missing or empty; empty text: it is whole."""
+        parts = (self.disk, self.kernel, self.initrd)
+        return ", ".join(f"no {part.name}" for part in parts if not part.is_file() or not part.stat().st_size)
+
+
+def discard_parts(say: Say) -> None:
+    """Remove what a making that was killed has left half done in the cache."""
+    for left in cache().glob("part-*"):
+        if not Path("/proc", left.name.removeprefix("part-").partition(".")[0]).exists():
+            say(f"removing {left}: left half done by a process that was ended")
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
+
 
 def digest(*paths: Path, extra: str = "") -> str:
     """Of files, and of all files below folders."""
@@ -89,7 +102,7 @@ def base_key() -> str:
 
 def image_key() -> str:
     """What the image depends on."""
-    parts = ("daemon", "hal", "estimator", "systemd", "requirements/core.lock", "pyproject.toml")
+    parts = ("daemon", "hal", "estimator", "taps", "systemd", "requirements/core.lock", "pyproject.toml")
     return digest(*(ROOT / part for part in parts), GUEST, Path(__file__), extra=base_key())
 
 
@@ -100,6 +113,10 @@ def image(say: Say) -> Image:
         CannotBench: something is missing, or a step failed; says what.
     """
     made = Image(cache() / f"image-{image_key()}")
+    discard_parts(say)
+    if made.folder.exists() and (lacks := made.lacks()):
+        say(f"{made.folder} is not whole ({lacks}): it is made anew")
+        shutil.rmtree(made.folder, ignore_errors=True)
     if reason := missing(build=not made.folder.exists()):
         raise CannotBench(reason)
     if not made.folder.exists():

@@ -14,7 +14,6 @@ import secrets
 import signal
 import sys
 from contextlib import AsyncExitStack
-from dataclasses import replace
 from pathlib import Path
 
 from hal.clock import SystemClock
@@ -22,61 +21,32 @@ from hal.fake.adc import FakeAdc, FakeBuses
 from hal.fake.adc_light import OrdinaryLamps
 from hal.fake.control import Control, serve_control
 from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import MODELS, PAPER, Unit
+from hal.fake.models import Unit
 from hal.fake.schedule import FaultSchedule
 from hal.fake.tcp_server import TcpServer
 from hal.i2c_server import BusServer
-from hal.input_codec import decode, encode
-from tools.sim.buildings import Building
+from tools.bench.world.room import LIDAR, room
+from tools.bench.world.stage import ForeignSender
 from tools.sim.feed import UdpSender, feed_odometry, feed_truth
 from tools.sim.hands import Hands
-from tools.sim.robot import Route
 from tools.sim.scene import Scenario, SimulatedScene
-from tools.sim.world import Plan
 
-MODEL, BUS = "bench", "bench"
+BUS = "bench"
 DWELL_S = 4.0
-LAP_CORNERS = ((-2.6, -1.9), (2.4, -1.9), (2.4, 1.6), (-2.6, 1.6))
 
 
-def register() -> None:
-    """A lidar whose scans an emulated computer can keep up with: 180 deg, 181 beams, 5 Hz, on USB."""
-    modl = "BENCH-180[180 degrees, 181 beams, 5 Hz]"
-    MODELS[MODEL] = replace(PAPER, modl=modl, ares=360, amax=180, afrt=90, rpm=300, true_period_s=0.2)
-
-
-def room() -> Building:
-    """9 x 7 m with things that make every place in it look like no other."""
-    plan = Plan()
-    for start, end in (((-4.5, -3.5), (4.5, -3.5)), ((4.5, -3.5), (4.5, 3.5)), ((4.5, 3.5), (-4.5, 3.5))):
-        plan.line(start, end)
-    plan.line((-4.5, 3.5), (-4.5, 1.0))
-    plan.line((-4.5, 1.0), (-5.3, 1.0))
-    plan.line((-5.3, 1.0), (-5.3, -3.5))
-    plan.line((-5.3, -3.5), (-4.5, -3.5))
-    plan.box((3.6, 2.8), (1.4, 0.8), 0.0, "wood")
-    plan.box((-3.4, -3.0), (0.7, 0.7), 0.4, "wood")
-    plan.circle((0.3, 0.2), 0.3)
-    plan.circle((-1.2, 3.0), 0.2)
-    return Building("bench", plan.build(), Route(LAP_CORNERS, 1.2))
-
-
-class ForeignSender(UdpSender):
-    """Odometry of another computer: its clock means nothing to the daemon, so the bit that says so is cleared."""
-
-    def send(self, data: bytes) -> None:
-        """See :class:`UdpSender`."""
-        super().send(encode(replace(decode(data), flags=0)))
+def scenario() -> Scenario:
+    """What is driven; also outside of the emulated computer, to compare with."""
+    return Scenario(lidar=LIDAR, people=False, dwell_s=DWELL_S)
 
 
 async def serve(odometry: int, truth: int, control: Path) -> None:
     """Until SIGINT or SIGTERM."""
-    register()
     loop = asyncio.get_running_loop()
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
-    scene = SimulatedScene(Scenario(lidar=MODEL, people=False, dwell_s=DWELL_S), room(), held=True)
+    scene = SimulatedScene(scenario(), room(), held=True)
     loop.add_signal_handler(signal.SIGUSR1, scene.release)
     async with AsyncExitStack() as stack:
         device = FakeHokuyo(scene.model, scene.scan, unit=Unit(serial="H0000001"))

@@ -1,0 +1,112 @@
+"""The report of all benches: what it says, what it keeps, and what it finds worse than before."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from tools.bench.plots import Plot, Series, histogram, svg
+from tools.bench.report import About, CannotCompare, Figure, Result, facts, junit, page, read, regressions, write
+
+NOISE = Figure("noise", 10.0, "mm", "more")
+GOOD = Result("boots", "Debian boots", True, 20.0, "up after 20 s", figures=(NOISE,))
+BAD = Result("drives", "A lap", False, 31.0, "0.300 m\nlog <of> the daemon")
+LEFT = Result("walks", "A walk", True, 0.0, "", skipped="needs motion")
+ABOUT = About("bench-vm", "Virtual bench", {"version": "1", "configuration": "[lidar]\n<x>"})
+
+
+def kept(tmp_path: Path, *results: Result) -> Path:
+    write(tmp_path, list(results), ABOUT, None)
+    return tmp_path / "results.json"
+
+
+def test_the_report_names_what_failed_and_what_was_not_tried(tmp_path: Path) -> None:
+    suite = ElementTree.fromstring(junit([GOOD, BAD, LEFT], "bench-vm"))
+    assert [suite.get(key) for key in ("tests", "failures", "skipped")] == ["3", "1", "1"]
+    assert [case.get("name") for case in suite if case.find("failure") is not None] == ["drives"]
+    assert [case.get("name") for case in suite if case.find("skipped") is not None] == ["walks"]
+    assert suite.find(".//property[@name='noise']").get("value") == "10 mm"  # type: ignore[union-attr]  # it is there
+    text = page([GOOD, BAD, LEFT], ABOUT, [])
+    assert "Virtual bench: 1 of 3 passed, 1 not tried" in text
+    assert "log &lt;of&gt; the daemon" in text
+    assert "[lidar]\n&lt;x&gt;" in text
+    assert write(tmp_path, [GOOD, BAD, LEFT], ABOUT, None) == []
+    assert json.loads((tmp_path / "results.json").read_text())["results"][0]["name"] == "boots"
+
+
+def test_what_a_device_says_cannot_break_the_xml() -> None:
+    ElementTree.fromstring(junit([replace(BAD, said="garbage \x00\x1b from the line")], "hil"))
+
+
+def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
+    slow = replace(GOOD, seconds=60.0)
+    fine = replace(BAD, passed=True)
+    before = read(kept(tmp_path, GOOD, fine))
+    assert regressions([slow, BAD], before) == ["boots takes 60 s, 20 s then", "drives passed then"]
+    assert regressions([GOOD, fine], before) == []
+    assert regressions([replace(LEFT, name="boots")], before) == [
+        "boots passed then, and was not tried now: needs motion"
+    ]
+    worse = ["boots takes 60 s, 20 s then", "drives passed then"]
+    assert write(tmp_path / "now", [slow, BAD], ABOUT, tmp_path) == worse
+    assert "drives passed then" in (tmp_path / "now" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("worse", "value", "lost"),
+    [("more", 12.6, True), ("more", 12.4, False), ("less", 7.4, True), ("less", 99.0, False), ("", 99.0, False)],
+)
+def test_a_figure_is_worse_in_its_own_direction(worse: str, value: float, lost: bool, tmp_path: Path) -> None:
+    before = read(kept(tmp_path, GOOD))
+    now = replace(GOOD, figures=(replace(NOISE, value=value, worse=worse),))
+    assert bool(regressions([now], before)) is lost
+    assert f"({10:.4g} then)" in page([now], ABOUT, [], before)
+
+
+def test_room_allows_what_is_small(tmp_path: Path) -> None:
+    figure = Figure("lost scans", 0.0, worse="more", room=2.0)
+    before = read(kept(tmp_path, replace(GOOD, figures=(figure,))))
+    assert not regressions([replace(GOOD, figures=(replace(figure, value=2.0),))], before)
+    assert regressions([replace(GOOD, figures=(replace(figure, value=3.0),))], before)
+
+
+@pytest.mark.parametrize("text", ["{}", "[1]", "x"])
+def test_what_cannot_be_compared_with_is_refused_before_anything_is_written(text: str, tmp_path: Path) -> None:
+    (tmp_path / "old.json").write_text(text)
+    with pytest.raises(CannotCompare, match="no results of a bench"):
+        write(tmp_path / "out", [GOOD], ABOUT, tmp_path / "old.json")
+    with pytest.raises(CannotCompare, match=r"name the results\.json"):
+        write(tmp_path / "out", [GOOD], ABOUT, tmp_path / "none.json")
+    assert not (tmp_path / "out").exists()
+
+
+def test_facts_say_which_software_on_which_computer() -> None:
+    told = facts(image="x")
+    assert told["image"] == "x"
+    assert "numpy" in told["software"]
+    assert "processors" in told["computer"]
+
+
+def test_pictures_are_well_formed_whatever_is_drawn() -> None:
+    empty: list[float] = []
+    plots = [
+        Plot("no <data>", "s", "m", (Series("a", empty, empty),)),
+        Plot("gaps", "s", "m", (Series("a", [0.0, 1.0, 2.0, 3.0], [1.0, math.nan, 2.0, math.inf]),)),
+        Plot("one", "s", "m", (Series("a", [5.0], [5.0], "dots"), Series("fault", [5.0], empty, "marks"))),
+        Plot("way", "m", "m", (Series("", list(range(9000)), [0.0] * 9000),), square=True),
+        histogram("spread", "mm", [1.0, 2.0, 2.0, math.nan]),
+        histogram("nothing", "mm", empty),
+    ]
+    for plot in plots:
+        text = svg(plot)
+        assert "nan" not in text
+        assert "inf" not in text
+        assert len(text) < 60_000
+        ElementTree.fromstring(text)
+    with_plots = replace(GOOD, plots=(plots[1],))
+    assert "<svg" in page([with_plots], ABOUT, [])

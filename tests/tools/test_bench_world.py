@@ -1,0 +1,393 @@
+"""A bench computer as the world: scenario files, the judge, the DAC's wire, the serial end, and a robot computer."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import subprocess
+import sys
+import threading
+import tty
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hal.errors import DeviceMissing, DeviceRefused
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.world import Room
+from hal.i2c import Message, Transferred
+from tests.daemon.lightroom import CODES, Lit
+from tests.daemon.test_lights import Bench, run_daemon
+from tools.bench.report import Seen
+from tools.bench.world import agreement, room
+from tools.bench.world.__main__ import main
+from tools.bench.world.dac import CLOCKS, Player, encoded
+from tools.bench.world.judge import Played, Read, errors_of, judged, pictures
+from tools.bench.world.local import robot
+from tools.bench.world.scenario import BUILT_IN, Expectation, Scenario, ScenarioError, find, load
+from tools.bench.world.serialend import SerialEnd
+
+ROOT = Path(__file__).parents[2]
+Floats = np.ndarray
+LOW_PASS_S = 47e-6
+"""4.7 kOhm and 10 nF."""
+LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
+
+
+# files
+
+
+@pytest.mark.parametrize("path", sorted(BUILT_IN.glob("*.toml")), ids=lambda path: path.stem)
+def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
+    made = load(path)
+    assert made.title != path.stem
+    assert all(one.until <= made.drive.seconds and one.from_ < made.drive.seconds for one in made.expect)
+    assert made.scene(held=True).held
+    assert find(path.stem) == path
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("x = 1", "x: a scenario holds"),
+        ("world = 3\n" + LEAST, r"world: expected a table"),
+        ("[world]\nspeedy = 1\n" + LEAST, r"world\.speedy: known are building"),
+        ("[world]\nspeed = 'fast'\n" + LEAST, r"world\.speed: expected a float"),
+        ("[world]\nspeed = 9\n" + LEAST, r"0\.05 to 3 m/s"),
+        ("[world]\nbuilding = 'barn'\n" + LEAST, r"world\.building: there are bench"),
+        ("[world]\nlidar = 'SICK'\n" + LEAST, "no lidar is called 'SICK'"),
+        ("title = 'nothing expected'", "cannot fail"),
+        ("fault = 1\n" + LEAST, "expected"),
+        ("[[expect]]\nwhat = 'luck'", r"expect\[0\]\.what: 'luck' is none of error"),
+        ("[[expect]]\nwhat = 'error'", "the number is missing"),
+        ("[[expect]]\nwhat = 'state'\nwithin = 1", r"expect\[0\]\.is"),
+        ("[[expect]]\nwhat = 'never'\nis = 'HAPPY'", "states are STARTING"),
+        ("[[expect]]\nwhat = 'fault'\nis = '104'\nwithin = 1", "faults are numbers"),
+        ("[[expect]]\nwhat = 'never'\nis = 'LOST'\nby = 3", r"expect\[0\]\.by: known are what"),
+        ("[[expect]]\nwhat = 'lamps'\nat_least = 0.5", "lamps = false"),
+        ("=", "not TOML"),
+    ],
+)
+def test_a_scenario_that_is_wrong_is_refused_by_file_and_place(text: str, says: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    with pytest.raises(ScenarioError, match=says) as raised:
+        load(file)
+    assert str(raised.value).startswith(str(file))
+
+
+def test_what_cannot_be_played_is_said_with_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["--modbus", "127.0.0.1:9", "--lidar"]
+    cases = {
+        "lap": "--lidar and --modbus missing",
+        "laps": "there are cable, carried, garbage, lamps, lap",
+        str(tmp_path / "none.toml"): "No such file",
+    }
+    for name, says in cases.items():
+        assert main([name]) == 2
+        assert says in capsys.readouterr().out
+    for port, says in {
+        str(tmp_path / "ttyGS0"): "modprobe g_serial",
+        str(tmp_path / "ttyUSB0@115200"): "ftdi_sio",
+        "/dev/null": "not a serial port",
+        "tcp://here": "expected tcp://HOST:PORT",
+        "ttyUSB0": "expected /dev/ttyUSB0",
+    }.items():
+        assert main(["lap", *line, port]) == 2
+        assert says in capsys.readouterr().out
+    assert main(["lamps", *line, f"pty:{tmp_path / 'l'}", "--light", "dac:/dev/i2c-1"]) == 2
+    assert "expected dac:/dev/i2c-1@0x60" in capsys.readouterr().out
+    assert main(["lap", *line, f"pty:{tmp_path / 'l'}", "--against", str(tmp_path)]) == 2
+    assert "results.json" in capsys.readouterr().out
+
+
+def test_a_robot_computer_that_does_not_answer_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "short.toml"
+    file.write_text("[drive]\nsettle = 0.2\n" + LEAST)
+    assert main([str(file), "--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}"]) == 2
+    assert "nobody answers at 127.0.0.1 port 9" in capsys.readouterr().out
+    assert not (tmp_path / "l").exists()
+
+
+# the judge
+
+
+SCENARIO = Scenario("x", "x", expect=(Expectation("never", ("LOST",)),), faults=({"when": 3.0, "for": 1.0},))
+SCENARIO = replace(SCENARIO, drive=replace(SCENARIO.drive, seconds=10.0))
+
+
+def way(t: Floats) -> Floats:
+    """East at 0.5 m/s from (1, 2), heading north."""
+    return np.column_stack([1.0 + 0.5 * t, np.full(len(t), 2.0), np.full(len(t), math.pi / 2)])
+
+
+def played(off: Callable[[float], float] = lambda t: 0.0, **change: object) -> Played:
+    """Reads every 0.1 s, the pose 0.05 s old, ``off`` m to the robot's left of where it is."""
+    reads = []
+    for k in range(100):
+        t = 0.1 * k
+        y = -0.5 * max(t - 0.05, 0.0)  # seen from a robot that looks north, east is to the right
+        pose = (off(t), y, 0.0)
+        reads.append(replace(Read(t, "TRACKING", 0, t - 0.05, pose, 0.01, True, True), **change))  # type: ignore[arg-type]  # test shorthand
+    return Played(SCENARIO, reads, lambda t: way(np.maximum(t, 0.0)), [(0.0, 0.0, 0.0)])
+
+
+def test_a_pose_is_compared_with_the_truth_where_the_robot_said_it_was() -> None:
+    assert errors_of(played()).metres.max() < 1e-9
+    found = errors_of(played(lambda t: 0.2 if t > 5.0 else 0.0))
+    assert found.metres.max() == pytest.approx(0.2)
+    assert judged(Expectation("error", at_most=0.1), played(lambda t: 0.2))[0] is False
+    assert judged(Expectation("error", at_most=0.1, until=4.0), played(lambda t: 0.2 if t > 5.0 else 0.0))[0]
+    assert judged(Expectation("error", at_most=0.1, sigmas=11.0), played(lambda t: 0.2))[0]
+    assert judged(Expectation("error", at_most=0.1), played(pose=None))[0] is False
+
+
+@pytest.mark.parametrize(
+    ("expected", "change", "passed"),
+    [
+        (Expectation("state", ("TRACKING",), from_=2.0, within=1.0), {}, True),
+        (Expectation("state", ("NO_LIDAR",), from_=2.0, within=1.0), {}, False),
+        (Expectation("state", ("TRACKING",), from_=2.0, within=1.0), {"answered": False}, False),
+        (Expectation("never", ("TRACKING",)), {}, False),
+        (Expectation("never", ("LOST",)), {}, True),
+        (Expectation("share", ("TRACKING",), at_least=0.9), {}, True),
+        (Expectation("share", ("TRACKING",), at_least=0.9), {"state": "DEGRADED"}, False),
+        (Expectation("fault", (104,), within=1.0), {"fault": 104}, True),
+        (Expectation("fault", (104,), within=1.0), {"fault": 101}, False),
+        (Expectation("clear", within=1.0), {}, True),
+        (Expectation("clear", within=1.0), {"fault": 101}, False),
+        (Expectation("age", at_most=0.06), {}, True),
+        (Expectation("age", at_most=0.04), {}, False),
+        (Expectation("answers", at_least=0.99), {}, True),
+        (Expectation("answers", at_least=0.99), {"answered": False}, False),
+        (Expectation("lamps", at_least=0.9), {"lamps": ((7, 1e-6), (8, 1e-7))}, True),
+        (Expectation("lamps", at_least=0.9), {"lamps": ((8, 1e-6), (7, 1e-7))}, False),
+        (Expectation("lamps", at_least=0.9), {"lamps": ((7, 1e-6), (99, 1e-7))}, False),
+        (Expectation("lamps", at_least=0.9), {}, False),
+        (Expectation("never", ("LOST",), from_=50.0), {}, False),
+    ],
+)
+def test_expectations_pass_and_fail(expected: Expectation, change: dict[str, object], passed: bool) -> None:
+    run = replace(played(**change), lamps=frozenset({7, 8}), strongest=lambda t: 7)
+    holds, seen = judged(expected, run)
+    assert holds is passed
+    assert isinstance(seen, Seen)
+    assert len(pictures(run)) == 4
+
+
+def test_two_runs_are_compared_at_equal_ways() -> None:
+    one, other = played(), played(lambda t: 0.004)
+    shifted = replace(other, reads=[replace(read, t_pose=read.t_pose + 0.031) for read in played().reads])
+    _, gap = agreement.differences(agreement.trace(one), agreement.trace(other))
+    assert gap == pytest.approx(0.004, abs=1e-6)
+    assert agreement.differences(agreement.trace(one), agreement.trace(shifted))[1].max() > 0.01  # poses 31 ms too late
+    told, _ = agreement.figures(agreement.trace(one), agreement.trace(other), "x")
+    assert told[-1].value == pytest.approx(4.0, abs=1e-3)
+
+
+def test_the_benchs_room_and_lidar_stand_beside_the_others() -> None:
+    assert room.model("bench").steps == 181
+    assert room.place("bench").name == "bench"
+    assert room.place("office_floor").name != "bench"
+    with pytest.raises(ValueError, match="no building is called"):
+        room.place("barn")
+
+
+# the DAC
+
+
+class Wire:
+    """A bus with an MCP4725 that keeps what it puts out, decoded by the data sheet; its own SCL, pauses between."""
+
+    name, about = "/dev/i2c-9", "fake"
+
+    def __init__(self, start: float, scl_hz: float, pause_s: float) -> None:
+        self.now, self.scl_hz, self.pause_s = start, scl_hz, pause_s
+        self.times: list[Floats] = []
+        self.words: list[Floats] = []
+
+    def transfer(self, messages: tuple[Message, ...]) -> Transferred:
+        (message,) = messages
+        assert message.address == 0x60
+        pairs = np.frombuffer(message.data, dtype=np.uint8).reshape(-1, 2).astype(int)
+        assert not (pairs[:, 0] & 0xF0).any(), "C2 C1 = 00: fast mode, PD1 PD0 = 00: not powered down"
+        self.now += self.pause_s
+        t0 = self.now
+        self.times.append(t0 + (10 + 18 * (1 + np.arange(len(pairs)))) / self.scl_hz)
+        self.words.append((pairs[:, 0] & 0x0F) << 8 | pairs[:, 1])
+        self.now += (11 + 18 * len(pairs)) / self.scl_hz
+        return Transferred(t0, self.now, ())
+
+    def repeat(self, messages: tuple[Message, ...]) -> Generator[Transferred]:
+        while True:
+            yield self.transfer(messages)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def voltage(self, tau_s: float) -> Callable[[Floats], Floats]:
+        """Behind a low pass, as a fraction of the supply; the output holds between its steps."""
+        times, steps = np.concatenate(self.times), np.concatenate(self.words) / 4096.0
+        at_step = np.empty(len(steps))
+        now = steps[0]
+        for k, decay in enumerate(np.exp(-np.diff(times, append=times[-1]) / tau_s)):
+            at_step[k] = now
+            now = steps[k] + (now - steps[k]) * decay
+
+        def at(t_mono: Floats) -> Floats:
+            k = np.maximum(np.searchsorted(times, t_mono, side="right") - 1, 0)
+            return np.asarray(steps[k] + (at_step[k] - steps[k]) * np.exp(-np.maximum(t_mono - times[k], 0.0) / tau_s))
+
+        return at
+
+
+def test_pairs_are_as_the_data_sheet_has_them() -> None:
+    assert encoded(np.array([0.0, 1.0, 0.5, -3.0, 7.0, math.nan])).hex(" ", 2) == "0000 0fff 0800 0000 0fff 0800"
+
+
+def test_the_output_follows_the_light_though_the_bus_is_slower_than_it_should_be() -> None:
+    def source(t: Floats) -> Floats:
+        return np.asarray(0.5 + 0.3 * np.sin(2.0 * np.pi * 97.0 * t))
+
+    wire = Wire(100.0, 391e3, 0.4e-3)
+    player = Player(wire, 0x60, source, lambda: wire.now)
+    for _ in range(40):
+        player.block()
+    t = np.arange(101.0, 102.5, 1e-4)
+    put_out = wire.voltage(1e-6)(t)
+    off = {lag: np.abs(put_out - source(t - lag)) for lag in np.arange(-1e-3, 1e-3, 2e-5).tolist()}
+    lag = min(off, key=lambda lag: float(np.median(off[lag])))
+    assert abs(lag) < 0.1e-3
+    assert np.quantile(off[lag], 0.98) < 0.01
+    assert off[lag].max() < 0.1, "holes of 0.4 ms at 97 Hz"
+    assert player.rate_hz == pytest.approx(391e3 / CLOCKS, rel=2e-3)
+    assert player.held_s / (wire.now - 100.0) < 0.01
+
+
+def test_an_address_that_no_such_chip_has_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match="0x60 to 0x67"):
+        Player(Wire(0.0, 4e5, 0.0), 0x4D, lambda t: t)
+
+
+def test_lamps_are_told_apart_and_in_order_through_the_dac() -> None:
+    """Light to voltage to converter to daemon: every ID, strongest first."""
+    wire = Wire(99.9, 397e3, 0.3e-3)
+    player = Player(wire, 0x60, Lit(), lambda: wire.now)
+    while wire.now < 102.7:
+        player.block()
+
+    async def scenario(bench: Bench) -> None:
+        bench.adc._source = wire.voltage(LOW_PASS_S)  # the wire from the DAC's pin to the converter's
+        await bench.until(lambda snapshot: snapshot.links == len(CODES), 2.0)
+        await asyncio.sleep(0.5)
+        result = bench.daemon.cycle.result
+        assert result is not None
+        assert result.lights is not None
+        links = sorted(result.lights.links, key=lambda link: -link.amplitude)
+        assert [link.code for link in links] == list(CODES)
+        held = [snapshot.links == len(CODES) for snapshot in bench.snapshots[-10:]]
+        assert all(held), "and goes on so"
+
+    run_daemon(scenario)
+
+
+# the line
+
+
+def test_the_lidar_comes_out_of_a_serial_port() -> None:
+    async def talk() -> tuple[bytes, DeviceMissing]:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        device = FakeHokuyo(room.LIDAR, Room(room.LIDAR))
+        end = SerialEnd(device, os.ttyname(slave))
+        os.write(master, b"QT\nVV\nMD0000018001000\n")
+        heard = b""
+        os.set_blocking(master, False)
+        for _ in range(200):
+            await asyncio.sleep(0.01)
+            with suppressed():
+                heard += os.read(master, 65536)
+            if heard.count(b"MD0000018001000\n99b") >= 2:
+                break
+        os.close(slave)
+        os.close(master)
+        await asyncio.sleep(0.05)
+        lost = end.lost
+        end.close()
+        device.close()
+        assert isinstance(lost, DeviceMissing)
+        return heard, lost
+
+    heard, lost = asyncio.run(talk())
+    assert b"SERI:" in heard
+    assert heard.count(b"MD0000018001000\n99b") >= 2
+    assert "start anew" in str(lost)
+
+
+@contextmanager
+def suppressed() -> Generator[None]:
+    try:
+        yield
+    except BlockingIOError:
+        return
+
+
+@contextmanager
+def null_modem() -> Generator[tuple[str, str]]:
+    """Two serial ports with a cable between them."""
+    (a, a_slave), (b, b_slave) = os.openpty(), os.openpty()
+    for slave in (a_slave, b_slave):
+        tty.setraw(slave)
+    names = os.ttyname(a_slave), os.ttyname(b_slave)
+
+    def carry(source: int, sink: int) -> None:
+        with suppressed_end():
+            while True:
+                os.write(sink, os.read(source, 4096))
+
+    threads = [threading.Thread(target=carry, args=pair, daemon=True) for pair in ((a, b), (b, a))]
+    for thread in threads:
+        thread.start()
+    try:
+        yield names
+    finally:
+        for fd in (a_slave, b_slave):
+            os.close(fd)
+        for thread in threads:
+            thread.join(2.0)
+        for fd in (a, b):
+            os.close(fd)
+
+
+@contextmanager
+def suppressed_end() -> Generator[None]:
+    try:
+        yield
+    except OSError:
+        return
+
+
+@pytest.mark.system
+def test_a_robot_computer_drives_in_the_played_world(tmp_path: Path) -> None:
+    """`lumiloop run` at one end of a serial cable, the bench at the other, faults included."""
+    file = tmp_path / "short.toml"
+    file.write_text(
+        '[drive]\nseconds = 18.0\n[[fault]]\nwhat = "silence"\nwhere = "lidar"\nwhen = 8.0\nfor = 2.0\n'
+        '[[expect]]\nwhat = "state"\nis = ["NO_LIDAR", "DEGRADED"]\nfrom = 8.0\nwithin = 3.0\n'
+        '[[expect]]\nwhat = "state"\nis = ["TRACKING"]\nfrom = 10.0\nwithin = 6.0\n'
+        '[[expect]]\nwhat = "error"\nuntil = 8.0\nat_most = 0.1\nsigmas = 3.0\n'
+    )
+    scenario = load(file)
+    with null_modem() as (here, there), robot(scenario, serial=there) as ends:
+        host, port = ends.modbus
+        words = ["--lidar", here, "--modbus", f"{host}:{port}", "--odometry", ends.odometry]
+        command = [sys.executable, "-m", "tools.bench.world", str(file), *words, "--out", str(tmp_path / "out")]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "3 of 3 as expected" in done.stdout
+    assert "<svg" in (tmp_path / "out" / "report.html").read_text()

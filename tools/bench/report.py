@@ -1,0 +1,244 @@
+"""What came of a run on a bench: JUnit XML for machines, an HTML page for people, JSON to compare the next run with.
+
+One report for all of them: the virtual bench, the suite on devices (tests/hil), and the bench computer that plays the
+world (tools/bench/world).
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import platform
+import subprocess
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+from xml.etree import ElementTree
+
+from daemon.versions import versions
+from tools.bench.plots import Plot, svg
+
+ROOT: Final = Path(__file__).parents[2]
+SLOWER: Final = 1.5
+"""What takes this many times as long as in the run compared with is marked; the machine may be to blame."""
+
+
+class CannotCompare(Exception):
+    """The run to compare with cannot be read; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A number that was measured.
+
+    Attributes:
+        worse: which way is worse; empty: neither, it is only told. share: by how much it may be worse than in another
+            run, as a share of the value then. room: and by so much in its own unit besides.
+    """
+
+    name: str
+    value: float
+    unit: str = ""
+    worse: Literal["more", "less", ""] = ""
+    share: float = 0.25
+    room: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.value:.4g} {self.unit}".rstrip()
+
+    def lost(self, old: float) -> bool:
+        """Whether it is worse than it was then."""
+        allowed = self.share * abs(old) + self.room
+        return {"more": self.value > old + allowed, "less": self.value < old - allowed, "": False}[self.worse]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Of one thing that was tried: its name, title, whether it passed, seconds, what was seen or what was wrong.
+
+    Attributes:
+        skipped: why it was not tried; empty: it was.
+    """
+
+    name: str
+    title: str
+    passed: bool
+    seconds: float
+    said: str
+    skipped: str = ""
+    figures: tuple[Figure, ...] = ()
+    plots: tuple[Plot, ...] = ()
+
+    @property
+    def outcome(self) -> str:
+        """In a word."""
+        return "skipped" if self.skipped else "passed" if self.passed else "FAILED"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What one thing that passed has shown."""
+
+    said: str
+    figures: tuple[Figure, ...] = ()
+    plots: tuple[Plot, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Old:
+    """What another run says of the same thing."""
+
+    outcome: str
+    seconds: float
+    figures: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """Whose report it is: the bench's name (``bench-vm``), its title, and facts of the run by name."""
+
+    name: str
+    title: str
+    facts: dict[str, str]
+
+
+def facts(**more: str) -> dict[str, str]:
+    """Which software, on which computer, how busy; and ``more``."""
+    said = subprocess.run(["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True)
+    return {
+        "version": said.stdout.strip() or versions()["lumiloop"],
+        "software": ", ".join(f"{name} {number}" for name, number in versions().items()),
+        "computer": f"{platform.machine()}, {platform.release()}, {os.cpu_count()} processors",
+        "load": f"{os.getloadavg()[1]:.1f}",
+        **more,
+    }
+
+
+def junit(results: list[Result], name: str = "bench") -> str:
+    """The results as JUnit XML."""
+    suite = ElementTree.Element(
+        "testsuite", name=name, tests=str(len(results)),
+        failures=str(sum(one.outcome == "FAILED" for one in results)),
+        skipped=str(sum(bool(one.skipped) for one in results)), time=f"{sum(one.seconds for one in results):.1f}",
+    )  # fmt: skip
+    for one in results:
+        where = name.replace("-", ".")
+        case = ElementTree.SubElement(suite, "testcase", classname=where, name=one.name, time=f"{one.seconds:.1f}")
+        if one.figures:
+            kept = ElementTree.SubElement(case, "properties")
+            for figure in one.figures:
+                ElementTree.SubElement(kept, "property", name=figure.name, value=f"{figure.value:.9g} {figure.unit}")
+        if one.skipped:
+            ElementTree.SubElement(case, "skipped", message=_plain(one.skipped))
+        elif one.passed:
+            ElementTree.SubElement(case, "system-out").text = _plain(one.said)
+        else:
+            first = (one.said.splitlines() or [""])[0][:200]
+            ElementTree.SubElement(case, "failure", message=_plain(first)).text = _plain(one.said)
+    return ElementTree.tostring(suite, encoding="unicode")
+
+
+def _plain(text: str) -> str:
+    """Without what XML cannot hold: a device's garbage may stand in a message."""
+    return "".join(char if char in "\t\n" or char.isprintable() else "?" for char in text)
+
+
+def read(against: Path) -> dict[str, Old]:
+    """Another run's results, by name; ``against`` is its ``results.json`` or the folder that holds it.
+
+    Raises:
+        CannotCompare: there is none, or it is something else.
+    """
+    file = against / "results.json" if against.is_dir() else against
+    try:
+        told = json.loads(file.read_text(encoding="utf-8"))["results"]
+        return {one["name"]: _old(one) for one in told}
+    except OSError as error:
+        raise CannotCompare(f"{file}: {error.strerror}; name the results.json of another run") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CannotCompare(f"{file} holds no results of a bench: {error!r}") from error
+
+
+def _old(one: dict[str, Any]) -> Old:
+    outcome = "skipped" if one.get("skipped") else "passed" if one["passed"] else "FAILED"
+    figures = {figure["name"]: float(figure["value"]) for figure in one.get("figures", ())}
+    return Old(outcome, float(one["seconds"]), figures)
+
+
+def regressions(results: list[Result], before: dict[str, Old]) -> list[str]:
+    """What has become worse since another run."""
+    found = []
+    for one in results:
+        old = before.get(one.name)
+        if old is None:
+            continue
+        if old.outcome == "passed" and one.outcome == "FAILED":
+            found.append(f"{one.name} passed then")
+        elif old.outcome == "passed" and one.skipped:
+            found.append(f"{one.name} passed then, and was not tried now: {one.skipped}")
+        elif one.passed and not one.skipped and one.seconds > SLOWER * old.seconds + 2.0:
+            found.append(f"{one.name} takes {one.seconds:.0f} s, {old.seconds:.0f} s then")
+        found += [
+            f"{one.name}: {figure}, {old.figures[figure.name]:.4g} then"
+            for figure in one.figures
+            if figure.name in old.figures and figure.lost(old.figures[figure.name])
+        ]
+    return found
+
+
+STYLE: Final = (
+    "body{font:15px sans-serif;margin:2em}td{padding:.2em .8em;vertical-align:top}.FAILED{background:#fcc}"
+    ".skipped{color:#777}pre{white-space:pre-wrap;margin:0;max-width:80em}tr{border-bottom:1px solid #ddd}"
+    "table{border-collapse:collapse}svg{margin:.3em}"
+)
+
+
+def page(results: list[Result], about: About, worse: list[str], before: dict[str, Old] | None = None) -> str:
+    """The results as one HTML page that needs nothing else."""
+    rows = "".join(_row(one, (before or {}).get(one.name)) for one in results)
+    told = "".join(f"<tr><td>{html.escape(k)}<td><pre>{html.escape(v)}</pre></tr>" for k, v in about.facts.items())
+    listed = "".join(f"<li>{html.escape(text)}" for text in worse)
+    counts = f"{sum(one.outcome == 'passed' for one in results)} of {len(results)} passed"
+    skipped = sum(bool(one.skipped) for one in results)
+    pictures = "".join(
+        f"<h3>{html.escape(one.title)}</h3>{''.join(map(svg, one.plots))}" for one in results if one.plots
+    )
+    return (
+        f"<!doctype html><meta charset=utf-8><title>lumiloop: {html.escape(about.title)}</title><style>{STYLE}</style>"
+        f"<h1>{html.escape(about.title)}: {counts}{f', {skipped} not tried' if skipped else ''}</h1>"
+        f"<table>{told}</table>{f'<h2>Worse than before</h2><ul>{listed}</ul>' if worse else ''}"
+        f"<h2>Results</h2><table><tr><th><th>what<th>s<th>seen</tr>{rows}</table>"
+        f"{f'<h2>Pictures</h2>{pictures}' if pictures else ''}\n"
+    )
+
+
+def _row(one: Result, old: Old | None) -> str:
+    was = old.figures if old else {}
+    lines = [f"{figure}{f' ({was[figure.name]:.4g} then)' if figure.name in was else ''}" for figure in one.figures]
+    text = html.escape("\n".join([one.skipped or one.said, *lines]))
+    return (
+        f"<tr class={one.outcome}><td>{one.outcome}<td>{html.escape(one.title)}<td>{one.seconds:.1f}"
+        f"<td><pre>{text}</pre></tr>"
+    )
+
+
+def write(out: Path, results: list[Result], about: About, against: Path | None) -> list[str]:
+    """Write all three into ``out``; returns what is worse than in the run that ``against`` names.
+
+    Raises:
+        CannotCompare: that run cannot be read; nothing has been written.
+    """
+    before = read(against) if against is not None else {}
+    out.mkdir(parents=True, exist_ok=True)
+    worse = regressions(results, before)
+    (out / "junit.xml").write_text(junit(results, about.name), encoding="utf-8")
+    (out / "report.html").write_text(page(results, about, worse, before), encoding="utf-8")
+    told = {"about": about.facts, "results": [_kept(one) for one in results]}
+    (out / "results.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    return worse
+
+
+def _kept(one: Result) -> dict[str, Any]:
+    """What a later run is compared with: no pictures."""
+    return {key: value for key, value in asdict(one).items() if key != "plots"}

@@ -1,0 +1,128 @@
+"""What twenty browsers that watch `lumiloop view` change about how late cycles begin.
+
+The daemon of `tools.bench.latency`, fed 40 times a second, with SCHED_FIFO where it may be had. Stretches of ten
+seconds take turns: *alone*, nobody listens to the stream; *loaded*, the page's server does, and hands on to twenty
+clients that take every message. Server and clients are processes of their own, on the same cores.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from daemon.lights import Lights
+from daemon.warmup import load
+from estimator.cdma_profile import PROFILE_A
+from tools.bench._drive import EndlessDrive
+from tools.bench._paced import SETTLE_S
+from tools.bench.latency import CannotRun, prepared
+from tools.figures import Figure, bounded
+
+COMMAND: Final = "python -m tools.bench viewers"
+ROOT: Final = Path(__file__).parents[2]
+STRETCH_S: Final = 10.0
+TURNS: Final = 3
+BROWSERS: Final = 20
+
+
+def free_port() -> int:
+    """A port that is free on loopback just now."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+class Page:
+    """The page's server and the browsers, on and off."""
+
+    def __init__(self, stream: str) -> None:
+        port = str(free_port())
+        words = (["serve", stream, port], ["watch", port, str(BROWSERS)])
+        module = [sys.executable, "-m", "tools.bench._viewers"]
+        self._both = [subprocess.Popen([*module, *w], cwd=ROOT, stdout=subprocess.PIPE, text=True) for w in words]
+        for one in self._both:
+            assert one.stdout is not None
+            one.stdout.readline()
+
+    def turn(self, on: bool) -> None:
+        """On or off."""
+        for one in self._both:
+            one.send_signal(signal.SIGUSR1 if on else signal.SIGUSR2)
+
+    def end(self) -> tuple[int, int]:
+        """Messages and bytes that the browsers were told."""
+        for one in self._both:
+            one.terminate()
+        told = [one.communicate(timeout=30.0)[0] for one in self._both]
+        messages, size = told[1].split()
+        return int(messages), int(size)
+
+    def kill(self) -> None:
+        """Whatever has become of them."""
+        for one in self._both:
+            one.kill()
+            one.wait()
+
+
+def paced(folder: Path, turns: int) -> dict[str, Any]:
+    """One run of the daemon: what it told, with the browsers' counts."""
+    drive, stream = prepared(folder, SETTLE_S + 2 * turns * STRETCH_S), str(folder / "stream")
+    wanted = {
+        "drive": str(drive), "stream": stream, "modbus": free_port(), "fifo": os.geteuid() == 0, "turns": turns,
+        "receiver": "127.0.0.1:9", "stretch_s": STRETCH_S, "solve": False,
+    }  # fmt: skip
+    with ExitStack() as undo:
+        page = Page(stream)
+        undo.callback(page.kill)
+        command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
+        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
+        undo.callback(child.kill)
+        assert child.stdout is not None
+        on = False
+        for line in child.stdout:
+            if line.startswith("told "):
+                messages, size = page.end()
+                child.wait(30.0)
+                return json.loads(line[5:]) | {"messages": messages, "size": size}
+            if (wanted_on := line.strip() == "loaded") != on:
+                on = wanted_on
+                page.turn(on)
+    raise CannotRun("the daemon ended before its time; its log says why")
+
+
+def figures(told: dict[str, Any], turns: int) -> list[Figure]:
+    """All rows."""
+    rows = []
+    for what in ("late", "cycle"):
+        alone, loaded = (1e-3 * np.array(told[what][stretch]) for stretch in ("alone", "loaded"))
+        words = {"late": "cycles begin late", "cycle": "a cycle takes"}[what]
+        for q in (50.0, 99.0):
+            rows.append(Figure(f"{words}, p{q:g}, alone", float(np.percentile(alone, q)), "ms", command=COMMAND))
+            rows.append(Figure(f"{words}, p{q:g}, watched", float(np.percentile(loaded, q)), "ms", command=COMMAND))
+        more = float(np.percentile(loaded, 99) - np.percentile(alone, 99))
+        rows.append(bounded(f"{words}, p99, watched over alone", more, "ms", "<= 0.5", COMMAND))
+    watched_s = turns * STRETCH_S * BROWSERS
+    counts = {
+        "cycles, alone and watched": float(sum(len(stretch) for stretch in told["late"].values())),
+        "messages a second to each browser": told["messages"] / watched_s,
+        "kB a second to each browser": 1e-3 * told["size"] / watched_s,
+        "scans missed": float(told["missed"]),
+    }
+    return rows + [Figure(name, value, "", command=COMMAND) for name, value in counts.items()]
+
+
+def run(turns: int = TURNS) -> list[Figure]:
+    """Some 70 s."""
+    load(Lights(EndlessDrive().survey, PROFILE_A))
+    with tempfile.TemporaryDirectory() as name:
+        return figures(paced(Path(name), turns), turns)

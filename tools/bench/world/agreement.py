@@ -1,0 +1,92 @@
+"""Whether two runs of one scenario said the same: as the robot got along, where was it put?
+
+The same drive inside the emulated computer and outside of it, or on a robot's computer and in virtual time: the truth
+is the same, so what differs is what was published. Scans do not fall on the same instants, so the errors are compared,
+which change slowly, at equal ways driven.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from tools.bench.plots import Plot, Series
+from tools.bench.report import Figure
+from tools.bench.world.judge import Errors, Played, errors_of, seen_from
+from tools.bench.world.scenario import Scenario
+from tools.sim.harness import run
+from tools.sim.scene import SimulatedScene
+
+Array = npt.NDArray[np.float64]
+STEP_M: Final = 0.05
+FINE_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Errors along a drive: (n,) metres driven, (n, 2) error of the place in the frame in which it began, m."""
+
+    driven: Array
+    off: Array
+
+
+def trace(played: Played) -> Trace:
+    """Of a run."""
+    seconds = np.arange(0.0, played.scenario.drive.seconds, FINE_S)
+    return _trace(errors_of(played), seconds, played.truth(seconds))
+
+
+def trace_of(t: Array, poses: Array, truth_t: Array, truth: Array) -> Trace:
+    """Of poses in a map that begins where the robot truly is first, and of the truth in a frame of its own."""
+    start, t0 = truth[0], truth_t[0]
+    true = np.column_stack([np.interp(t, truth_t, truth[:, k]) for k in range(2)] + [np.zeros(len(t))])
+    off = poses - seen_from(start, np.zeros(3), true)
+    return _trace(Errors(t - t0, off, poses, np.zeros(len(t))), truth_t - t0, truth)
+
+
+def _trace(found: Errors, seconds: Array, truth: Array) -> Trace:
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    inside = (found.t >= seconds[0]) & (found.t <= seconds[-1])
+    return Trace(np.interp(found.t[inside], seconds, driven), found.off[inside, :2])
+
+
+def reference(scenario: Scenario) -> Trace:
+    """The same scenario with the daemon in this process and in virtual time."""
+    return reference_of(scenario.scene(held=False), scenario.drive.seconds, scenario.world.odometry)
+
+
+def reference_of(scene: SimulatedScene, seconds: float, odometry: bool = True) -> Trace:
+    """A scene in virtual time, for so many seconds from its first scan."""
+    made = run(seconds, scene=scene, odometry=odometry)
+    t0 = float(scene.t_go or 0.0)
+    kept = np.isfinite(made.pose[:, 0])
+    off = made.pose[kept] - made.truth[kept]
+    errors = Errors(made.t_mono[kept] - t0, off, made.pose[kept], made.sigma[kept, 0])
+    fine = np.arange(0.0, seconds, FINE_S)
+    return _trace(errors, fine, scene.truth(t0 + fine))
+
+
+def differences(one: Trace, other: Trace) -> tuple[Array, Array]:
+    """(n,) metres driven and (n,) distance between what the two say, every 5 cm of the way that both have."""
+    first, last = max(one.driven.min(), other.driven.min()), min(one.driven.max(), other.driven.max())
+    at = np.arange(first, last, STEP_M)
+    gap = [_at(one, at, k) - _at(other, at, k) for k in range(2)]
+    return at, np.asarray(np.hypot(*gap))
+
+
+def _at(one: Trace, driven: Array, axis: int) -> Array:
+    order = np.argsort(one.driven, kind="stable")
+    return np.asarray(np.interp(driven, one.driven[order], one.off[order, axis]))
+
+
+def figures(one: Trace, other: Trace, names: str) -> tuple[tuple[Figure, ...], tuple[Plot, ...]]:
+    """For a report; the largest is the last figure."""
+    at, gap = differences(one, other)
+    told = (
+        Figure(f"{names}: apart, median", 1e3 * float(np.median(gap)), "mm", "more", 0.5, 2.0),
+        Figure(f"{names}: apart, largest", 1e3 * float(gap.max()), "mm", "more", 0.5, 5.0),
+    )
+    return told, (Plot(f"{names}: apart", "m driven", "mm", (Series("", at.tolist(), (1e3 * gap).tolist()),)),)

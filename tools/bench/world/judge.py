@@ -1,0 +1,236 @@
+"""What was read from the robot computer against the truth, and against what a scenario expects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from tools.bench.plots import Plot, Series, histogram
+from tools.bench.report import Figure, Seen
+from tools.bench.world.scenario import Expectation, Scenario
+from tools.clients.read_modbus import STATES
+
+Array = npt.NDArray[np.float64]
+Pose = tuple[float, float, float]
+TOLD: Final = 3
+"""How many reads that fail are named."""
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """One read over Modbus. Times in s since the robot set off.
+
+    Attributes:
+        t: when it was answered. t_pose: instant that the pose is true for; NaN where there is none.
+        pose: in the robot's map. sigma_m: the larger of x and y. answered: False: nobody has answered.
+        fresh: not read before.
+        lamps: (lamp ID, photocurrent in A), strongest first, where they were asked for.
+    """
+
+    t: float
+    state: str = ""
+    fault: int = 0
+    t_pose: float = math.nan
+    pose: Pose | None = None
+    sigma_m: float = 0.0
+    answered: bool = True
+    fresh: bool = False
+    lamps: tuple[tuple[int, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """All of a run.
+
+    Attributes:
+        reads: of the whole drive. truth: true pose of the robot at ``t`` in the room's frame.
+        standing: poses read while it stood, before it set off. lamps: IDs of those overhead; strongest: the truly
+            strongest one's at a time, None: nothing is received.
+    """
+
+    scenario: Scenario
+    reads: Sequence[Read]
+    truth: Callable[[Array], Array]
+    standing: Sequence[Pose]
+    lamps: frozenset[int] = frozenset()
+    strongest: Callable[[float], int | None] = lambda t: None
+    facts: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """Poses less the truth, both in the robot's map: (n,) times, (n, 3) errors in m and rad, (n, 3) poses, sigmas."""
+
+    t: Array
+    off: Array
+    pose: Array
+    sigma: Array
+
+    @property
+    def metres(self) -> Array:
+        """(n,)."""
+        return np.asarray(np.hypot(self.off[:, 0], self.off[:, 1]))
+
+
+def errors_of(played: Played) -> Errors:
+    """Of every read that has a pose; the map lies where the robot said it was while it stood."""
+    kept = [one for one in played.reads if one.pose is not None and one.fresh]
+    t = np.array([one.t_pose for one in kept])
+    pose = np.array([one.pose for one in kept], dtype=np.float64).reshape(-1, 3)
+    start = played.truth(np.zeros(1))[0]
+    told = np.mean(np.array(played.standing, dtype=np.float64).reshape(-1, 3), axis=0)
+    truth = seen_from(start, told, played.truth(t)) if len(t) else np.zeros((0, 3))
+    off = pose - truth
+    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    return Errors(t, off, pose, np.array([one.sigma_m for one in kept]))
+
+
+def seen_from(at: Array, pose: Array, truth: Array) -> Array:
+    """True poses (n, 3) as seen from the map in which the robot, truly ``at``, has ``pose``."""
+    turn = pose[2] - at[2]
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = truth[:, 0] - at[0], truth[:, 1] - at[1]
+    return np.column_stack([pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, truth[:, 2] + turn])
+
+
+def judged(expected: Expectation, played: Played) -> tuple[bool, Seen]:
+    """Whether it is as expected, and what was seen."""
+    until = expected.until or played.scenario.drive.seconds
+    if expected.what in ("state", "fault", "clear"):
+        until = min(until, expected.from_ + expected.within)
+    window = [one for one in played.reads if expected.from_ <= one.t <= until]
+    if not window:
+        return False, Seen("nothing was read in that time")
+    return JUDGES[expected.what](expected, played, window)
+
+
+Verdict = tuple[bool, Seen]
+
+
+def _error(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    found = errors_of(played)
+    within = (found.t >= window[0].t) & (found.t <= window[-1].t)
+    if not within.any():
+        return False, Seen("no pose was read in that time")
+    metres, allowed = found.metres[within], expected.at_most + expected.sigmas * found.sigma[within]
+    worst = int(np.argmax(metres - allowed))
+    figures = (
+        Figure("error, median", 1e3 * float(np.median(metres)), "mm", "more", 0.5, 5.0),
+        Figure("error, largest", 1e3 * float(metres.max()), "mm", "more", 0.5, 10.0),
+        Figure("heading, largest", float(np.degrees(np.abs(found.off[within, 2]).max())), "deg", "more", 0.5, 0.5),
+    )
+    said = f"{len(metres)} poses; {metres[worst]:.3f} m where {allowed[worst]:.3f} is allowed, "
+    said += f"at {found.t[within][worst]:.1f} s"
+    return bool((metres <= allowed).all()), Seen(said, figures)
+
+
+def _first(window: list[Read], so: Callable[[Read], bool], expected: Expectation, name: str) -> Verdict:
+    """The first read that is so."""
+    for one in window:
+        if one.answered and so(one):
+            after = one.t - expected.from_
+            return True, Seen(f"after {after:.2f} s", (Figure(name, after, "s", "more", 0.5, 0.5),))
+    seen = sorted({f"{one.state} fault {one.fault}" for one in window if one.answered}) or ["no answer"]
+    return False, Seen(f"not within {expected.within:g} s; there was {', '.join(seen)}")
+
+
+def _state(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    return _first(
+        window, lambda one: one.state in expected.is_, expected, f"{' or '.join(map(str, expected.is_))} after"
+    )
+
+
+def _fault(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    return _first(window, lambda one: one.fault in expected.is_, expected, f"fault {expected.is_[0]} after")
+
+
+def _clear(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    return _first(window, lambda one: one.fault == 0, expected, "no fault after")
+
+
+def _never(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    wrong = [f"{one.state} at {one.t:.1f} s" for one in window if one.state in expected.is_]
+    return not wrong, Seen("; ".join(wrong[:TOLD]) or f"never in {len(window)} reads")
+
+
+def _share(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    share = float(np.mean([one.state in expected.is_ for one in window]))
+    name = f"{' or '.join(map(str, expected.is_))}"
+    return share >= expected.at_least, Seen("", (Figure(name, 100.0 * share, "%", "less", 0.05),))
+
+
+def _age(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    ages = [one.t - one.t_pose for one in window if math.isfinite(one.t_pose)]
+    if not ages:
+        return False, Seen("no pose was read in that time")
+    middle = float(np.median(ages))
+    figures = (
+        Figure("age, median", 1e3 * middle, "ms", "more", 0.25, 10.0),
+        Figure("age, 99 %", 1e3 * float(np.quantile(ages, 0.99)), "ms", "more", 0.5, 50.0),
+    )
+    return middle <= expected.at_most, Seen("", figures)
+
+
+def _answers(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    share = float(np.mean([one.answered for one in window]))
+    return share >= expected.at_least, Seen("", (Figure("answered", 100.0 * share, "%", "less", 0.01),))
+
+
+def _lamps(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
+    heard = [one for one in window if one.lamps]
+    if not heard:
+        return False, Seen("no lamp was received")
+    strange = {lamp for one in heard for lamp, _ in one.lamps} - played.lamps
+    right = [one.lamps[0][0] == played.strongest(one.t_pose if math.isfinite(one.t_pose) else one.t) for one in heard]
+    share = float(np.mean(right)) * len(heard) / len(window)
+    known = len({lamp for one in heard for lamp, _ in one.lamps} & played.lamps)
+    figures = (
+        Figure("strongest lamp right", 100.0 * share, "%", "less", 0.1),
+        Figure("lamps received", known, f"of {len(played.lamps)}", "less", 0.1),
+    )
+    said = f"IDs that no lamp has: {sorted(strange)}" if strange else "no ID that no lamp has"
+    return not strange and share >= expected.at_least, Seen(said, figures)
+
+
+JUDGES: Final[dict[str, Callable[[Expectation, Played, list[Read]], Verdict]]] = {
+    "error": _error, "state": _state, "never": _never, "share": _share, "fault": _fault, "clear": _clear,
+    "age": _age, "answers": _answers, "lamps": _lamps,
+}  # fmt: skip
+
+
+def pictures(played: Played) -> tuple[Plot, ...]:
+    """Way, error, states, ages; when faults began and ended."""
+    found = errors_of(played)
+    seconds = np.arange(0.0, played.scenario.drive.seconds, 0.1)
+    start, told = played.truth(np.zeros(1))[0], np.mean(np.array(played.standing).reshape(-1, 3), axis=0)
+    way = seen_from(start, told, played.truth(seconds))
+    struck = [float(fault.get("when", 0.0)) for fault in played.scenario.faults]
+    struck += [
+        float(fault.get("when", 0.0)) + float(fault["for"]) for fault in played.scenario.faults if "for" in fault
+    ]
+    marks = (Series("faults", struck, struck, "marks"),) if struck else ()
+    t = [one.t for one in played.reads]
+    states = [float(STATES.index(one.state)) if one.state in STATES else math.nan for one in played.reads]
+    ages = [1e3 * (one.t - one.t_pose) for one in played.reads]
+    return (
+        Plot(
+            "trajectory", "x m", "y m",
+            (_line("truth", way[:, 0], way[:, 1]), _line("published", found.pose[:, 0], found.pose[:, 1])), square=True,
+        ),
+        Plot(
+            "error", "s", "mm",
+            (_line("error", found.t, 1e3 * found.metres), _line("three sigma", found.t, 3e3 * found.sigma), *marks),
+        ),
+        Plot(f"state: {', '.join(f'{k} {name}' for k, name in enumerate(STATES))}", "s", "",
+             (Series("", t, states, "dots"), *marks)),
+        histogram("age of poses that were read", "ms", ages),
+    )  # fmt: skip
+
+
+def _line(name: str, x: Array, y: Array) -> Series:
+    return Series(name, x.tolist(), y.tolist())

@@ -1,0 +1,61 @@
+"""A robot computer that is none: `lumiloop run` as a process of this computer, on a pty and loopback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tools.bench.report import ROOT
+from tools.bench.world.scenario import Scenario
+from tools.bench.world.stage import Ends
+from tools.sim.serve_light import write_plan
+
+
+@contextmanager
+def robot(scenario: Scenario, serial: str = "") -> Generator[Ends]:
+    """Start it on ``serial``, or on a pty of its own, with a folder for maps; nothing of it is left at the end."""
+    with tempfile.TemporaryDirectory(prefix="lumiloop-world-") as made:
+        folder = Path(made)
+        modbus, odometry = _free(socket.SOCK_STREAM), _free(socket.SOCK_DGRAM)
+        scene = scenario.scene(held=True)
+        x, y, _ = scene.mount
+        values = {"modbus.port": modbus, "odometry.port": odometry, "lidar.mount.x": x, "lidar.mount.y": y}
+        light = ""
+        if scene.light is not None:
+            light = f"unix:{folder / 'bus'}"
+            write_plan(scene.light, folder / "lamps.toml")
+            values |= {"photodiode.bus": f'"{light}"', "lights.survey": f'"{folder / "lamps.toml"}"'}
+        sets = [word for key, value in values.items() for word in ("--set", f"{key}={value}")]
+        command = [sys.executable, "-m", "daemon", "run", "--lidar", serial or str(folder / "lidar"), *sets]
+        log = folder / "daemon.log"
+        environment = {**os.environ, "XDG_STATE_HOME": str(folder / "state")}
+        with log.open("wb") as said, subprocess.Popen(command, cwd=ROOT, stderr=said, env=environment) as child:
+            try:
+                yield Ends(f"pty:{folder / 'lidar'}", ("127.0.0.1", modbus), f"udp://127.0.0.1:{odometry}", light)
+            finally:
+                child.send_signal(signal.SIGTERM)
+                try:
+                    child.wait(20.0)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+                _keep(log)
+
+
+def _keep(log: Path) -> None:
+    """The daemon's log outlives its folder where there is something wrong in it."""
+    text = log.read_text(errors="replace")
+    if "Traceback" in text:
+        sys.stderr.write(text)
+
+
+def _free(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])

@@ -1,0 +1,279 @@
+"""One scenario in real time: devices out of this computer's ports, poses in over Modbus, orders when they are due."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hal.clock import SystemClock
+from hal.errors import DeviceRefused
+from hal.fake.adc import FakeBuses
+from hal.fake.faults import read_fault
+from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.models import Unit
+from hal.fake.pty_server import PtyServer
+from hal.fake.schedule import FaultSchedule, Target
+from hal.fake.tcp_server import TcpServer
+from hal.i2c_server import BusServer
+from hal.input_codec import decode, encode
+from tools.bench.world.dac import DacThread
+from tools.bench.world.judge import Played, Pose, Read
+from tools.bench.world.scenario import Scenario
+from tools.bench.world.serialend import SerialEnd
+from tools.clients.read_lights import Reader as LightReader
+from tools.clients.read_modbus import Reader
+from tools.sim.feed import UdpSender, feed_odometry
+from tools.sim.hands import Hands
+from tools.sim.scene import SimulatedScene
+from tools.sim.serve_light import BUS, converter
+
+POLL_S: Final = 0.01
+"""The block says how old its pose was when it was made, not when it is read: a new one is seen this late at most."""
+WAIT_S: Final = 0.05
+STANDING_S: Final = 2.0
+"""Poses of so long, read while it stands, say where the map lies."""
+PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
+HEARD_A: Final = 1e-9
+SET_OFF_S: Final = 5.0
+
+
+class CannotPlay(Exception):
+    """The robot computer does not answer, or does not find a place; the text says what to look at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ends:
+    """Where things go.
+
+    Attributes:
+        lidar: ``/dev/ttyUSB0@BAUD``, ``pty:PATH`` or ``tcp://HOST:PORT``. modbus: (host, port).
+        odometry: ``udp://HOST:PORT`` or empty. light: ``dac:BUS@ADDRESS``, ``unix:PATH``, ``tcp://HOST:PORT`` or empty.
+        anyone: a bus served over TCP may be used from other computers.
+    """
+
+    lidar: str
+    modbus: tuple[str, int]
+    odometry: str = ""
+    light: str = ""
+    anyone: bool = False
+
+
+class ForeignSender(UdpSender):
+    """Odometry of another computer: its clock means nothing to the daemon, so the bit that says so is cleared."""
+
+    def send(self, data: bytes) -> None:
+        """See :class:`UdpSender`."""
+        super().send(encode(replace(decode(data), flags=0)))
+
+
+class Ears:
+    """Reads poses over Modbus, and lamps where they are wanted, in a thread of its own."""
+
+    def __init__(self, host: str, port: int, lamps: bool) -> None:
+        self._pose = Reader(host, port)
+        self._lamps = LightReader(host, port) if lamps else None
+        self.reads: list[Read] = []
+        self._seq, self._t_pose = -1, math.nan
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="modbus", daemon=True)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while not self._stop.wait(POLL_S):
+            self.reads.append(self._one())
+
+    def _one(self) -> Read:
+        before = self.reads[-1].t if self.reads else time.monotonic()
+        try:
+            told: dict[str, Any] = self._pose.read()
+            lamps = self._heard()
+        except (OSError, ValueError):
+            return Read(time.monotonic(), answered=False)
+        now = time.monotonic()
+        fresh, self._seq = told["seq"] != self._seq, told["seq"]
+        placed = told["x"] is not None and told["age"] is not None
+        if fresh:  # it was made between the read before and this one
+            self._t_pose = 0.5 * (before + now) - told["age"] if placed else math.nan
+        pose = (told["x"], told["y"], told["yaw"]) if placed else None
+        sigma = max(told["sigma_x"] or 0.0, told["sigma_y"] or 0.0)
+        return Read(now, told["state"], told["fault"], self._t_pose, pose, sigma, True, fresh and placed, lamps)
+
+    def _heard(self) -> tuple[tuple[int, float], ...]:
+        if self._lamps is None:
+            return ()
+        links: Any = self._lamps.read()["links"]
+        return tuple((one["lamp"], one["strength"]) for one in links if one["lamp"] is not None and one["strength"])
+
+    def close(self) -> None:
+        """Stop and hang up."""
+        self._stop.set()
+        self._thread.join()
+        self._pose.close()
+        if self._lamps is not None:
+            self._lamps.close()
+
+
+async def play(scenario: Scenario, ends: Ends, say: Callable[[str], None]) -> Played:
+    """Play it to its end.
+
+    Raises:
+        CannotPlay: nobody answers, or there is no pose within ``settle``. HalError: a port cannot be used.
+        FaultError: an order in the file makes no sense.
+    """
+    scene = scenario.scene(held=True)
+    device = FakeHokuyo(scene.model, scene.scan, unit=Unit(serial="H0000001", seed=scenario.world.seed))
+    async with AsyncExitStack() as stack:
+        stack.callback(device.close)
+        targets: dict[str, Target] = {"lidar": device, "robot": Hands(scene, time.monotonic)}
+        if scene.light is not None:
+            await _light(scene, ends, targets, stack)
+        schedule = FaultSchedule(targets)
+        stack.callback(schedule.close)
+        faults = [read_fault(one, f"fault[{k}]", schedule.vocabularies) for k, one in enumerate(scenario.faults)]
+        line = await _connect(device, ends.lidar, stack)
+        if ends.odometry and scenario.world.odometry:
+            await _roll(scene, ends.odometry, stack)
+        ears = Ears(*ends.modbus, lamps=scene.light is not None)
+        stack.callback(ears.close)
+        standing = await _settled(scenario, ends, ears, say)
+        scene.release()
+        t_go = await _set_off(scene)
+        for fault in faults:
+            schedule.order(fault)
+        say(f"it drives for {scenario.drive.seconds:g} s")
+        await asyncio.sleep(scenario.drive.seconds)
+        if isinstance(line, SerialEnd) and line.lost is not None:
+            raise line.lost
+        reads = [_since(one, t_go) for one in ears.reads if one.t >= t_go]
+    return _played(scenario, scene, reads, standing, t_go)
+
+
+async def _set_off(scene: SimulatedScene) -> float:
+    """Wait for the scan with which it sets off; the instant."""
+    for _ in range(round(SET_OFF_S / WAIT_S)):
+        if scene.t_go is not None:
+            return scene.t_go
+        await asyncio.sleep(WAIT_S)
+    raise CannotPlay(
+        f"the robot computer has read no scan for {SET_OFF_S:g} s since it had a pose: is its line still in?"
+    )
+
+
+def _since(one: Read, t_go: float) -> Read:
+    return replace(one, t=one.t - t_go, t_pose=one.t_pose - t_go)
+
+
+def _played(scenario: Scenario, scene: SimulatedScene, reads: list[Read], standing: list[Pose], t_go: float) -> Played:
+    light = scene.light
+    if light is None:
+        return Played(scenario, reads, lambda t: scene.truth(t + t_go), standing)
+    names = [lamp.lamp_id for lamp in light.ceiling.fixtures]
+
+    def strongest(t: float) -> int | None:
+        strengths = light.stream.track.at(t + t_go)
+        best = int(np.argmax(strengths))
+        return names[best] if strengths[best] > HEARD_A else None
+
+    return Played(scenario, reads, lambda t: scene.truth(t + t_go), standing, frozenset(names), strongest)
+
+
+async def _light(scene: SimulatedScene, ends: Ends, targets: dict[str, Target], stack: AsyncExitStack) -> None:
+    """The lamps' light: as a voltage, or as a converter on a bus that is served."""
+    light = scene.light
+    assert light is not None
+    if not ends.light:
+        raise CannotPlay("the scenario has coded lamps: say with --light where their light goes")
+    bus, _, address = ends.light.removeprefix("dac:").rpartition("@")
+    if ends.light.startswith("dac:") and not (bus and re.fullmatch("0x[0-9a-f]{1,2}", address.lower())):
+        raise DeviceRefused(ends.light, "not the name of a DAC", "expected dac:/dev/i2c-1@0x60")
+    light.prepare()
+    if ends.light.startswith("dac:"):
+        thread = await asyncio.to_thread(DacThread, bus, int(address, 16), light.sample)
+        stack.callback(thread.close)
+        return
+    device = converter(light, SystemClock())
+    targets["adc"] = device
+    buses = FakeBuses(SystemClock())
+    buses.plug(BUS, device)
+    server = BusServer(buses, BUS, SystemClock(), anyone=ends.anyone)
+    stack.push_async_callback(server.close)
+    await server.listen(ends.light)
+
+
+async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> object:
+    """Offer the lidar."""
+    if where.startswith("tcp://"):
+        host, _, port = where.removeprefix("tcp://").rpartition(":")
+        if not port.isdigit():
+            raise DeviceRefused(
+                where, "not an address to listen on", "expected tcp://HOST:PORT, as tcp://0.0.0.0:10940"
+            )
+        server = TcpServer(device)
+        stack.push_async_callback(server.close)
+        await server.listen(host, int(port))
+        return server
+    if where.startswith("pty:"):
+        pty = PtyServer(device, Path(where.removeprefix("pty:")))
+        stack.callback(pty.close)
+        return pty
+    path, _, baud = where.partition("@")
+    if not path.startswith("/") or (baud and not baud.isdigit()):
+        raise DeviceRefused(
+            where, "not a line", "expected /dev/ttyUSB0, /dev/ttyUSB0@115200, pty:PATH or tcp://HOST:PORT"
+        )
+    line = SerialEnd(device, path, int(baud or 115200))
+    stack.callback(line.close)
+    return line
+
+
+async def _roll(scene: SimulatedScene, where: str, stack: AsyncExitStack) -> None:
+    sender = ForeignSender(where)
+    stack.callback(sender.close)
+    feed = asyncio.create_task(feed_odometry(scene, sender.send, session=secrets.randbits(32)))
+
+    async def end() -> None:
+        feed.cancel()
+        await asyncio.wait([feed])
+
+    stack.push_async_callback(end)
+
+
+async def _settled(scenario: Scenario, ends: Ends, ears: Ears, say: Callable[[str], None]) -> list[Pose]:
+    """Wait until the standing robot has a place, and hear for a while where it says that is."""
+    host, port = ends.modbus
+    say(f"{scenario.title}: waiting for a pose from {host} port {port}")
+    begun, since = time.monotonic(), math.inf
+    while time.monotonic() - max(since, begun) < STANDING_S or since == math.inf:
+        last = ears.reads[-1] if ears.reads else Read(0.0, answered=False)
+        if last.pose is None or last.state not in PLACED:
+            since = math.inf
+        elif since == math.inf:
+            since = time.monotonic()
+        if since == math.inf and time.monotonic() - begun > scenario.drive.settle:
+            raise CannotPlay(_why(last, ends, scenario.drive.settle))
+        await asyncio.sleep(WAIT_S)
+    return [one.pose for one in ears.reads if one.t >= since and one.pose is not None]
+
+
+def _why(last: Read, ends: Ends, settle: float) -> str:
+    host, port = ends.modbus
+    if not last.answered:
+        return (
+            f"nobody answers at {host} port {port}: is lumiloop running there, does its `bind` and `allow` let this "
+            f"computer in, is UDP port {port} open in its firewall?"
+        )
+    return (
+        f"no pose within {settle:g} s: state {last.state}, fault {last.fault}; does its lidar.device name the line "
+        f"that comes from {ends.lidar}? On the robot computer: lumiloop probe"
+    )

@@ -1,0 +1,59 @@
+"""``python -m tools.pageshots``: the pictures of the web page in the documents, from a simulated robot's own page.
+
+Needs chromium (`apt-get install chromium`). The robot drives under lamps for a while, and the page is photographed, as
+a desktop and as a phone show it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from tools.browser import BrowserError, chromium, robot, tab, view
+
+SEEN: Final = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose && lumiloop.world.lampsPlaced"
+DESKTOP, PHONE = (1280, 860), (390, 844)
+SETTLE_S: Final = 3.0
+
+
+async def photograph(browser: str, address: str, out: Path, seconds: float) -> None:
+    """Both pictures, after so many seconds of driving."""
+    async with tab(browser, address, DESKTOP) as page:
+        await page.until(SEEN, 60.0)
+        await asyncio.sleep(seconds)
+        await page.picture(out / "view.png")
+    async with tab(browser, address, PHONE, phone=True, dark=False) as page:
+        await page.until(SEEN, 60.0)
+        await asyncio.sleep(SETTLE_S)
+        await page.picture(out / "view-phone.png")
+
+
+def main() -> int:
+    """Exit code 1 where there is no browser."""
+    parser = argparse.ArgumentParser(prog="python -m tools.pageshots", description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=40.0, help="of driving before (default %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("docs/images"), help="default: %(default)s")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="lumiloop-page-") as name:
+        folder = Path(name)
+        try:
+            with (
+                chromium(folder) as browser,
+                robot(folder) as one,
+                view(one.env, folder, "--config", str(one.config), "--write") as address,
+            ):
+                one.drive()
+                asyncio.run(photograph(browser, address, options.out, options.seconds))
+        except BrowserError as error:
+            print(error, file=sys.stderr)
+            return 1
+    print(f"written: {options.out / 'view.png'}, {options.out / 'view-phone.png'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
