@@ -35,25 +35,20 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff check --quiet .
 	$(BIN)/mypy
 
-# Two rows of tests side by side, one a core: the estimator's, without a compiler and then with it, with faults, fuzz, logs, tools;
-# and all others.
-# The first row is silent until the second has ended. With ARGS, a row in which nothing is selected is no failure.
+# Compiled kernels are invisible to coverage, so the estimator is also run without the compiler, beside the compiling;
+# that row is silent unless it fails. The rest is shared out to the cores file by file.
 QUICK := not slow and not system
-FIRST := tests/estimator tests/faults tests/fuzz tests/logs tests/tools
-PYTEST := $(BIN)/python -m coverage run --data-file
+COVER := $(BIN)/python -m coverage
 test: check  ## everything quick (no root, <= 12 minutes)
-	@mkdir -p out; rm -f .coverage .coverage.*
-	@( NUMBA_DISABLE_JIT=1 $(PYTEST)=.coverage.plain -m pytest -q -p no:cacheprovider -m "not jit and $(QUICK)" \
-		tests/estimator; plain=$$?; \
-	$(PYTEST)=.coverage.estimator -m pytest -q -p no:cacheprovider -m "$(QUICK)" $(FIRST) $(ARGS); compiled=$$?; \
-	[ $$compiled = 5 ] && [ -n '$(ARGS)' ] && compiled=0; exit $$(( plain || compiled )) ) > out/estimator.txt 2>&1 & \
-	estimator=$$!; trap "kill $$estimator" INT TERM; \
-	$(PYTEST)=.coverage.others -m pytest -q -m "$(QUICK)" $(FIRST:%=--ignore=%) $(ARGS); others=$$?; \
-	[ $$others = 5 ] && [ -n '$(ARGS)' ] && others=0; \
-	wait $$estimator; failed=$$?; echo "the estimator without a compiler; with it, and faults, fuzz, logs, tools:"; \
-	if [ $$failed = 0 ]; then grep -h " passed" out/estimator.txt; else cat out/estimator.txt; fi; \
-	exit $$(( others || failed ))
-	@$(BIN)/python -m coverage combine -q
+	@mkdir -p out; rm -f .coverage .coverage.* out/plain.coverage
+	@NUMBA_DISABLE_JIT=1 $(COVER) run --data-file=out/plain.coverage -m pytest -q -p no:cacheprovider \
+		-m "not jit and $(QUICK)" tests/estimator > out/plain.txt 2>&1 & plain=$$!; trap "kill $$plain" INT TERM; \
+	$(BIN)/python -c "from daemon.warmup import load; load()" && \
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report= -m "$(QUICK)" $(ARGS); tests=$$?; \
+	wait $$plain; plain=$$?; echo "the estimator without the compiler:"; \
+	if [ $$plain = 0 ]; then grep -h " passed" out/plain.txt; else cat out/plain.txt; fi; \
+	exit $$(( tests || plain ))
+	@$(COVER) combine -q --append out/plain.coverage
 	$(BIN)/python -m tools.floors
 
 test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)
@@ -101,8 +96,8 @@ deb:  ## the same as a Debian package, in out/
 
 lock:  ## renew the lock files (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade pyproject.toml -o requirements/core.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot pyproject.toml -o requirements/dev.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot --extra bench pyproject.toml -o requirements/bench.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view pyproject.toml -o requirements/dev.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra bench pyproject.toml -o requirements/bench.lock
 
 clean:  ## remove what the targets above made
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--adc", default="fake", help="fake, or a real converter: /dev/i2c-1@0x4d, /dev/i2c-1@0x54,adc121c021"
     )
+    hil = parser.getgroup("tests/hil", "the suite on devices (docs/bench.md)")
+    hil.addoption("--have", default="", help="what real devices can be given: motion,light")
+    hil.addoption(
+        "--operator", default="", help="who plugs and covers: terminal (a person there), or a unix socket for orders"
+    )
+    hil.addoption("--program", default="", help="the lumiloop to try; default: of this tree")
+    hil.addoption("--odometry-port", type=int, default=5601, help="UDP port to which the robot sends odometry")
+    hil.addoption("--walk-s", type=float, default=60.0, help="seconds of the calibration walk on a real robot")
+    hil.addoption("--hil-report", metavar="DIR", help="write report.html, junit.xml and results.json of tests/hil")
+    hil.addoption("--against", metavar="OLD", help="results.json of another run; what is worse makes this one fail")
 
 
 @pytest.fixture(scope="session")
@@ -36,6 +48,14 @@ def warm_kernels() -> None:
     """Compile the kernels of this tree once, before anything is judged against the wall clock."""
     command = [sys.executable, "-c", "from daemon.warmup import load; load()"]
     subprocess.run(command, cwd=ROOT, check=True, timeout=900)
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a process does to itself for good - objects frozen, its priority - would outlast the test that does it."""
+    monkeypatch.setattr(os, "nice", lambda by: by)
+    yield
+    gc.unfreeze()
 
 
 @pytest.fixture(autouse=True)

@@ -11,11 +11,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-OURS = {"daemon", "hal", "estimator", "tools", "tests"}
+OURS = {"daemon", "hal", "estimator", "taps", "tools", "tests"}
 MAY_IMPORT = {
     "estimator": {"estimator"},
     "hal": {"hal"},
     "daemon": {"daemon", "hal", "estimator"},
+    "taps": {"taps", "daemon", "hal", "estimator"},
 }
 ESTIMATOR_NEVER = {
     *("os", "pathlib", "io", "subprocess", "logging"),

@@ -12,23 +12,26 @@ import tempfile
 from pathlib import Path
 
 from tests.logs import golden
-from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, replayed
+from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, origin, replayed
+
+NO_DATA = "LUMILOOP_DATA does not name the folder of real logs"
 
 
 def bless(entry: Entry, root: Path | None, reason: str) -> str:
     """Write one golden file; returns what changed, for people."""
     with tempfile.TemporaryDirectory() as folder:
-        trajectory = ledger_of(replayed(entry, root, Path(folder))).final()
+        ledger = ledger_of(replayed(entry, root, Path(folder)))
+    trajectory, loops = ledger.final(), [loop for _, loop in ledger.loops]
     before = golden.FOLDER / f"{entry.name}.txt"
     moved = "new"
     if before.exists():
         old = golden.load(entry.name)
-        if old.facts.get("digest") == golden.digest(trajectory):
+        if old.facts.get("digest") == golden.digest(trajectory) and "loops" in old.facts:
             return f"{entry.name}: unchanged"
         far = golden.largest_difference(old, trajectory, entry.every)
         step = golden.largest_difference(old, trajectory, entry.every, motion=True)
         moved = f"moved by up to {far:.6f} m, from one kept pose to the next by up to {step:.6f} m"
-    golden.save(entry.name, trajectory, entry.every, golden.facts_of(trajectory, entry.sha256, reason))
+    golden.save(entry.name, trajectory, entry.every, golden.facts_of(trajectory, loops, origin(entry), reason))
     return f"{entry.name}: {moved}"
 
 
@@ -38,6 +41,8 @@ def main() -> int:
     parser.add_argument("--reason", required=True, help="why the trajectories have changed; kept in the files")
     parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
     args = parser.parse_args()
+    if len(args.reason.strip()) <= 10:
+        parser.error(f"--reason {args.reason!r} says nothing to whoever reads the file in a year")
     unknown = sorted(set(args.name) - set(BY_NAME))
     if unknown:
         parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
@@ -46,7 +51,7 @@ def main() -> int:
         if args.name and entry.name not in args.name:
             continue
         if entry.source and not data:
-            sys.stdout.write(f"{entry.name}: left as it is, LUMILOOP_DATA does not name the folder of real logs\n")
+            sys.stdout.write(f"{entry.name}: left as it is, {NO_DATA}\n")
             continue
         sys.stdout.write(bless(entry, Path(data) if data else None, args.reason) + "\n")
     return 0

@@ -1,4 +1,4 @@
-"""The real logs (and a made one) whose replay is watched, and how each becomes something that replay reads."""
+"""The logs whose replay is watched, committed ones of the simulator and real ones, and how replay gets to read each."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from daemon.config import Config
 from daemon.ledger import Ledger
 from daemon.replay import Outcome, replay
 from tests.daemon.replay.room import carmen, drive
+from tests.logs import made
 from tools import convert
 
 
@@ -19,7 +20,7 @@ class Entry:
     """One log.
 
     Attributes:
-        name: of its golden file. source: below the folder of real logs; empty for the made one.
+        name: of its golden file. source: below the folder of real logs; empty for the simulator's.
         sha256: of the source, so that a golden trajectory is never held against another log.
         every: one pose in so many is kept in the golden file.
         heavy: replayed in the full test run only.
@@ -34,6 +35,8 @@ class Entry:
 
 ENTRIES: Final = (
     Entry("room", "", "", 10),
+    Entry("laps", "", "", 10),
+    Entry("lamps", "", "", 4),
     Entry("intel", "intel/intel.clf.gz", "969f6eb0dc4c9af9995ca45b1885ebadaa4aa7c8cfe813250b675e1a007061b7", 200),
     Entry(
         "aces", "aces/aces.clf.gz", "6c65d4fe04e5192b1658fefb2b05cef796cf8cf53de6bccca444a141c6d95361", 120, heavy=True
@@ -60,6 +63,8 @@ def prepared(entry: Entry, root: Path | None, folder: Path) -> Path:
     Raises:
         AssertionError: the source is not the log that was blessed.
     """
+    if entry.name in made.MADE:
+        return made.unpacked(entry.name, folder)
     if not entry.source:
         return carmen(folder / "room.log", drive())
     assert root is not None
@@ -78,6 +83,13 @@ def replayed(entry: Entry, root: Path | None, folder: Path) -> Outcome:
     outcome = replay(prepared(entry, root, folder), Config())
     assert not outcome.stopped
     return outcome
+
+
+def origin(entry: Entry) -> str:
+    """What the golden poses are of, so that they are never held against another log."""
+    if entry.name in made.MADE:
+        return hashlib.sha256(made.packed(entry.name).read_bytes()).hexdigest()
+    return entry.sha256 or "made by tests/daemon/replay/room.py"
 
 
 def ledger_of(outcome: Outcome) -> Ledger:

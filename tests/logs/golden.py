@@ -8,6 +8,8 @@ tight tolerance counts only where versions and processor are those of the blessi
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -18,13 +20,15 @@ import numpy.typing as npt
 
 from daemon.results import Trajectory, tum
 from daemon.versions import versions
+from estimator.result import Loop
 
 Array = npt.NDArray[np.float64]
 
 FOLDER: Final = Path(__file__).parent / "golden"
 TIGHT_M: Final = 1e-6
-LOOSE_M: Final = 0.5
-"""Elsewhere, for the motion from one kept pose to the next: notices a robot that has got lost, no more."""
+REMEDY: Final = "python -m tests.logs.bless --reason TEXT"
+LOOSE_M: Final = 1e-3
+"""On another processor, or with other versions: and the same loops."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +44,52 @@ def environment() -> str:
     """Whatever may change the last bits of a result."""
     found = versions()
     parts = ("python", "numpy", "numba", "llvmlite", "scipy", "machine")
-    return " ".join(f"{part}={found[part]}" for part in parts) + f" cpu={llvmlite.binding.get_host_cpu_name()}"
+    cpu = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
+    return " ".join(f"{part}={found[part]}" for part in parts) + f" cpu={cpu}"
 
 
-def facts_of(trajectory: Trajectory, sha256: str, reason: str) -> dict[str, str]:
+def facts_of(trajectory: Trajectory, loops: Sequence[Loop], log: str, reason: str) -> dict[str, str]:
     """What is written above the poses."""
     return {
-        "log": sha256 or "made by tests/daemon/replay/room.py",
+        "log": log,
         "reason": reason,
         "environment": environment(),
         "poses": str(len(trajectory.stamps)),
+        "loops": loops_of(loops),
         "digest": digest(trajectory),
     }
+
+
+def loops_of(loops: Sequence[Loop]) -> str:
+    """How many were closed, and between which keyframes."""
+    pairs = " ".join(f"{loop.keyframe_new}-{loop.keyframe_old}" for loop in loops)
+    return f"{len(loops)} {hashlib.sha256(pairs.encode()).hexdigest()[:16]}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Of one replay against its golden file: whether it may stay, and in words by how much it differs."""
+
+    same: bool
+    said: str
+
+
+def judged(blessed: Golden, trajectory: Trajectory, loops: Sequence[Loop], every: int) -> Verdict:
+    """To the last digit where it was blessed on such a machine, else to a millimetre and by the same loops."""
+    off = largest_difference(blessed, trajectory, every)
+    here = blessed.facts["environment"] == environment()
+    wrong = []
+    if blessed.facts["poses"] != str(len(trajectory.stamps)):
+        wrong.append(f"{len(trajectory.stamps)} poses, {blessed.facts['poses']} when blessed")
+    if not off <= (TIGHT_M if here else LOOSE_M):
+        wrong.append(f"moved by {off:.6f} m")
+    if blessed.facts["loops"] != loops_of(loops):
+        wrong.append(f"loops {loops_of(loops)}, {blessed.facts['loops']} when blessed")
+    if here and blessed.facts["digest"] != digest(trajectory):
+        wrong.append("poses between those that are kept differ")
+    where = "same machine" if here else "another processor, or other versions"
+    said = f"{where}: {'; '.join(wrong)} since {blessed.facts['reason']!r}" if wrong else f"{where}: {off:.6f} m"
+    return Verdict(not wrong, said)
 
 
 def digest(trajectory: Trajectory) -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from daemon.results import Trajectory
-from tests.logs import golden
-from tests.logs.catalog import ENTRIES, Entry, ledger_of
+from estimator.result import Loop
+from tests.logs import golden, made
+from tests.logs.__main__ import main
+from tests.logs.catalog import ENTRIES, Entry, ledger_of, origin
 from tests.logs.conftest import Replayed
-
-REMEDY = "look at the change; if it is meant: python -m tests.logs.bless --reason TEXT"
 
 
 def cases() -> list[object]:
@@ -19,31 +21,45 @@ def cases() -> list[object]:
 
 @pytest.mark.parametrize("entry", cases())
 def test_the_trajectory_is_the_blessed_one(entry: Entry, outcome_of: Replayed) -> None:
-    trajectory = ledger_of(outcome_of(entry.name)).final()
-    blessed = golden.load(entry.name)
-    assert blessed.facts["poses"] == str(len(trajectory.stamps))
-    off = golden.largest_difference(blessed, trajectory, entry.every)
-    if blessed.facts["environment"] == golden.environment():
-        assert off <= golden.TIGHT_M, f"{entry.name} moved by {off:.6f} m since {blessed.facts['reason']!r}; {REMEDY}"
-        assert blessed.facts["digest"] == golden.digest(trajectory), f"{entry.name} differs between; {REMEDY}"
-    else:
-        off = golden.largest_difference(blessed, trajectory, entry.every, motion=True)
-        assert off <= golden.LOOSE_M, f"{entry.name} moves otherwise, by {off:.3f} m, than where it was blessed"
+    ledger = ledger_of(outcome_of(entry.name))
+    loops = [loop for _, loop in ledger.loops]
+    verdict = golden.judged(golden.load(entry.name), ledger.final(), loops, entry.every)
+    assert verdict.same, f"{entry.name}: {verdict.said}; look at the change; if it is meant: {golden.REMEDY}"
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
 def test_a_golden_file_says_what_it_is(entry: Entry) -> None:
     facts = golden.load(entry.name).facts
-    assert facts["log"] == (entry.sha256 or "made by tests/daemon/replay/room.py")
+    assert facts["log"] == origin(entry)
     assert len(facts["reason"]) > 10
     assert (golden.FOLDER / f"{entry.name}.txt").stat().st_size < 20_000
+
+
+def test_recordings_of_the_simulator_are_small_and_real_ones_are_not_committed() -> None:
+    kept = {path.name for path in made.FOLDER.iterdir()}
+    assert kept == {f"{name}.tar.xz" for name in made.MADE}
+    assert all(made.packed(name).stat().st_size < 300_000 for name in made.MADE)
+    assert all(entry.sha256 for entry in ENTRIES if entry.source)
+
+
+def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LUMILOOP_DATA", raising=False)
+    assert main(["room", "exp1"]) == 0
+    assert "exp1   not replayed: LUMILOOP_DATA" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["nowhere"])
+    blessed = golden.load("room")
+    moved = replace(blessed, poses=blessed.poses + np.array((2e-6, 0.0, 0.0)))
+    monkeypatch.setattr(golden, "load", lambda name: moved)
+    assert main(["room"]) == 1
+    assert "MOVED" in capsys.readouterr().out
 
 
 def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(golden, "FOLDER", tmp_path)
     poses = np.random.default_rng(1).normal(size=(25, 3))
     trajectory = Trajectory(np.arange(25.0), poses)
-    golden.save("x", trajectory, 10, golden.facts_of(trajectory, "", "a test"))
+    golden.save("x", trajectory, 10, golden.facts_of(trajectory, [], "a log", "a test"))
     blessed = golden.load("x")
     assert golden.largest_difference(blessed, trajectory, 10) <= golden.TIGHT_M
     assert golden.largest_difference(blessed, trajectory, 10, motion=True) <= 4 * golden.TIGHT_M
@@ -56,5 +72,12 @@ def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pyte
     assert golden.largest_difference(blessed, Trajectory(np.arange(25.0), moved), 10) > golden.TIGHT_M
     between = poses.copy()
     between[13, 1] += 2e-6  # not among the kept poses: the digest tells
-    assert golden.digest(Trajectory(np.arange(25.0), between)) != blessed.facts["digest"]
+    assert golden.judged(blessed, trajectory, [], 10).same
+    assert not golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
+    assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same, "another loop"
+    monkeypatch.setattr(golden, "environment", lambda: "another processor")
+    assert golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
+    far = poses + np.array((0.0, 1.1e-3, 0.0))
+    assert not golden.judged(blessed, Trajectory(np.arange(25.0), far), [], 10).same
+    assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same
     assert golden.largest_difference(blessed, Trajectory(np.arange(24.0), poses[:24]), 10) == float("inf")

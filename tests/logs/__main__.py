@@ -1,0 +1,57 @@
+"""``python -m tests.logs [NAME ...]``: replay every log and hold it against its golden poses.
+
+Ends with 1 where one has moved. What is meant is blessed: ``python -m tests.logs.bless --reason TEXT [NAME ...]``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.logs import golden
+from tests.logs.bless import NO_DATA
+from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, replayed
+
+
+def checked(entry: Entry, root: Path | None) -> golden.Verdict:
+    """Replay one."""
+    with tempfile.TemporaryDirectory() as folder:
+        ledger = ledger_of(replayed(entry, root, Path(folder)))
+    return golden.judged(golden.load(entry.name), ledger.final(), [loop for _, loop in ledger.loops], entry.every)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.logs", description=__doc__.split("\n")[0])
+    parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
+    args = parser.parse_args(arguments)
+    unknown = sorted(set(args.name) - set(BY_NAME))
+    if unknown:
+        parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
+    data = os.environ.get("LUMILOOP_DATA")
+    moved = []
+    for entry in ENTRIES:
+        if args.name and entry.name not in args.name:
+            continue
+        if entry.source and not data:
+            sys.stdout.write(f"{entry.name:<6} not replayed: {NO_DATA}\n")
+            continue
+        begun = time.monotonic()
+        verdict = checked(entry, Path(data) if data else None)
+        moved += [] if verdict.same else [entry.name]
+        said = (
+            f"{entry.name:<6} {'same ' if verdict.same else 'MOVED'} {time.monotonic() - begun:5.1f} s  {verdict.said}"
+        )
+        sys.stdout.write(said + "\n")
+        sys.stdout.flush()
+    if moved:
+        sys.stdout.write(f"look at the change; if it is meant: {golden.REMEDY} {' '.join(moved)}\n")
+    return int(bool(moved))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

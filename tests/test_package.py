@@ -1,0 +1,50 @@
+"""What is shipped: every file of ours is in the wheel, and every room in what is installed."""
+
+from __future__ import annotations
+
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+ROOMS = [name.removesuffix("*") for name in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]]
+
+
+def files(room: str) -> list[Path]:
+    found = (path for path in (ROOT / room).rglob("*") if path.is_file())
+    return [path for path in found if "__pycache__" not in path.parts]
+
+
+def test_every_file_is_in_the_wheel() -> None:
+    data = PROJECT["tool"]["setuptools"]["package-data"]
+    for room in ROOMS:
+        for path in files(room):
+            if path.suffix == ".py":
+                assert (path.parent / "__init__.py").exists(), f"{path}: its folder is no package"
+            else:
+                name = str(path.relative_to(ROOT / room))
+                assert any(fnmatch(name, pattern) for pattern in data[room]), f"{room}/{name} is not in package-data"
+    assert any(path.name == "index.html" for path in files("taps"))
+
+
+def test_the_installer_takes_every_room() -> None:
+    (line,) = (line for line in (ROOT / "systemd/install.sh").read_text().splitlines() if "pyproject.toml" in line)
+    assert set(ROOMS) <= set(line.split())
+
+
+def test_locks_have_everything_that_is_named() -> None:
+    """Each lock file against the extras that it is made of (`make lock`)."""
+    extras = PROJECT["project"]["optional-dependencies"]
+    dev = ["test", "plot", "mcap", "foxglove", "view"]
+    for lock, named in {"core": [], "dev": dev, "bench": [*dev, "bench"]}.items():
+        kept = {row.partition("==")[0] for row in (ROOT / f"requirements/{lock}.lock").read_text().splitlines()}
+        wanted = [*PROJECT["project"]["dependencies"], *(one for extra in named for one in extras[extra])]
+        missing = {one for one in wanted if name_of(one) not in kept}
+        assert not missing, f"{lock}.lock lacks {missing}"
+
+
+def name_of(requirement: str) -> str:
+    """Its name, as lock files have it."""
+    end = next((at for at, letter in enumerate(requirement) if letter in "<>=!~; ["), len(requirement))
+    return requirement[:end].lower().replace("_", "-").replace(".", "-")
