@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import signal
 import threading
 from typing import Final
 
@@ -18,6 +17,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 from daemon import cli
 from daemon.config import Config
 from daemon.endpoints import parse_endpoint
+from hal.serving import work_until_told
 from taps import rostypes
 from taps.frames import Hello, NotTheStream
 from taps.ros import TOPICS, Out, Translator
@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
     cli.say(f"ws://{host}:{bridge.port}")
     try:
         stream = Stream(args.stream or path_of(args.settings.name), WANTED)
-        asyncio.run(_until_stopped(stream, args.settings, bridge))
+        asyncio.run(work_until_told(follow(stream, args.settings, bridge)))
     except NotTheStream as error:
         return cli.fail(str(error))
     finally:
@@ -95,22 +95,6 @@ class Bridge(ServerListener):
     def close(self) -> None:
         """Stop serving."""
         self._server.stop()
-
-
-async def _until_stopped(stream: Stream, settings: Config, bridge: Bridge) -> None:
-    loop, stop = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    running = asyncio.ensure_future(follow(stream, settings, bridge))
-    stopping = asyncio.ensure_future(stop.wait())
-    try:
-        await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
-        if running.done():
-            running.result()
-    finally:
-        for task in (running, stopping):
-            task.cancel()
-        await asyncio.gather(running, stopping, return_exceptions=True)
 
 
 async def follow(stream: Stream, settings: Config, bridge: Bridge) -> None:

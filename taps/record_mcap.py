@@ -9,11 +9,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import signal
 from typing import Final
 
 from daemon import cli
 from daemon.config import Config
+from hal.serving import work_until_told
 from taps.frames import Hello, NotTheStream
 from taps.mcapfile import FLUSH_S, McapFile
 from taps.ros import Translator
@@ -29,7 +29,7 @@ def main(args: argparse.Namespace) -> int:
     stream = Stream(args.stream or path_of(args.settings.name), (*TOPICS, *(["raw"] if args.raw else [])))
     try:
         with McapFile(args.out) as file:
-            asyncio.run(_until_stopped(stream, args.settings, file, args.seconds))
+            asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))
     except NotTheStream as error:
         return cli.fail(str(error))
     except OSError as error:
@@ -38,25 +38,6 @@ def main(args: argparse.Namespace) -> int:
     if not file.messages:
         return cli.fail("nothing was told; is the daemon running?")
     return cli.OK
-
-
-async def _until_stopped(stream: Stream, settings: Config, file: McapFile, seconds: float | None) -> None:
-    """Record until interrupted, or for so long."""
-    loop, stop = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    recording = asyncio.ensure_future(record(stream, settings, file))
-    stopping = asyncio.ensure_future(stop.wait())
-    try:
-        await asyncio.wait({recording, stopping}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        if recording.done():
-            recording.result()  # it never ends but by an error
-    finally:
-        for task in (recording, stopping):
-            task.cancel()
-        await asyncio.gather(recording, stopping, return_exceptions=True)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)
 
 
 async def record(stream: Stream, settings: Config, file: McapFile) -> None:

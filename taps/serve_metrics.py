@@ -9,12 +9,12 @@ import argparse
 import asyncio
 import contextlib
 import json
-import signal
 import time
 from typing import Final
 
 from daemon import cli
 from daemon.endpoints import parse_endpoint
+from hal.serving import work_until_told
 from taps import vda5050
 from taps.frames import NotTheStream
 from taps.metrics import CONTENT_TYPE, Told, exposition
@@ -39,7 +39,8 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     try:
         host, port = parse_endpoint(args.listen)
-        asyncio.run(_until_stopped(Stream(args.stream or path_of(args.settings.name), TOPICS), host, port))
+        stream = Stream(args.stream or path_of(args.settings.name), TOPICS)
+        asyncio.run(work_until_told(serve(stream, host, port)))
     except ValueError as error:
         return cli.fail(f"--listen: {error}", cli.USAGE)
     except NotTheStream as error:
@@ -47,22 +48,6 @@ def main(args: argparse.Namespace) -> int:
     except OSError as error:
         return cli.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
     return cli.OK
-
-
-async def _until_stopped(stream: Stream, host: str, port: int) -> None:
-    loop, stop = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    running = asyncio.ensure_future(serve(stream, host, port))
-    stopping = asyncio.ensure_future(stop.wait())
-    try:
-        await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
-        if running.done():
-            running.result()
-    finally:
-        for task in (running, stopping):
-            task.cancel()
-        await asyncio.gather(running, stopping, return_exceptions=True)
 
 
 async def serve(stream: Stream, host: str, port: int) -> None:

@@ -17,7 +17,7 @@ import urllib.request
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from aiohttp import ClientSession, ClientWebSocketResponse
 
@@ -81,6 +81,23 @@ def view(env: dict[str, str], folder: Path, *words: str) -> Iterator[str]:
         yield "http://" + told.partition("http://")[2].split()[0]
 
 
+AIM: Final = """(selector) => {
+  const wanted = document.querySelector(selector);
+  const kinds = ["pointerdown", "mousedown", "pointerup", "mouseup", "click"];
+  let hit = false;
+  const guard = (event) => {
+    if (!wanted.contains(event.target)) event.stopImmediatePropagation();
+    else if (event.type === "click") hit = true;
+  };
+  for (const kind of kinds) addEventListener(kind, guard, true);
+  globalThis.aim_ended = () => { for (const kind of kinds) removeEventListener(kind, guard, true); return hit; };
+  wanted.scrollIntoView({ block: "center" });
+  const box = wanted.getBoundingClientRect();
+  return [box.x + box.width / 2, box.y + box.height / 2];
+}"""
+"""The middle of an element; what is pressed beside it is kept from the page until ``aim_ended``."""
+
+
 @dataclass
 class Tab:
     """One page in a browser. said: errors and warnings of it."""
@@ -122,13 +139,17 @@ class Tab:
             await asyncio.sleep(0.1)
 
     async def click(self, selector: str) -> None:
-        """As a finger would: in the middle of an element that is in sight."""
+        """As a finger would: in the middle of an element, again where the page has moved away beneath the finger.
+
+        Raises:
+            BrowserError: the element cannot be hit.
+        """
         await self.ask("Page.bringToFront")
-        place = await self.js(
-            f"((e) => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
-            f"return [b.x + b.width / 2, b.y + b.height / 2]; }})(document.querySelector({json.dumps(selector)}))"
-        )
-        await self.drag([tuple(place)])
+        for _ in range(5):
+            await self.drag([tuple(await self.js(f"({AIM})({json.dumps(selector)})"))])
+            if await self.js("globalThis.aim_ended()"):
+                return
+        raise BrowserError(f"{selector} cannot be hit")
 
     async def drag(self, way: list[tuple[float, float]]) -> None:
         """Press, move along, let go; in pixels of the view."""

@@ -310,18 +310,21 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
 
 def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
     """The demo itself; returns the exit code."""
-    score, wrong = Score(), ""
+    score, wrong, interrupted = Score(), "", False
     try:
         play(options, folder, out, score)
     except KeyboardInterrupt:
+        interrupted = True
         if not score.reads:
             return INTERRUPTED
     except (DemoError, OrderRefused) as error:
         wrong = str(error)
     figures = summary(score)
-    wrong = wrong or verdict(figures) or complaint(score.acts)
-    if score.error_m:
+    early = interrupted and not score.error_m  # nothing is wrong with a run that had no time to show anything
+    wrong = wrong or ("" if early else verdict(figures)) or complaint(score.acts)
+    if score.error_m or early:
         wrong = export_map(folder, out) or wrong
+    if score.error_m:
         off, turned = figures["error_m"], figures["error_deg"]
         print(
             f"{figures['driven_m']:.1f} m driven; error median {100 * off['median']:.1f} cm, "

@@ -9,7 +9,6 @@ import errno
 import logging
 import multiprocessing
 import os
-import signal
 import socket
 import tempfile
 import time
@@ -24,6 +23,7 @@ from daemon import cli
 from daemon.config import Config
 from daemon.lights import SurveyError
 from daemon.publish.client import NoAnswer, address_of
+from hal.serving import stopping
 from taps.stream import Stream, path_of
 from taps.view.film import Film
 from taps.view.guard import Guard, TokenRefused, token_for
@@ -132,10 +132,7 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
 
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
+    stop = stopping()
     runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:

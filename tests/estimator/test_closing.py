@@ -105,11 +105,9 @@ def test_a_loop_brings_the_map_together_and_the_odometry_never_hears_of_it() -> 
 
 
 def test_the_pose_is_surer_after_the_loop_than_before() -> None:
-    state, _ = driven(laps=0.9)
-    before = state.atlas.spread(state.fused.T_odom_base)
-    state, _ = driven()
-    after = state.atlas.spread(state.fused.T_odom_base)
-    assert np.trace(after[:2, :2]) < 0.8 * np.trace(before[:2, :2])
+    states = [state for state, _ in (driven(laps=0.9), driven())]
+    before, after = (np.trace(state.atlas.spread(state.fused.T_odom_base)[:2, :2]) for state in states)
+    assert after < 0.8 * before
 
 
 def test_a_correction_of_the_map_takes_nothing_from_what_is_known_of_the_pose() -> None:

@@ -1,6 +1,6 @@
 """Two kinds of ends for one test body: fakes in virtual time, and devices that ``--lidar`` and ``--adc`` name.
 
-A body is a coroutine; :meth:`LidarEnd.play` and :meth:`AdcEnd.play` run it where its device is.
+A body is a coroutine; :meth:`End.play` runs it where its device is.
 """
 
 from __future__ import annotations
@@ -8,10 +8,11 @@ from __future__ import annotations
 import asyncio
 import math
 import socket
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Generic, Protocol, TypeVar
 
 import pytest
 
@@ -37,6 +38,7 @@ LINE, BUS = "/dev/ttyACM7", "/dev/i2c-7"  # names that stand for a kind; nothing
 UNIT: Final = Unit(serial="H0000007", clock_gain=30e-6, seed=7)
 ANSWER_S: Final = 5.0
 Body = Callable[[], Awaitable[None]]
+Block = TypeVar("Block")
 
 
 class Operator(Protocol):
@@ -119,25 +121,26 @@ def operator_for(text: str) -> Operator | None:
     return SocketOperator(text) if text else None
 
 
+class Driver(Protocol[Block]):
+    """What both drivers have in common."""
+
+    async def run(self, take: Callable[[Block], None]) -> None:
+        """Deliver until cancelled."""
+        ...
+
+
 @dataclass
-class LidarEnd:
-    """A lidar. While a body runs, everything in it may be used; ``fake`` is None on a real device."""
+class End(ABC, Generic[Block]):
+    """A device. While a body runs, everything in it may be used."""
 
     name: str
     operator: Operator | None = None
     clock: Clock = field(default_factory=SystemClock)
-    opener: PortOpener = open_port
-    fake: FakeHokuyo | None = None
 
     @property
     def real(self) -> bool:
         """Whether it is a device of this computer, or one on the network."""
         return self.name != FAKE
-
-    @property
-    def device(self) -> str:
-        """What a driver opens."""
-        return self.name if self.real else LINE
 
     def play(self, body: Body) -> None:
         """Run a body to its end."""
@@ -148,45 +151,80 @@ class LidarEnd:
 
     async def _on_fake(self, body: Body) -> None:
         self.clock = LoopClock(asyncio.get_running_loop())
-        self.fake = FakeHokuyo(UTM_30LX, Room(UTM_30LX, seed=7, lap_s=math.inf), unit=UNIT)
-        plugs = FakeOpener(self.clock)
-        plugs.plug(LINE, self.fake)
-        self.opener = plugs
-        schedule, self.operator = _orders({"lidar": self.fake})
+        schedule = FaultSchedule(self.plug())
+        self.operator = FakeOperator(Control(schedule))
         try:
             await body()
         finally:
             schedule.close()
+            self.unplug()
+
+    @abstractmethod
+    def plug(self) -> dict[str, Target]:
+        """Put a fake where the driver opens its device; what faults can be ordered of, by name."""
+
+    def unplug(self) -> None:
+        """Take the fake away."""
+
+    async def follow(self, driver: Driver[Block], seconds: float, none: Callable[[], str]) -> list[Block]:
+        """What comes in so many seconds, from the first on, which has to come within 15 s."""
+        got: list[Block] = []
+        running = asyncio.create_task(driver.run(got.append))
+        try:
+            await self.until(lambda: bool(got), 15.0, none)
+            await asyncio.sleep(seconds)
+        finally:
+            await ended(running)
+        return got
+
+    async def until(self, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
+        """Wait until something is so; the seconds it took. Fails with the text after ``seconds``."""
+        begun = self.clock.now()
+        while not so():
+            assert self.clock.now() - begun < seconds, f"not within {seconds:g} s: {else_()}"
+            await asyncio.sleep(0.005)
+        return self.clock.now() - begun
+
+
+@dataclass
+class LidarEnd(End[RawScan]):
+    """A lidar; ``fake`` is None on a real device."""
+
+    opener: PortOpener = open_port
+    fake: FakeHokuyo | None = None
+
+    @property
+    def device(self) -> str:
+        """What a driver opens."""
+        return self.name if self.real else LINE
+
+    def plug(self) -> dict[str, Target]:
+        """One of the UTM kind, in a room."""
+        self.fake = FakeHokuyo(UTM_30LX, Room(UTM_30LX, seed=7, lap_s=math.inf), unit=UNIT)
+        plugs = FakeOpener(self.clock)
+        plugs.plug(LINE, self.fake)
+        self.opener = plugs
+        return {"lidar": self.fake}
+
+    def unplug(self) -> None:
+        """Take the fake away."""
+        if self.fake is not None:
             self.fake.close()
 
     async def measure(self, seconds: float, driver: HokuyoDriver | None = None) -> list[RawScan]:
         """Scans of so many seconds, from the first on that comes within 15 s."""
-        driver = driver or self.driver()
-        scans: list[RawScan] = []
-        running = asyncio.create_task(driver.run(scans.append))
-        try:
-            await self.until(lambda: bool(scans), 15.0, lambda: f"no scan has come: {driver.status.error}")
-            await asyncio.sleep(seconds)
-        finally:
-            await ended(running)
-        return scans
+        asked = driver or self.driver()
+        return await self.follow(asked, seconds, lambda: f"no scan has come: {asked.status.error}")
 
     def driver(self) -> HokuyoDriver:
         """A driver of our own on it."""
         return HokuyoDriver(self.device, clock=self.clock, opener=self.opener)
 
-    async def until(self, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
-        """Wait until something is so; the seconds it took. Fails with the text after ``seconds``."""
-        return await _until(self.clock, so, seconds, else_)
-
 
 @dataclass
-class AdcEnd:
+class AdcEnd(End[RawSamples]):
     """A photodiode's converter; as :class:`LidarEnd`."""
 
-    name: str
-    operator: Operator | None = None
-    clock: Clock = field(default_factory=SystemClock)
     opener: BusOpener = open_bus
     fake: FakeAdc | None = None
 
@@ -200,49 +238,22 @@ class AdcEnd:
         if not at or not bus:
             raise pytest.UsageError(f"--adc {self.name}: expected BUS@ADDRESS[,CHIP], as /dev/i2c-1@0x4d")
 
-    @property
-    def real(self) -> bool:
-        """Whether it is a device of this computer, or one on the network."""
-        return self.name != FAKE
-
-    def play(self, body: Body) -> None:
-        """Run a body to its end."""
-        if self.real:
-            asyncio.run(_await(body))
-        else:
-            run_virtual(self._on_fake(body), start=1000.0)
-
-    async def _on_fake(self, body: Body) -> None:
-        self.clock = LoopClock(asyncio.get_running_loop())
+    def plug(self) -> dict[str, Target]:
+        """One under ordinary lamps."""
         self.fake = FakeAdc(OrdinaryLamps(seed=7), self.clock, address=self.address, seed=7)
         buses = FakeBuses(self.clock)
         buses.plug(self.bus, self.fake)
         self.opener = buses
-        schedule, self.operator = _orders({"adc": self.fake})
-        try:
-            await body()
-        finally:
-            schedule.close()
+        return {"adc": self.fake}
 
     async def measure(self, seconds: float) -> list[RawSamples]:
         """Blocks of so many seconds, from the first on that comes within 15 s."""
         driver = self.driver()
-        blocks: list[RawSamples] = []
-        running = asyncio.create_task(driver.run(blocks.append))
-        try:
-            await self.until(lambda: bool(blocks), 15.0, lambda: f"no samples have come: {driver.status.error}")
-            await asyncio.sleep(seconds)
-        finally:
-            await ended(running)
-        return blocks
+        return await self.follow(driver, seconds, lambda: f"no samples have come: {driver.status.error}")
 
     def driver(self) -> PhotodiodeAdc:
         """A driver of our own on it."""
         return PhotodiodeAdc(self.bus, self.address, self.chip, clock=self.clock, opener=self.opener)
-
-    async def until(self, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
-        """Wait until something is so; the seconds it took. Fails with the text after ``seconds``."""
-        return await _until(self.clock, so, seconds, else_)
 
 
 async def ended(running: asyncio.Task[None]) -> None:
@@ -261,16 +272,3 @@ def asked(end: LidarEnd | AdcEnd) -> Operator:
 
 async def _await(body: Body) -> None:
     await body()
-
-
-async def _until(clock: Clock, so: Callable[[], bool], seconds: float, else_: Callable[[], str]) -> float:
-    begun = clock.now()
-    while not so():
-        assert clock.now() - begun < seconds, f"not within {seconds:g} s: {else_()}"
-        await asyncio.sleep(0.005)
-    return clock.now() - begun
-
-
-def _orders(targets: dict[str, Target]) -> tuple[FaultSchedule, Operator]:
-    schedule = FaultSchedule(targets)
-    return schedule, FakeOperator(Control(schedule))

@@ -35,6 +35,7 @@ from hal.fake.models import MODELS, Unit
 from hal.fake.pty_server import PtyServer
 from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.tcp_server import TcpServer
+from hal.serving import work_until_told
 from tools.sim.buildings import BUILDINGS
 from tools.sim.ceiling import Effects
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
@@ -155,7 +156,7 @@ async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None
         lidar = await _connect(options, device, stack)
         feeds = _feeds(options, scene, stack)
         say({"lidar": lidar, **there})
-        await _until_told(options.seconds, feeds)
+        await work_until_told(*feeds, seconds=options.seconds)
     counts = device.counts
     say({"scans": device.scans_sent, "sent": counts.sent, "unheard": counts.unheard, "lost": counts.lost_in_sensor})
 
@@ -200,28 +201,6 @@ def _feeds(options: Options, scene: Scene, stack: AsyncExitStack) -> list[Corout
         stack.callback(sink.close)
         feeds.append(feed_truth(scene, sink.tell))
     return feeds
-
-
-async def _until_told(seconds: float, feeds: list[Coroutine[Any, Any, None]]) -> None:
-    """Run the feeds until a signal or the time's end; a feed that fails ends everything."""
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    if seconds > 0:
-        loop.call_later(seconds, stop.set)
-    tasks = [asyncio.create_task(feed) for feed in feeds]
-    stopped = asyncio.create_task(stop.wait())
-    try:
-        pending = {stopped, *tasks}
-        while stopped in pending:
-            done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-    finally:
-        for task in (stopped, *tasks):
-            task.cancel()
-        await asyncio.gather(stopped, *tasks, return_exceptions=True)
 
 
 def _say(what: dict[str, Any]) -> None:
