@@ -34,8 +34,10 @@ LIGHT_S: Final = 2
 """A block of light every so many seconds of the lap; a lap is a whole number of them."""
 BLOCKS: Final = 4
 """Blocks that the decoder has followed its lamps by then, of which the last one counts."""
-WHEELS_HZ: Final = 10.0
+WHEELS_HZ: Final = 4.0
 """The filter bridges half a second without wheels."""
+REST_S: Final = 600.0
+"""On its charger after each lap of some five minutes: half of what may grow grows only where it stands."""
 
 
 class Patrol:
@@ -49,7 +51,7 @@ class Patrol:
         place = building(name)
         body, rng = Body(), np.random.default_rng((seed, 5))
         drive = Drive(place.route, body)
-        self.lap_s = LIGHT_S * int(np.ceil(drive.lap_s / LIGHT_S))
+        self.lap_s = LIGHT_S * int(np.ceil((drive.lap_s + REST_S) / LIGHT_S))
         self._drive = Drive(place.route, body, drive.dwell_s + self.lap_s - drive.lap_s)
         self.mount = body.lidar
         self.geometry = LidarGeometry(
