@@ -39,6 +39,9 @@ TURNED: Final = 1.05
 TREMBLE: Final = np.diag((0.005**2, 0.005**2, 0.003**2))
 """What a correction of the map is uneven by."""
 
+AS_ONE: Final = 1e-6
+"""Rounding (m, rad) of submaps that were moved together."""
+
 APART: Final = 4.0
 """By how much the variance of what light said is raised: its errors hang together over several submaps."""
 
@@ -229,8 +232,8 @@ def solve_graph(state: State, atlas: Atlas) -> None:
 
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
-        solution, ties = payload
-        if correct(state, atlas, submaps, graph.poses, solution):
+        before, solution, ties = along(submaps, graph.poses, *payload)
+        if correct(state, atlas, submaps, before, solution):
             R = se2.rotation(-state.T_map_odom[2])
             atlas.tied = submaps[-1]
             turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
@@ -284,6 +287,36 @@ def information(at: Array, P_map: Array) -> Array:
     H = np.array([invert3(P) for P in R @ P_map @ R.transpose(0, 2, 1)])
     rows, columns = np.array(UPPER).T
     return np.ascontiguousarray(H[:, rows, columns])
+
+
+def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: Array) -> tuple[Array, Solution, Array]:
+    """Take a solution along where the whole map has moved as one since, as it does while light finds out where it lies.
+
+    Such a map may move with every epoch; if its solutions were thrown away for that, no loop would ever correct it.
+
+    Args:
+        before: (n, 3) places of the submaps that the solution has begun from. ties: (n, 3, 3) with it.
+
+    Returns:
+        These, the solution and the ties as they would be, had the map moved before; unchanged where it did not.
+    """
+    now = np.array([submap.T_map_submap for submap in submaps])
+    there = np.array([submap.into is None for submap in submaps[:-1]], np.bool_)
+    if not there.any() or np.array_equal(now, before):
+        return before, solution, ties
+    k = int(np.argmax(there))
+    moved = se2.compose(now[k], se2.inverse(before[k]))
+    places = se2.compose_all(moved, before)
+    off = places - now
+    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    near = np.abs(off).max(axis=1) < AS_ONE
+    if not near[:-1][there].all():
+        return before, solution, ties
+    places[near] = now[near]
+    R = se2.rotation(moved[2])
+    P = R @ solution.covariance @ R.T
+    solution = replace(solution, poses=se2.compose_all(moved, solution.poses), covariance=P)
+    return places, solution, np.asarray(R @ ties @ R.T)
 
 
 def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:

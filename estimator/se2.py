@@ -27,6 +27,14 @@ def compose(T_a_b: Array, T_b_c: Array) -> Array:
     return np.array((x + c * u - s * v, y + s * u + c * v, wrap(yaw + w)))
 
 
+def compose_all(T_a_b: Array, T_b_c: Array) -> Array:
+    """:func:`compose` with each row of ``T_b_c`` (n, 3)."""
+    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    u, v, yaw = T_b_c.T
+    turned = (T_a_b[2] + yaw + math.pi) % (2.0 * math.pi) - math.pi
+    return np.column_stack((T_a_b[0] + c * u - s * v, T_a_b[1] + s * u + c * v, turned))
+
+
 def inverse(T_a_b: Array) -> Array:
     """``T_b_a``."""
     x, y, yaw = T_a_b.tolist()

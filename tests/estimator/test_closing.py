@@ -16,7 +16,6 @@ from estimator.closing import candidates, found_again, keyframe_laid, surer, tak
 from estimator.commands import forget
 from estimator.keyframe import Submap, Virtual, keep
 from estimator.loop import Candidate, Found, LoopSettings, look, look_in
-from estimator.mapframe import shift_map
 from estimator.posegraph import UPPER, Graph, optimise
 from estimator.records import Answer, Array, Job
 from estimator.result import Loop, LoopReason
@@ -186,20 +185,6 @@ def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
         take_answer(state, answer)
     assert not state.atlas.submaps
     assert state.atlas.next_job > late[-1].job_id
-
-
-def test_a_map_moved_while_its_graph_was_solved_is_solved_again() -> None:
-    state, truth = driven()
-    state.atlas.stale = True
-    take_answer(state, Answer(0.0, -1, None))  # nobody asked: only makes the graph be handed out
-    (job,) = state.atlas.take_jobs()
-    shift_map(state, np.array((5.0, 0.0, 0.0)), 0)
-    state.T_map_odom = se2.compose(np.array((5.0, 0.0, 0.0)), state.T_map_odom)
-    take_answer(state, Answer(0.0, job.job_id, job.run()))
-    (again,) = state.atlas.take_jobs()
-    take_answer(state, Answer(0.0, again.job_id, again.run()))
-    places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
-    assert np.hypot(*(places - truth)[:, :2].T - np.array(((5.0,), (0.0,)))).max() < 0.15
 
 
 def test_a_graph_of_which_a_part_was_forgotten_meanwhile_moves_nothing() -> None:

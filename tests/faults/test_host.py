@@ -20,7 +20,9 @@ import pytest
 
 from daemon.health import Fault
 from daemon.heartbeat import BEAT_S, OVER_S
+from daemon.publish.client import Reader
 from daemon.publish.holding import CommandCode, Outcome
+from daemon.publish.parts import FAULTS
 from daemon.publish.snapshot import State
 from tests.daemon.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
 from tests.daemon.test_store_process import ask
@@ -45,14 +47,25 @@ def tracking(daemon: Running, seconds: float = PATIENCE_S) -> None:
     daemon.until(seconds, "state", State.TRACKING)
 
 
+def present(daemon: Running) -> set[int]:
+    """All faults, not the gravest alone: on a loaded machine scans may come late meanwhile."""
+    with Reader("127.0.0.1", daemon.modbus) as reader:
+        reading = reader.read()
+    return {int(reading[f"fault_{k}"] or 0) for k in range(1, FAULTS + 1)}
+
+
 def named(daemon: Running, fault: Fault, seconds: float) -> None:
-    newest(daemon)
-    daemon.until(seconds, "fault", int(fault))
+    end = time.monotonic() + seconds
+    while int(fault) not in (there := present(daemon)):
+        assert time.monotonic() < end, f"fault {int(fault)} is not named within {seconds} s, but {there}"
+        time.sleep(0.05)
 
 
-def over(daemon: Running, seconds: float) -> None:
-    newest(daemon)
-    daemon.until(seconds, "fault", 0)
+def over(daemon: Running, fault: Fault, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while int(fault) in present(daemon):
+        assert time.monotonic() < end, f"fault {int(fault)} is not over within {seconds} s"
+        time.sleep(0.05)
 
 
 @contextmanager
@@ -83,7 +96,7 @@ def disk_full(daemon: Running, disk: Path) -> None:
     named(daemon, Fault.MAP_NOT_SAVED, 8.0)
     ballast.unlink()
     assert ask(daemon, 12, CommandCode.SAVE_MAP) is Outcome.DONE
-    over(daemon, 20.0)
+    over(daemon, Fault.MAP_NOT_SAVED, 20.0)
 
 
 def read_only(daemon: Running, disk: Path) -> None:
@@ -95,7 +108,7 @@ def read_only(daemon: Running, disk: Path) -> None:
     finally:
         subprocess.run(["umount", disk], check=True)
     assert ask(daemon, 14, CommandCode.SAVE_MAP) is Outcome.DONE
-    over(daemon, 20.0)
+    over(daemon, Fault.MAP_NOT_SAVED, 20.0)
 
 
 def stopped(daemon: Running, _disk: Path) -> None:
@@ -104,7 +117,7 @@ def stopped(daemon: Running, _disk: Path) -> None:
     daemon.process.send_signal(signal.SIGCONT)
     named(daemon, Fault.LOOP_STALLED, 5.0)
     tracking(daemon)
-    over(daemon, 40.0)
+    over(daemon, Fault.LOOP_STALLED, 40.0)
 
 
 def stuck_clients(daemon: Running, _disk: Path) -> None:
@@ -138,7 +151,8 @@ def steady(daemon: Running, seconds: float = 3.0) -> None:
     assert first["state"] == last["state"] == State.TRACKING
     came = int(str(last["seq"])) - int(str(first["seq"]))
     assert came > 40 * seconds / 4, f"{came} poses in {seconds} s"
-    assert last["fault"] in (0, Fault.LOOP_STALLED, Fault.OVERRUNS, Fault.LIDAR_GAPS), "a loaded machine, no more"
+    loaded = {Fault.LOOP_STALLED, Fault.OVERRUNS, Fault.LIDAR_GAPS, Fault.LIDAR_LATE}
+    assert present(daemon) <= {0, *loaded}, "a loaded machine, no more"
 
 
 CHAIN: list[Callable[[Running, Path], None]] = [stopped, stuck_clients, slow_listener, disk_full, read_only]
@@ -162,7 +176,7 @@ def test_one_process_survives_one_after_the_other(tmp_path: Path, monkeypatch: p
             with fake_lidar(link):
                 assert link.readlink() != before, "the lidar has come back as another tty"
                 tracking(daemon)
-                over(daemon, 40.0)
+                over(daemon, Fault.LIDAR_MISSING, 40.0)
                 time.sleep(OVER_S + 2.0 * BEAT_S)  # so long a fault must be gone before the log says so
                 code, log, _ = daemon.stop()
             for end in other:

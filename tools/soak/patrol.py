@@ -34,7 +34,7 @@ LIGHT_S: Final = 2
 """A block of light every so many seconds of the lap; a lap is a whole number of them."""
 BLOCKS: Final = 4
 """Blocks that the decoder has followed its lamps by then, of which the last one counts."""
-WHEELS_HZ: Final = 4.0
+WHEELS_HZ: Final = 10.0
 """The filter bridges half a second without wheels."""
 REST_S: Final = 600.0
 """On its charger after each lap of some five minutes: half of what may grow grows only where it stands."""
