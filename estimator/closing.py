@@ -294,11 +294,8 @@ def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: 
 
     Such a map may move with every epoch; if its solutions were thrown away for that, no loop would ever correct it.
 
-    Args:
-        before: (n, 3) places of the submaps that the solution has begun from. ties: (n, 3, 3) with it.
-
-    Returns:
-        These, the solution and the ties as they would be, had the map moved before; unchanged where it did not.
+    ``before`` (n, 3) are the places of the submaps that the solution has begun from, ``ties`` (n, 3, 3) came with it.
+    Returns these, the solution and the ties as they would be had the map moved before; unchanged where it did not.
     """
     now = np.array([submap.T_map_submap for submap in submaps])
     there = np.array([submap.into is None for submap in submaps[:-1]], np.bool_)

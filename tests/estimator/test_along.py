@@ -27,7 +27,7 @@ def drifted() -> State:
     state.settings = replace(state.settings, loops=TOLD)
     atlas = state.atlas
     a, *_, b = atlas.submaps.values()
-    T = se2.between(a.T_map_submap, b.T_map_submap) + (0.1, -0.05, 0.02)
+    T = se2.between(a.T_map_submap, b.T_map_submap) + np.array((0.1, -0.05, 0.02))
     atlas.constraints.add(a.key, b.key, T, np.diag((0.01**2, 0.01**2, 0.005**2)), True)
     atlas.stale = True
     return state
