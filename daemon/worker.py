@@ -28,6 +28,10 @@ SWITCH_S: Final = 5e-4
 """A thread that runs Python gives way after so long (the interpreter's own 5 ms would be waited for after every kernel
 of a cycle while a job prepares its numbers)."""
 
+TRIES: Final = 3
+PAUSE_S: Final = 0.2
+"""A job that raises is run so often, in real time with a pause between."""
+
 
 _Waiting = queue.PriorityQueue[tuple[int, int, Job | None]]
 
@@ -37,7 +41,7 @@ class Worker(Protocol):
 
     @property
     def failed(self) -> int:
-        """Jobs that raised; they never answer."""
+        """Jobs that raised each time they were tried; they never answer."""
         ...
 
     def submit(self, jobs: Iterable[Job]) -> None:
@@ -110,7 +114,7 @@ class ThreadWorker:
             _, _, job = self._waiting[number].get()
             if job is not None:
                 self.since[number] = time.monotonic()
-                self._done.put(_run(job))
+                self._done.put(_run(job, PAUSE_S))
                 self.since[number] = None
 
 
@@ -180,10 +184,16 @@ class ScheduledWorker:
         self._jobs.clear()
 
 
-def _run(job: Job) -> tuple[int, object] | None:
-    """Run one job; a defect in it is logged and costs its answer, never the daemon."""
-    try:
-        return job.job_id, job.run()
-    except Exception:  # a job is arbitrary work; its failure is counted, published and logged in full
-        log.exception("background job %d failed", job.job_id)
-        return None
+def _run(job: Job, pause_s: float = 0.0) -> tuple[int, object] | None:
+    """Run one job; a defect in it is logged and costs its answer, never the daemon.
+
+    A job changes nothing and can be run again: what fails for want of memory, say, is tried :data:`TRIES` times. The
+    map waits for it, and one without which a submap would never be finished must not be lost to a bad moment.
+    """
+    for left in reversed(range(TRIES)):
+        try:
+            return job.job_id, job.run()
+        except Exception:  # a job is arbitrary work; its failure is counted, published and logged in full
+            log.exception("background job %d failed%s", job.job_id, "; it is tried again" if left else "")
+            time.sleep(pause_s if left else 0.0)
+    return None

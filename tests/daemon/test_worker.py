@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from daemon.worker import ANSWER_CYCLES, URGENT, CycleWorker, ScheduledWorker, ThreadWorker, Worker
+from daemon.worker import ANSWER_CYCLES, TRIES, URGENT, CycleWorker, ScheduledWorker, ThreadWorker, Worker
 from estimator.records import Job
 
 
@@ -46,6 +46,23 @@ def test_a_failing_job_costs_its_answer_and_is_said(caplog: pytest.LogCaptureFix
     assert worker.failed == 1
     assert "background job 1 failed" in caplog.text
     assert "no such map" in caplog.text
+
+
+def test_a_job_that_fails_in_a_bad_moment_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
+    tried = []
+
+    def second_time() -> object:
+        tried.append(True)
+        if len(tried) == 1:
+            raise MemoryError
+        return "found"
+
+    worker = CycleWorker(cycles=1)
+    worker.submit([Job(1, 0, second_time), broken(2)])
+    assert answers(worker) == [(1, "found")]
+    assert worker.failed == 1
+    assert caplog.text.count("background job 1 failed") == 1
+    assert caplog.text.count("background job 2 failed") == TRIES
 
 
 def test_a_recording_decides_in_which_cycle_an_answer_is_applied() -> None:

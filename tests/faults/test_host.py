@@ -20,7 +20,7 @@ import pytest
 
 from daemon.health import Fault
 from daemon.heartbeat import BEAT_S, OVER_S
-from daemon.publish.client import Reader
+from daemon.publish.client import NoAnswer, Reader
 from daemon.publish.holding import CommandCode, Outcome
 from daemon.publish.parts import FAULTS
 from daemon.publish.snapshot import State
@@ -49,9 +49,14 @@ def tracking(daemon: Running, seconds: float = PATIENCE_S) -> None:
 
 def present(daemon: Running) -> set[int]:
     """All faults, not the gravest alone: on a loaded machine scans may come late meanwhile."""
+    end = time.monotonic() + PATIENCE_S
     with Reader("127.0.0.1", daemon.modbus) as reader:
-        reading = reader.read()
-    return {int(reading[f"fault_{k}"] or 0) for k in range(1, FAULTS + 1)}
+        while True:
+            with contextlib.suppress(NoAnswer):
+                reading = reader.read()
+                if "fault_1" in reading:
+                    return {int(reading[f"fault_{k}"] or 0) for k in range(1, FAULTS + 1)}
+            assert time.monotonic() < end, "the table of faults is not answered"
 
 
 def named(daemon: Running, fault: Fault, seconds: float) -> None:
@@ -151,7 +156,7 @@ def steady(daemon: Running, seconds: float = 3.0) -> None:
     assert first["state"] == last["state"] == State.TRACKING
     came = int(str(last["seq"])) - int(str(first["seq"]))
     assert came > 40 * seconds / 4, f"{came} poses in {seconds} s"
-    loaded = {Fault.LOOP_STALLED, Fault.OVERRUNS, Fault.LIDAR_GAPS, Fault.LIDAR_LATE}
+    loaded = {Fault.LOOP_STALLED, Fault.OVERRUNS, Fault.OVERLOADED, Fault.LIDAR_GAPS, Fault.LIDAR_LATE}
     assert present(daemon) <= {0, *loaded}, "a loaded machine, no more"
 
 
@@ -184,8 +189,11 @@ def test_one_process_survives_one_after_the_other(tmp_path: Path, monkeypatch: p
     assert code == 0, log
     assert "Traceback" not in log
     for fault in (Fault.LOOP_STALLED, Fault.MAP_NOT_SAVED, Fault.LIDAR_MISSING):
-        come, gone = log.count(f" fault {int(fault)}: "), log.count(f"over: fault {int(fault)}: ")
-        assert come - gone == gone >= 1, f"fault {int(fault)}: said {come - gone} times, over {gone} times"
+        gone = log.count(f"over: fault {int(fault)}: ")
+        come = log.count(f" fault {int(fault)}: ") - gone
+        still = int(fault is Fault.LOOP_STALLED and come > gone)  # a loaded machine may stall once more at the end
+        assert come == gone + still, f"fault {int(fault)}: said {come} times, over {gone} times"
+        assert gone >= 1
 
 
 def test_killed_it_comes_back_with_its_map(tmp_path: Path) -> None:
