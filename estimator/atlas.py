@@ -26,8 +26,9 @@ Ints = npt.NDArray[np.int64]
 FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
 """What a keyframe's place loses against the one before, beyond what the matches know of: 5 mm and 0.1 deg."""
 
-CELL_M, KEPT = 3.0, 2
-"""Submaps kept of each place so large and each quarter of heading."""
+NEAR_M, NEAR_RAD, KEPT = 1.5, 0.25 * math.pi, 2
+"""So many submaps are kept that begin so near each other, with the robot looking the same way. In a grid of places they
+would go on filling up for hours, because no lap begins its submaps where the last one did."""
 
 OWN: Final = 12
 """Submaps of this session kept on top of a restored map that is only used."""
@@ -356,7 +357,7 @@ class Atlas:
         """Bound what is kept per area: of the submaps of one place and heading the newest few stay."""
         first = 0 if self.watch is None else self.watch.first  # what is watched takes the place of nothing older
         part = [other for other in self.of_part(latest) if (other.key < first) == (latest.key < first)]
-        here = [other for other in part if cell_of(other) == cell_of(latest) and not self.is_held(other)]
+        here = [other for other in part if alike(other, latest) and not self.is_held(other)]
         for submap in here[:-KEPT]:
             self.let_go(submap)
         self.constraints.keep(thinned(np.array(list(self.submaps)), self.constraints))
@@ -388,7 +389,7 @@ def swing(lever: Array) -> Array:
     return np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0]), (0.0, 0.0, 1.0)))
 
 
-def cell_of(submap: Submap) -> tuple[int, int, int]:
-    """Place (of CELL_M) and heading (a quarter turn) of a submap; who drives along an axis is well within a quarter."""
-    x, y, yaw = submap.T_map_submap.tolist()
-    return math.floor(x / CELL_M), math.floor(y / CELL_M), math.floor(yaw * 2.0 / math.pi + 0.5) % 4
+def alike(one: Submap, other: Submap) -> bool:
+    """Whether two submaps begin in one place and look the same way."""
+    x, y, yaw = (one.T_map_submap - other.T_map_submap).tolist()
+    return math.hypot(x, y) < NEAR_M and abs(se2.wrap(yaw)) < NEAR_RAD
