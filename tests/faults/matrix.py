@@ -27,7 +27,7 @@ FAULT_S: Final = 8.0
 """How long a fault lasts."""
 CALM_S: Final = 3.0
 """TRACKING before it."""
-STOP_AFTER_S: Final = 4.0
+STOP_AFTER_S: Final = 6.0
 """A stop comes this long after the fault; the fault ends a second after the next start."""
 PATIENCE_S: Final = 40.0
 STOP_S: Final = 3.0

@@ -28,7 +28,7 @@ TITLE: Final = {"lidar": "Lidar", "adc": "Photodiode (converter and its bus)", "
 TIME: Final = {
     "start": f"There before the start, lifted {FAULT_S:g} s after it",
     "run": f"While TRACKING at half a metre a second, for {FAULT_S:g} s",
-    "stop": "From 4 s before a stop, until 1 s after the next start",
+    "stop": "From 6 s before a stop, until 1 s after the next start",
 }
 
 
