@@ -56,10 +56,17 @@ class Orders:
         self._lines = Sparing(log)
 
     def take(self, request: Request) -> None:
-        """An order as it was written."""
-        feeds, code = self._feeds, request.code
+        """An order as it was written; whatever goes wrong with it, the client hears of its end."""
         self._lines.say(self._clock.now(), logging.INFO, f"Modbus: {_said(request)}")
         told = partial(self._ended, request)
+        try:
+            self._hand_on(request, told)
+        except Exception as failure:
+            log.debug("%s has failed", request.code.name, exc_info=True)  # at any rate: above, it would fill the log
+            told(f"it has failed: {failure!r}")
+
+    def _hand_on(self, request: Request, told: Told) -> None:
+        feeds, code = self._feeds, request.code
         if code is CommandCode.SAVE_MAP:
             feeds.on_save(told)
         elif code is CommandCode.DUMP_RECORDER:

@@ -49,6 +49,8 @@ ADRIFT: Final = "the place in the stored map is not known yet, and the map has n
 Revision = tuple[int, int, int]
 Told = Callable[[str], None]
 """Takes the end of a save that was asked for: :data:`DONE`, or why it came to nothing."""
+End = Callable[[Path | None, str], None]
+"""Takes the end of a save in the loop's thread: the file, or None and why there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +94,6 @@ class Keeper:
         self._anew = False
         self._due = clock.now() + FIRST_S
         self._waiting: list[Told] = []
-        self._thread: threading.Thread | None = None
         self._over = asyncio.Event()
         self._over.set()
 
@@ -184,16 +185,22 @@ class Keeper:
             return
         self._anew = False
         waiting, self._waiting = self._waiting, []
+        end = partial(self._end, revision, waiting)
+        self.busy_since = time.monotonic()
+        self._over.clear()
+        try:
+            self._begin(store, state, end)
+        except Exception as failure:  # no memory, no thread, or a defect: whoever waits is told, and it is tried again
+            log.exception("the save of the map cannot begin")
+            end(None, f"the save cannot begin: {failure!r}")
+
+    def _begin(self, store: Store, state: State, end: End) -> None:
+        """Gather the map, and have a thread save it, which calls ``end`` in this one."""
         begun = time.perf_counter()
         image = self._image(state)
         log.debug("the map was gathered in %.2f ms", 1e3 * (time.perf_counter() - begun))
-        end = partial(self._end, revision, waiting)
-        self._thread = threading.Thread(
-            target=self._work, args=(store, image, asyncio.get_running_loop(), end), name="lumiloop-map", daemon=True
-        )
-        self._thread.start()
-        self.busy_since = time.monotonic()
-        self._over.clear()  # after what may fail: else nothing would ever be saved again
+        work = partial(self._work, store, image, asyncio.get_running_loop(), end)
+        threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
 
     def _revision(self, state: State) -> Revision:
         """Changes when there is something new to save."""
@@ -215,9 +222,7 @@ class Keeper:
         )
         return image_of(state, who)
 
-    def _work(
-        self, store: Store, image: MapImage, loop: asyncio.AbstractEventLoop, end: Callable[[Path | None, str], None]
-    ) -> None:
+    def _work(self, store: Store, image: MapImage, loop: asyncio.AbstractEventLoop, end: End) -> None:
         """Pack, write, verify; in a thread of its own."""
         path, error = None, DONE
         try:

@@ -123,3 +123,13 @@ def test_what_a_run_cannot_do_is_refused(code: CommandCode) -> None:
     bench = Bench()
     bench.ask(9, code)
     assert bench.ended == [(9, Outcome.REFUSED)]
+
+
+def test_whatever_goes_wrong_with_an_order_its_client_hears_of_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    def broken(told: Told) -> None:
+        raise MemoryError
+
+    bench = Bench(on_dump=broken)
+    bench.ask(5, CommandCode.DUMP_RECORDER)
+    assert bench.ended == [(5, Outcome.REFUSED)]
+    assert "DUMP_RECORDER refused: it has failed: MemoryError()" in caplog.text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -201,6 +202,36 @@ def test_a_defect_in_the_packing_is_told_in_full_and_ends_nothing(
         monkeypatch.undo()
         await bench.turn(RETRY_S)
         assert bench.keeper.saves == 1
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
+def test_a_save_that_cannot_begin_is_told_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        bench.drive()
+        await bench.turn(FIRST_S)
+        bench.state, bench.map_id = new_state(), 0x78
+
+        def fail(*given: object) -> None:
+            raise failure
+
+        with monkeypatch.context() as without:
+            without.setattr(*((threading.Thread, "start") if str(failure) else (bench.keeper, "_image")), fail)
+            bench.drive()
+            bench.state.keyframes[0] = None  # type: ignore[assignment]  # there is something of a map
+            bench.keeper.ask(bench.told.append)
+            bench.state.keyframes.clear()
+        assert len(bench.told) == 1
+        assert repr(failure) in bench.told[0]
+        assert repr(failure) in bench.keeper.error
+        assert bench.keeper.busy_since is None
+        await bench.turn(RETRY_S)
+        assert bench.keeper.error == ""
+        assert bench.keeper.saves == 2, "begun anew, which must not be forgotten"
 
     asyncio.run(run())
 
