@@ -44,19 +44,31 @@ class Heartbeat:
         self._samples: deque[Vitals] = deque()
         self._seen: dict[Fault, float] = {}  # those that have been said, and when they were last present
         self._beats = 0
+        self._failing = False
 
     def fault(self) -> int:
         """Number of the gravest present fault, 0 for none."""
         return int(self.faults[0]) if self.faults else 0
 
     async def run(self) -> None:
-        """Beat until cancelled."""
+        """Beat until cancelled.
+
+        A beat that fails does not feed the watchdog. It is said once, and the next one is tried: a defect in what only
+        looks must not end a daemon that localises, and one that lasts ends in a restart all the same.
+        """
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
             due = max(due + BEAT_S, loop.time())
             await asyncio.sleep(due - loop.time())
-            self.beat(loop.time() - due)
+            try:
+                self.beat(loop.time() - due)
+            except Exception:
+                if not self._failing:
+                    log.exception("a heartbeat has failed; said once until they work again")
+                self._failing = True
+            else:
+                self._failing = False
 
     def beat(self, lateness: float) -> None:
         """One beat; ``lateness``: seconds by which the loop was late for it."""

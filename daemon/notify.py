@@ -11,8 +11,8 @@ def notify(*words: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock:
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock:
             sock.sendto("\n".join(words).encode(), address.replace("@", "\0", 1))
-        except OSError:
-            return  # it restarts, or its queue is full: the next word will do
+    except OSError:
+        return  # it restarts, its queue is full, or there is no file descriptor left: the next word will do

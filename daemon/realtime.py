@@ -44,8 +44,11 @@ def line_up() -> int:
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0
     moved, ours = 0, threading.get_native_id()
-    for path in Path("/proc/self/task").iterdir():
-        task = int(path.name)
+    try:
+        tasks = [int(path.name) for path in Path("/proc/self/task").iterdir()]
+    except OSError:
+        return 0  # no file descriptor is left: the next call will do
+    for task in tasks:
         try:
             if task != ours and os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
                 os.sched_setscheduler(task, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(BEHIND))

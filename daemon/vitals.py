@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from pathlib import Path
@@ -92,8 +93,11 @@ def _light_statistics(cycle: Cycle) -> str:
 
 
 def resident_mb() -> float:
-    """Resident memory of this process, MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    """Resident memory of this process, MB; NaN where that cannot be read, as without a free file descriptor."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return math.nan
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 

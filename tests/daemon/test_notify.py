@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 from pathlib import Path
@@ -27,4 +28,13 @@ def test_without_a_manager_nothing_happens(monkeypatch: pytest.MonkeyPatch, addr
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     if address is not None:
         monkeypatch.setenv("NOTIFY_SOCKET", address)
+    notify("WATCHDOG=1")
+
+
+def test_without_a_free_file_descriptor_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(*kind: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setenv("NOTIFY_SOCKET", "/run/notify")
+    monkeypatch.setattr(socket, "socket", none_left)
     notify("WATCHDOG=1")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -67,6 +69,15 @@ def test_a_kernel_that_refuses_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     assert realtime._schedule(40) == "ordinary scheduling (Operation not permitted)"
+
+
+def test_threads_that_cannot_be_listed_are_lined_up_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(folder: Path) -> Iterator[Path]:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(os, "sched_getscheduler", lambda thread: os.SCHED_FIFO)
+    monkeypatch.setattr(Path, "iterdir", none_left)
+    assert realtime.line_up() == 0
 
 
 @needs_root

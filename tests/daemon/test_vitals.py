@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
+import math
 import subprocess
 import sys
 import time
@@ -31,6 +33,14 @@ def test_resident_memory_counts_what_is_touched() -> None:
     ballast = bytearray(50_000_000)
     ballast[::4096] = b"x" * len(ballast[::4096])
     assert 45.0 < resident_mb() - before < 60.0
+
+
+def test_memory_that_cannot_be_read_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(path: Path) -> str:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(Path, "read_text", none_left)
+    assert math.isnan(resident_mb())
 
 
 def test_a_stream_without_a_descriptor_is_logged_to_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
