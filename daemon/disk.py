@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.wholefile import sync_folder
+from daemon.wholefile import defect_in, reason_of, sync_folder
 from hal.errors import DeviceRefused
 from hal.replay.recording import LONGEST, Kind, pack_frame, pack_head, segment_name
 
@@ -112,9 +112,7 @@ class SegmentWriter:
 
     def _work(self) -> None:
         while not self._stop.wait(WRITE_S):
-            self.busy_since = time.monotonic()
             self._turn()
-            self.busy_since = None
         self._retry_at = 0.0
         self._turn()
         self._close()
@@ -123,8 +121,10 @@ class SegmentWriter:
         """Write what is ready; on trouble drop it, count it, and try again later in a new segment."""
         with self._lock:
             ready, self._ready, self._waiting = self._ready, [], 0
-        batches = _batches(ready)
+        batches: list[Batch] = []
+        self.busy_since = time.monotonic()
         try:
+            batches = _batches(ready)
             if self._file < 0:
                 if time.monotonic() < self._retry_at:
                     self._lose(batches)
@@ -139,8 +139,10 @@ class SegmentWriter:
                     batches[0] = None, frames
                 self._write(frames)
                 del batches[0]
-        except OSError as error:
+        except Exception as error:  # noqa: BLE001  no memory, or a defect, must not end the thread either; it is told
             self._fail(error, batches)
+        finally:
+            self.busy_since = None
 
     def _write(self, frames: list[bytes]) -> None:
         """Append whole records; rotates first where the segment is full."""
@@ -168,10 +170,12 @@ class SegmentWriter:
         note = f"{self.lost - self._noted} records before this one were lost: {self.error or 'the disk is too slow'}"
         return pack_frame(Kind.NOTE, 0, self._t_mono, note.encode())
 
-    def _fail(self, error: OSError, batches: list[Batch]) -> None:
+    def _fail(self, error: Exception, batches: list[Batch]) -> None:
+        reason = reason_of(error)
         if not self.error:
-            log.error("recording into %s has stopped: %s; it goes on when there is room", self.folder, error.strerror)
-        self.error = f"{self.folder}: {error.strerror or error}"
+            line = "recording into %s has stopped: %s; it goes on when there is room"
+            log.error(line, self.folder, reason, exc_info=defect_in(error))
+        self.error = f"{self.folder}: {reason}"
         self._lose(batches)
         self._close()
         self._retry_at = time.monotonic() + RETRY_S

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Final
 
 from daemon.publish.snapshot import Snapshot, State
-from daemon.wholefile import sync_folder
+from daemon.wholefile import defect_in, reason_of, sync_folder
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +123,8 @@ class LastPose:
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._stop = False
-        self._file, self._dirty, self._synced = -1, False, time.monotonic()
+        self._file, self._synced = -1, time.monotonic()
+        self._unsynced: Remembered | None = None  # written, and not on the disk for sure
         self._thread: threading.Thread | None = None
 
     def of_map(self, map_id: int) -> Pose | None:
@@ -172,31 +173,36 @@ class LastPose:
 
     def _work(self) -> None:
         while not self._stop:
-            self._wake.wait(RETRY_S if self.error else SYNC_S if self._dirty else None)
+            self._wake.wait(RETRY_S if self.error else SYNC_S if self._unsynced else None)
             self._wake.clear()
             self._turn()
         self._turn()
         self._close()
 
     def _turn(self) -> None:
-        """Write the newest pose, if there is one, and now and then see to it that the disk has it."""
+        """Write the newest pose, if there is one, and now and then see to it that the disk has it.
+
+        After a failure the disk has to have it at once, else nobody knows whether it works again.
+        """
         with self._lock:
             told, self._next = self._next, None
         self.busy_since = time.monotonic()
         try:
             if told is not None:
                 self._write(told)
-            if self._dirty and (self._stop or time.monotonic() - self._synced >= SYNC_S):
+            overdue = time.monotonic() - self._synced >= SYNC_S
+            if self._unsynced is not None and (self._stop or self.error or overdue):
                 os.fdatasync(self._file)
-                self._dirty, self._synced = False, time.monotonic()
-        except OSError as error:
-            self._say(f"{self.path}: {error.strerror or error}")
-            self._close()
+                self._unsynced, self._synced = None, time.monotonic()
+        except Exception as error:  # noqa: BLE001  no memory, or a defect, must not end the thread either; it is told
+            self._say(f"{self.path}: {reason_of(error)}", defect_in(error))
             with self._lock:
-                self._next = self._next or told
+                self._next = self._next or told or self._unsynced
+            self._close()
         else:
             self._say("" if told is not None or not self.error else self.error)
-        self.busy_since = None
+        finally:
+            self.busy_since = None
 
     def _write(self, told: Remembered) -> None:
         if self._file < 0:
@@ -204,18 +210,18 @@ class LastPose:
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
             sync_folder(self.path.parent)
         os.pwrite(self._file, packed(told), _SLOT_BYTES * (told.number % 2))
-        self._dirty = True
+        self._unsynced = told
 
     def _close(self) -> None:
         """Let go of the file; the next write opens it anew."""
-        file, self._file, self._dirty = self._file, -1, False
+        file, self._file, self._unsynced = self._file, -1, None
         if file >= 0:
             with contextlib.suppress(OSError):
                 os.close(file)
 
-    def _say(self, error: str) -> None:
+    def _say(self, error: str, defect: Exception | None = None) -> None:
         if error and not self.error:
-            log.warning("the pose cannot be kept for the next start: %s; it is tried again", error)
+            log.warning("the pose cannot be kept for the next start: %s; it is tried again", error, exc_info=defect)
         elif self.error and not error:
             log.info("the pose is kept for the next start again")
         self.error = error

@@ -23,6 +23,16 @@ def write_whole(path: Path, content: bytes) -> None:
         raise
 
 
+def reason_of(error: Exception) -> str:
+    """Why something could not be written, for people: the system's words where it has some."""
+    return (error.strerror if isinstance(error, OSError) else None) or repr(error)
+
+
+def defect_in(error: Exception) -> Exception | None:
+    """What a log tells in full: whatever is more than the system's refusal."""
+    return None if isinstance(error, OSError) else error
+
+
 def sync_folder(folder: Path) -> None:
     """Make a new file's name survive a power cut, too."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daemon import lastpose
 from daemon.lastpose import FILE, WRITE_S, LastPose, Remembered, packed, read, unpacked
 from daemon.publish.snapshot import Snapshot, State
 
@@ -103,6 +109,55 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
     pose.close()
     assert LastPose(file / "maps").of_map(7) == (9.0, 2.0, 0.5)
     assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + 5.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("call", ["pwrite", "fdatasync"])
+@pytest.mark.parametrize("failure", [OSError(errno.EIO, "Input/output error"), MemoryError()])
+def test_a_robot_that_stands_has_its_pose_written_again_after_a_failure(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    call: str,
+    failure: Exception,
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(lastpose, "SYNC_S", 0.02)
+    monkeypatch.setattr(lastpose, "RETRY_S", 0.02)
+    failing, works, synced = threading.Event(), getattr(os, call), threading.Event()
+    fdatasync = os.fdatasync
+
+    def fails(*given: Any) -> Any:
+        if failing.is_set():
+            raise failure
+        return works(*given)
+
+    def sync(file: int) -> None:
+        (fails if call == "fdatasync" else fdatasync)(file)
+        synced.set()
+
+    monkeypatch.setattr(os, call, fails)
+    monkeypatch.setattr(os, "fdatasync", sync)
+    pose = LastPose(tmp_path)
+    pose.start()
+    failing.set()
+    pose.take(at(0.0, 1.0))
+    wait_for(lambda: pose.error)
+    time.sleep(0.1)  # several retries fail
+    assert not synced.is_set()
+    failing.clear()
+    wait_for(lambda: not pose.error)
+    assert synced.is_set()
+    assert LastPose(tmp_path).of_map(7) == (1.0, 2.0, 0.5)
+    wait_for(lambda: pose.busy_since is None)
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"], "said once, however often it failed"
+    pose.close()
 
 
 def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

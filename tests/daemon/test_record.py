@@ -126,6 +126,28 @@ def test_a_full_disk_is_counted_and_said_and_survived(
     assert caplog.text.count("recording goes on") == 1
 
 
+def test_memory_that_runs_out_is_counted_and_said_and_survived(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = writer(tmp_path)
+    write = disk._write_all
+
+    def none_left(file: int, data: bytes) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(disk, "_write_all", none_left)
+    out.put(Kind.RX, 0, 1.0, b"lost")
+    wait_for(lambda: out.lost == 1)
+    assert out.error.endswith("MemoryError()")
+    monkeypatch.setattr(disk, "_write_all", write)
+    wait_for(lambda: out.error == "")
+    out.put(Kind.RX, 0, 2.0, b"after")
+    wait_for(lambda: out.busy_since is None and out.records == 1)
+    out.close()
+    assert [frame.payload for frame in read(tmp_path)[0] if frame.kind == Kind.RX] == [b"after"]
+    assert caplog.text.count("has stopped") == 1
+
+
 def test_a_disk_that_hangs_costs_records_but_no_memory_and_no_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
