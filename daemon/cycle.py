@@ -335,7 +335,8 @@ class Cycle:
         """What may be said about the pose; a change goes to the log."""
         evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
         before, self.verdict = self.verdict, judge(self.verdict, evidence)
-        self.watch.on_verdict(t_mono, self.verdict, bool(self.lidar_ok(t_mono)))
+        compared = bool(self.lidar_ok(t_mono)) and self.observer.unused is None
+        self.watch.on_verdict(t_mono, self.verdict, compared)
         self.trust = self._trust(t_mono, evidence)
         if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
             meaning, remedy = REASONS[self.verdict.reason]

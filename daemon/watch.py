@@ -41,7 +41,7 @@ QUIET_S: Final = 10.0
 """As long without a scan that does not fit takes it back, too: without a witness TRACKING may not come for hours."""
 DISAGREE_S: Final = 1.0
 """Wheels and laser have to disagree for this long, as in the state machine."""
-ODD: Final = (State.RELOCATING, State.AMBIGUOUS, State.LOST)
+ODD: Final = (State.RELOCATING, State.AMBIGUOUS)
 
 
 class Watch:
@@ -96,7 +96,7 @@ class Watch:
         return hz < FEWER * max(self._usual_hz, min(LEAST_HZ, 1.0 / period))
 
     def on_verdict(self, t_mono: float, memory: Memory, scans: bool) -> None:
-        """A cycle has judged; ``scans``: they arrive."""
+        """A cycle has judged; ``scans``: they arrive and are compared with the map."""
         since = memory.disagree_since
         self.disagree = since is not None and t_mono - since >= DISAGREE_S
         self.misfit = self._at_odds(t_mono, memory, scans)
@@ -107,7 +107,7 @@ class Watch:
         self._known |= fits
         self._fits_since = (t_mono if self._fits_since is None else self._fits_since) if fits else None
         nowhere = memory.state is State.RELOCATING and memory.reason is Reason.SEARCHING
-        odd = (memory.reason is Reason.MATCH_FAILED or memory.state in ODD) if self._known else nowhere
+        odd = _odd(memory) if self._known else nowhere
         settled = self._fits_since is not None and t_mono - self._fits_since >= FITS_S
         if not scans or settled or not (self._known or nowhere):
             self._odd_since = None
@@ -118,3 +118,9 @@ class Watch:
             self._odd_since = None
         enough = MISFIT_S if self._known else NOWHERE_S
         return self._odd_since is not None and t_mono - self._odd_since >= enough
+
+
+def _odd(memory: Memory) -> bool:
+    """Whether the latest scans do not fit; a pose that is only too uncertain is lost without a scan at odds with it."""
+    lost = memory.state is State.LOST and memory.failed > 0
+    return memory.reason is Reason.MATCH_FAILED or memory.state in ODD or lost

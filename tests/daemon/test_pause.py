@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from daemon.budget import RecordedBudget
+from daemon.publish.snapshot import State
+from daemon.state_memory import Memory
 from daemon.worker import ScheduledWorker
 from estimator.records import Command, Order, Rung
 from estimator.result import Reason
@@ -38,6 +40,33 @@ def test_the_map_is_left_alone_and_the_laser_moves_nothing() -> None:
     asked = [order for records, _ in bench.estimate.calls for order in records if isinstance(order, Command)]
     assert asked == [], "the estimator is not concerned"
     assert any(r.result is not None and r.result.keyframe >= 0 for r in bench.records[ended:])
+
+
+def test_a_pose_that_is_lost_during_a_pause_is_no_laser_at_odds_with_the_map() -> None:
+    """No scan has been compared with anything: without wheels the pose has only become too uncertain."""
+    misfits: list[bool] = []
+    compared: list[bool] = []
+
+    async def paused_and_driven(bench: Bench) -> None:
+        on_verdict = bench.cycle.watch.on_verdict
+
+        def listen(t_mono: float, memory: Memory, scans: bool) -> None:
+            compared.append(scans)
+            on_verdict(t_mono, memory, scans)
+
+        bench.cycle.watch.on_verdict = listen  # type: ignore[method-assign]  # to see what it is told
+        await bench.drive(0, 60)
+        bench.cycle.inbox.put_command(Command(6.0, Order.PAUSE))
+        for begin in range(60, 240, 20):
+            await bench.drive(begin, 20)
+            misfits.append(bench.cycle.watch.misfit)
+
+    states = [snapshot.state for snapshot in on_bench(paused_and_driven).snapshots]
+    assert State.TRACKING in states
+    assert states[-30:] == [State.LOST] * 30
+    assert not any(misfits)
+    assert all(compared[1:55])
+    assert not any(compared[65:])
 
 
 def test_answers_that_came_during_a_pause_are_applied_after_it_and_a_replay_repeats_that() -> None:

@@ -104,6 +104,14 @@ def test_a_laser_at_odds_with_a_place_that_was_known() -> None:
     assert not judged(watch, 9.1, 11.0, FIT)
 
 
+@pytest.mark.parametrize("reason", [Reason.UNCERTAIN, Reason.NO_WITNESS])
+def test_a_pose_that_is_only_uncertain_is_no_laser_at_odds(reason: Reason) -> None:
+    watch = Watch()
+    assert not judged(watch, 0.0, 3.0, FIT)
+    assert not judged(watch, 3.1, 9.0, Memory(State.LOST, reason))
+    assert judged(watch, 9.1, 12.0, Memory(State.LOST, reason, failed=1))
+
+
 def test_wrong_ranges_that_fit_for_a_moment_are_wrong_all_the_same() -> None:
     watch = Watch()
     assert not judged(watch, 0.0, 3.0, FIT)
