@@ -191,6 +191,7 @@ def _keep_state(state: State, taken: Taken) -> Any:
 
 def _keep_atlas(atlas: Atlas, taken: Taken) -> Any:
     said = _fields_of(atlas)
+    said["submaps"] = taken.hold(atlas.submaps.copy())
     said["ties"] = taken.hold(atlas.ties.copy())
     return blank, (Atlas,), said, None, None, fill
 
