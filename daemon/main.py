@@ -164,8 +164,9 @@ class Daemon:
             for task in (stopped, warming):
                 await _stop(task)
             self.cycle.parts.worker.close()
-            if self.last_pose is not None:
-                self.last_pose.close()
+            for kept in (self.last_pose, self._world.sample_clock):
+                if kept is not None:
+                    kept.close()
             await saving
             if self._recorder is not None:
                 self._recorder.close(ended=stop.is_set())
@@ -304,9 +305,7 @@ class Daemon:
         if self.cycle.cycles == 0:
             self.cycle.announce()
             notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
-        failed = set(self.supervisor.failed)
-        if self._recorder is not None:
-            failed |= self._recorder.failing
+        failed = self.supervisor.failed | (set() if self._recorder is None else self._recorder.failing)
         if self.keeper.error:
             failed.add("map")
         if self.last_pose is not None and self.last_pose.error:
