@@ -53,6 +53,7 @@ class Fault(IntEnum):
     OVERRUNS = 302
     WORKER_FAILED = 303
     OVERLOADED = 304
+    PART_FAILED = 305
     PUBLISHER_FAILED = 401
     RECORDER_FAILED = 402
     MAP_NOT_SAVED = 403
@@ -167,6 +168,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "take load off the computer, or raise `cycle.budget_ms`; the stages' times are published",
     ),
     Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
+    Fault.PART_FAILED: (
+        "a part of the daemon has failed and is started again and again",
+        "read the log, which names it: is `odometry.port` taken by another program? a defect: please report it",
+    ),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
         "read the log; is the port taken by another program?",
@@ -377,6 +382,8 @@ STORE: Final = {
     "thread": Fault.THREAD_HANGS,
 }
 """Parts that keep things, and threads, by name, and what it means that they are down."""
+PUBLISHERS: Final = frozenset(["modbus", "modbus serial", "pose", "pose subscriptions", "stream", "publisher"])
+"""Parts that publish, by name, and what the cycle says of those that it calls."""
 
 
 def _outputs(now: Vitals) -> Iterable[Fault]:
@@ -385,5 +392,7 @@ def _outputs(now: Vitals) -> Iterable[Fault]:
     for part, fault in STORE.items():
         if part in now.failed:
             yield fault
-    if now.failed - {"recorder", *STORE}:
+    if now.failed & PUBLISHERS:
         yield Fault.PUBLISHER_FAILED
+    if now.failed - {"recorder", *STORE} - PUBLISHERS:
+        yield Fault.PART_FAILED

@@ -9,12 +9,14 @@ from dataclasses import replace
 import pytest
 
 from daemon import heartbeat as module
-from daemon.health import FAULTS, Fault, Vitals, assess, describe
+from daemon.condition import NAMES
+from daemon.health import FAULTS, PUBLISHERS, Fault, Vitals, assess, describe
 from daemon.heartbeat import Heartbeat
 from hal.clock import run_virtual
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused
 from hal.lidar import Link
 
+INPUTS = {"lidar", "photodiode", "odometry", "imu"}
 BEFORE = Vitals(0.0, link=Link.STREAMING)
 WELL = replace(BEFORE, t_mono=10.0, scans=400, cycles=400)
 
@@ -45,6 +47,8 @@ def test_all_is_well() -> None:
         ({"overruns": 30}, Fault.OVERRUNS),
         ({"jobs_failed": 1}, Fault.WORKER_FAILED),
         ({"failed": frozenset(["modbus"])}, Fault.PUBLISHER_FAILED),
+        ({"failed": frozenset(["publisher"])}, Fault.PUBLISHER_FAILED),
+        *(({"failed": frozenset([part])}, Fault.PART_FAILED) for part in sorted(INPUTS | {"stream beat"})),
         ({"failed": frozenset(["recorder"])}, Fault.RECORDER_FAILED),
         ({"failed": frozenset(["map"])}, Fault.MAP_NOT_SAVED),
         ({"failed": frozenset(["stored map"])}, Fault.MAP_REFUSED),
@@ -81,6 +85,10 @@ def test_the_gravest_comes_first() -> None:
 def test_missing_scans_of_a_lidar_that_is_down_are_no_fault_of_their_own() -> None:
     now = replace(WELL, link=Link.WAITING, error=DeviceMissing("/dev/ttyACM0", "gone"), missed=100)
     assert assess(now, BEFORE) == (Fault.LIDAR_MISSING,)
+
+
+def test_every_part_is_known_for_what_it_is() -> None:
+    assert NAMES.keys() - PUBLISHERS == INPUTS | {"map"}
 
 
 def test_every_fault_has_a_meaning_and_a_remedy() -> None:
@@ -209,6 +217,32 @@ def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
     run_virtual(go())
     assert len(seen) == 10
     assert max(seen) < 1e-6
+
+
+def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next_is_tried(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(module, "notify", lambda *words: said.extend(words))
+    beats = 0
+
+    def sample(lateness: float) -> Vitals:
+        nonlocal beats
+        beats += 1
+        if 3 <= beats <= 5 or beats == 8:
+            raise OSError(24, "Too many open files")
+        return Vitals(float(beats), cycles=beats)
+
+    async def go() -> None:
+        beating = asyncio.create_task(Heartbeat(sample, str).run())
+        await asyncio.sleep(10.5)
+        assert not beating.done()
+        beating.cancel()
+
+    run_virtual(go())
+    assert beats == 10
+    assert said == ["WATCHDOG=1"] * 6
+    assert caplog.text.count("a heartbeat has failed") == 2
 
 
 def test_cycles_that_leave_out_map_work_or_laser_are_a_fault_while_they_are_many() -> None:
