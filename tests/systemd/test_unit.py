@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from daemon.cli import USAGE
+
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "lumiloop.service"
 MOST_EXPOSED = 2.0
@@ -81,9 +83,10 @@ def test_both_units_share_user_and_cache() -> None:
         assert daemon[name] == warmup[name]
 
 
-def test_it_is_started_again_for_ever() -> None:
+def test_it_is_started_again_for_ever_but_not_with_a_configuration_that_is_wrong() -> None:
     told = dict(settings(UNIT))
     assert (told["StartLimitIntervalSec"], told["Restart"]) == ("0", "always")
+    assert told["RestartPreventExitStatus"] == str(USAGE)
 
 
 def test_devices_are_named_by_what_they_are() -> None:
