@@ -14,7 +14,7 @@ from hal.errors import DeviceMissing
 @pytest.mark.parametrize("name", ["robot..local", ".local", f"{64 * 'a'}.local"])
 def test_what_cannot_be_a_name_is_missing(name: str) -> None:
     assert inet.numeric(name, 5000) == []
-    with pytest.raises(DeviceMissing, match="not a host name .*63 characters"):
+    with pytest.raises(DeviceMissing, match=r"not a host name .*63 characters"):
         asyncio.run(inet.resolve(name, 5000))
 
 
