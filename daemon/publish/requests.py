@@ -126,7 +126,7 @@ class Responder:
             return ExceptionResponse(function, ExcCodes.ILLEGAL_ADDRESS)
         except (ValueError, IndexError, struct.error, ModbusException):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  whatever it is, the client is told, and the log
             self._failed(error)
             return ExceptionResponse(function, ExcCodes.DEVICE_FAILURE)
         return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)

@@ -114,15 +114,18 @@ def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.LogCapt
         return struct.pack(">HHHBBHHBHHiii", 9, 0, 23, 1, 16, 1000, 8, 16, number, 1, 0, 0, 0)
 
     async def run() -> None:
-        async with publishing(write=True, on_command=broken) as publisher:
-            async with tcp_client(publisher.port) as (reader, writer), udp_client(publisher.port) as (udp, datagrams):
-                writer.write(request(1, *BLOCK) * 3 + command(1) + request(2, *BLOCK) * 3)
-                answers = [await read_answer(reader) for _ in range(7)]
-                assert [answer[7:9] for answer in answers] == [b"\x04\x80"] * 3 + [b"\x90\x04"] + [b"\x04\x80"] * 3
-                udp.sendto(command(2))
-                await datagrams.wait_for(1)
-                assert datagrams.answers[0][7:] == b"\x90\x04"
-                assert publisher._age_s == 0.0
+        async with (
+            publishing(write=True, on_command=broken) as publisher,
+            tcp_client(publisher.port) as (reader, writer),
+            udp_client(publisher.port) as (udp, datagrams),
+        ):
+            writer.write(request(1, *BLOCK) * 3 + command(1) + request(2, *BLOCK) * 3)
+            answers = [await read_answer(reader) for _ in range(7)]
+            assert [answer[7:9] for answer in answers] == [b"\x04\x80"] * 3 + [b"\x90\x04"] + [b"\x04\x80"] * 3
+            udp.sendto(command(2))
+            await datagrams.wait_for(1)
+            assert datagrams.answers[0][7:] == b"\x90\x04"
+            assert publisher._age_s == 0.0
 
     asyncio.run(run())
     assert caplog.text.count("RuntimeError: a defect") == 1
