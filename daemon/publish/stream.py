@@ -301,25 +301,25 @@ class Client(asyncio.Protocol):
         """Take requests."""
         self._received += data
         if self._again is None:
-            self._take()
+            self._serve()
 
-    def _take(self) -> None:
+    def _serve(self) -> None:
         """Take a few requests; the others wait for a turn of their own, and nothing more is read until then."""
         self._again, share, more = None, self._server.share, True
         if share.begin():
             try:
-                more = self._take_some()
+                more = self._serve_some()
             finally:
                 share.end()
         if self._transport is None:
             return
         if more:
             self._transport.pause_reading()
-            self._again = share.later(self._take)
+            self._again = share.later(self._serve)
         else:
             self._transport.resume_reading()
 
-    def _take_some(self) -> bool:
+    def _serve_some(self) -> bool:
         """Returns whether there are more."""
         for _ in range(REQUESTS_PER_TURN):
             if not self._whole():
