@@ -66,6 +66,10 @@ def parse_endpoint(text: str) -> tuple[str, int]:
         raise ValueError(f"Expected a port from 1 to 65535, got `{text}`")
     if match["v6"] is not None and not is_address(match["v6"].partition("%")[0]):
         raise ValueError(f"Expected an IPv6 address in the brackets, got `{text}`")
+    if match["host"] is not None and not all(
+        0 < len(label) < 64 for label in match["host"].removesuffix(".").split(".")
+    ):
+        raise ValueError(f"Expected a host name of labels with 1 to 63 characters between its dots, got `{text}`")
     return match["v6"] or match["host"], port
 
 

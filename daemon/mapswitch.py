@@ -9,25 +9,23 @@ has changed.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
 import logging
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from daemon.store import Judge, Start, Store, said
 from daemon.store_file import BadMap
 from daemon.store_keeper import ADRIFT, DONE, FIXED, NO_MAP, Keeper
+from hal.beside import beside
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from estimator.state import State
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
 Told = Callable[[str], None]
 NOTHING_TO_SAVE: Final = (DONE, NO_MAP, FIXED, ADRIFT)
 
@@ -92,27 +90,6 @@ class Maps:
     keep: Callable[[str, bytes], None] | None = None
 
 
-async def _in_thread(work: Callable[[], T]) -> T:
-    """What a thread of its own makes of it."""
-    loop = asyncio.get_running_loop()
-    ended: asyncio.Future[T] = loop.create_future()
-
-    def end(settle: Callable[[], None]) -> None:
-        if not ended.done():
-            settle()
-
-    def run() -> None:
-        try:
-            settle = partial(ended.set_result, work())
-        except Exception as error:  # noqa: BLE001  raised again where it is awaited
-            settle = partial(ended.set_exception, error)
-        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
-            loop.call_soon_threadsafe(end, settle)
-
-    threading.Thread(target=run, name="lumiloop-switch", daemon=True).start()
-    return await ended
-
-
 class MapSwitch:
     """Carries out one switch after the other.
 
@@ -153,7 +130,7 @@ class MapSwitch:
         if map_id == self._keeper.map_id:
             return IN_USE
         try:
-            there = {one.map_id for one in await _in_thread(store.generations) if one.map_id >= 0}
+            there = {one.map_id for one in await beside(store.generations, "switch") if one.map_id >= 0}
         except OSError as error:
             return f"{store.folder}: {said(error)}"
         if map_id not in there:
@@ -162,7 +139,7 @@ class MapSwitch:
         if (reason := await self._saved()) not in NOTHING_TO_SAVE:
             return f"the map in use cannot be saved: {reason}"
         try:
-            switch = await _in_thread(partial(self._load, store, map_id))
+            switch = await beside(partial(self._load, store, map_id), "switch")
         except (BadMap, OSError) as error:
             return f"map {map_id:08x} cannot be used: {said(error) if isinstance(error, OSError) else error}"
         taken = asyncio.Event()

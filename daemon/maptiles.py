@@ -30,6 +30,9 @@ RESOLUTION_M: Final = 0.05
 JOBS: Final = 8
 """Pieces of work handed out in a row: some 20 ms each."""
 
+AGAIN_S: Final = 30.0
+"""Drawing that has failed, for lack of memory perhaps, is tried again after this long."""
+
 Tiles = dict[tuple[int, int], tuple[int, bytes]]
 """By column and row: the version a tile is of, and its cells, deflated."""
 
@@ -43,7 +46,8 @@ class MapTiles:
     """The tiles of the map in use.
 
     Attributes:
-        version: counts changes. tiles: all that have ever had something in them. error: why drawing has failed, empty.
+        version: counts changes. tiles: all that have ever had something in them. error: why drawing has failed, empty
+            where it has not.
     """
 
     def __init__(self, state: Callable[[], State | None], changed: Callable[[], None]) -> None:
@@ -57,17 +61,17 @@ class MapTiles:
         self._frames: dict[int, list[Keyframe]] = {}
         self._seen = 0
         self._busy = False
+        self._again = 0.0
         self._thread: ThreadPoolExecutor | None = None
 
     def follow(self, loop: AbstractEventLoop) -> None:
         """Look what is new, and have it drawn; in the loop's thread, now and then, while somebody watches."""
         state = self._state()
-        if state is None or self._busy or self.error:
+        if state is None or self._busy or (self.error and loop.time() < self._again):
             return
         self._look(state)
         live, adrift = self._live, _adrift(state)
         if live is not None and live.busy(adrift):
-            self._busy = True
             self._hand_out(live.task(adrift), adrift, JOBS, loop)
 
     @property
@@ -80,6 +84,7 @@ class MapTiles:
         if not self._busy:
             self.tiles, self._live, self._frames, self._seen = {}, None, {}, 0
             self.version += 1
+            self.error = ""
 
     def close(self) -> None:
         """Stop drawing, until it is followed again; idempotent."""
@@ -140,14 +145,16 @@ class MapTiles:
             try:
                 progress = advance(task)
                 done = progress, {tile: _packed(cells) for tile, cells in progress.tiles.items()}
-            except Exception:  # what is shown of the map must not harm who drives by it; told in full
-                log.exception("the map cannot be drawn for the stream")
+            except Exception:  # what is shown of the map must not harm who drives by it; told in full, once
+                if not self.error:
+                    log.exception("the map cannot be drawn for the stream; it is tried again every %.0f s", AGAIN_S)
             try:
                 loop.call_soon_threadsafe(self._take, live, done, adrift, left, loop)
             except RuntimeError:
                 return  # the loop has closed: nobody waits any more
 
         self._thread.submit(work)
+        self._busy = True
 
     def _take(
         self,
@@ -162,8 +169,9 @@ class MapTiles:
             return  # it was closed meanwhile
         self._busy = False
         if done is None:
-            self.error = "it cannot be drawn, see the log"
+            self.error, self._again = "it cannot be drawn, see the log", loop.time() + AGAIN_S
             return
+        self.error = ""
         progress, packed = done
         before = live.version
         live.take(progress)
@@ -174,7 +182,6 @@ class MapTiles:
                     self.tiles[tile] = self.version, cells
             self._changed()
         if left > 0 and live.busy(adrift):
-            self._busy = True
             self._hand_out(live.task(adrift), adrift, left - 1, loop)
 
 

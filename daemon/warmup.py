@@ -7,19 +7,19 @@ lock; and the daemon wants to go on talking to its devices meanwhile, hence the 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import fcntl
 import gc
 import hashlib
 import logging
 import sys
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+from hal.beside import beside
 
 if TYPE_CHECKING:
     from daemon.lights import Lights
@@ -59,10 +59,11 @@ class Warmth:
 async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | None = None) -> Warmth:
     """Load the estimator in a thread; ``progress`` gets a line every few seconds while kernels are being compiled.
 
+    A stop during the first start does not wait for the compiler.
     What belongs to light is loaded only where ``lights`` says that there is a photodiode.
     """
     begun = time.monotonic()
-    loading = _in_thread(load if lights is None else partial(load, lights))
+    loading = beside(load if lights is None else partial(load, lights), "warm-up")
     while not loading.done():
         await asyncio.wait([loading], timeout=REPORT_S)
         if not loading.done() and (line := _progress_line(time.monotonic() - begun, lights is not None)):
@@ -73,33 +74,6 @@ async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | N
     if warmth.compiled:
         progress(f"kernels compiled in {warmth.seconds:.0f} s; later starts load them in less than a second")
     return warmth
-
-
-def _in_thread(work: Callable[[], Warmth]) -> asyncio.Future[Warmth]:
-    """Run in a thread that dies with the process: a stop during the first start must not wait for the compiler."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[Warmth] = loop.create_future()
-
-    def run() -> None:
-        try:
-            outcome: Callable[[], None] = partial(_settle, done, work(), None)
-        except Exception as error:
-            log.debug("warm-up failed", exc_info=True)
-            outcome = partial(_settle, done, None, error)
-        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
-            loop.call_soon_threadsafe(outcome)
-
-    threading.Thread(target=run, name="lumiloop-warm-up", daemon=True).start()
-    return done
-
-
-def _settle(done: asyncio.Future[Warmth], warmth: Warmth | None, error: Exception | None) -> None:
-    if done.cancelled():
-        return
-    if warmth is not None:
-        done.set_result(warmth)
-    elif error is not None:
-        done.set_exception(error)
 
 
 def load(lights: Lights | None = None) -> Warmth:

@@ -266,6 +266,8 @@ def open_remote(name: str) -> RemoteBus:
             link = socket.create_connection(address, CONNECT_S)
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         link.settimeout(REPLY_S)
+    except UnicodeError as error:
+        raise DeviceMissing(name, "not a host name", "name the host by its IP address") from error
     except OSError as error:
         if link is not None:
             link.close()

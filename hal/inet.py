@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import socket
+from functools import partial
 from typing import Any, Final
 
+from hal.beside import beside
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 
 Address = tuple[socket.AddressFamily, tuple[str, int] | tuple[str, int, int, int]]
@@ -51,13 +52,21 @@ def _interface(host: str) -> tuple[str, int]:
     return bare, int(name) if name.isascii() and name.isdigit() else socket.if_nametoindex(name)
 
 
+def _interfaces() -> str:
+    """Names of this computer's network interfaces, or how to find them."""
+    try:
+        return ", ".join(name for _, name in socket.if_nameindex())
+    except OSError:  # the service manager's RestrictAddressFamilies= leaves netlink out
+        return "ip link"
+
+
 def numeric(host: str, port: int, flags: int = 0) -> list[Address]:
     """Addresses of a numeric host, without any look-up; none where it is a name, or names an interface not there."""
     try:
         bare, index = _interface(host)
         flags |= socket.AI_NUMERICHOST
         return _addresses(socket.getaddrinfo(bare or None, port, type=socket.SOCK_DGRAM, flags=flags), index)
-    except OSError:  # what getaddrinfo says of names is one, too
+    except (OSError, UnicodeError):  # what getaddrinfo says of names, and of what cannot be one
         return []
 
 
@@ -70,7 +79,7 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
         passive: whether the addresses are to be listened on.
 
     Raises:
-        DeviceMissing: the name is not known (now), or there is no such network interface.
+        DeviceMissing: the name is not known (now) or cannot be one, or there is no such network interface.
     """
     flags = socket.AI_PASSIVE if passive else 0
     if found := numeric(host, port, flags):
@@ -78,12 +87,14 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
     try:
         _interface(host)
     except OSError as error:
-        there = ", ".join(name for _, name in socket.if_nameindex())
         problem = f"no network interface {host.partition('%')[2]} on this computer"
-        raise DeviceMissing(f"{host}:{port}", problem, f"name one that there is: {there}") from error
-    loop = asyncio.get_running_loop()
+        raise DeviceMissing(f"{host}:{port}", problem, f"name one that there is: {_interfaces()}") from error
+    look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_DGRAM, flags=flags)
     try:
-        return _addresses(await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=flags))
+        return _addresses(await beside(look_up, "names"))
+    except UnicodeError as error:
+        remedy = "its labels, between dots, have 1 to 63 characters each"
+        raise DeviceMissing(f"{host}:{port}", "not a host name", remedy) from error
     except socket.gaierror as error:
         remedy = "write a numeric address, or make the name resolvable on this computer"
         raise DeviceMissing(f"{host}:{port}", f"host name not known: {error.strerror}", remedy) from error

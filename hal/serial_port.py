@@ -13,10 +13,12 @@ import grp
 import os
 import stat
 import termios
+from functools import partial
 from pathlib import Path
 
 import serial
 
+from hal.beside import beside
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.port import OnData, OnLost
@@ -116,12 +118,12 @@ class SerialPort:
 async def open_serial_port(device: str, baud: int, clock: Clock | None = None, style: str = "8N1") -> SerialPort:
     """Open ``device`` exclusively (advisory lock), raw, without flow control; ``style``: bits, parity, stop bits.
 
-    The kernel may block in ``open`` for seconds when a USB device is wedged, so that one call runs outside the loop.
+    The kernel may block in ``open`` for seconds when a USB device is wedged, so that one call runs beside the loop.
 
     Raises:
         DeviceMissing: nothing there. DeviceRefused: permission, busy, not a serial port, impossible rate.
     """
-    opening = asyncio.ensure_future(asyncio.to_thread(_open_line, device, baud, style))
+    opening = beside(partial(_open_line, device, baud, style), "open")
     try:
         line = await asyncio.shield(opening)
     except asyncio.CancelledError:

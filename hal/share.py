@@ -77,8 +77,10 @@ class Reader:
 
     def _read(self) -> None:
         if self._share.begin():
-            self._serve()
-            self._share.end()
+            try:
+                self._serve()
+            finally:
+                self._share.end()
         else:
             self._loop.remove_reader(self._fd)
             self._waiting = self._share.later(self._again)

@@ -9,6 +9,7 @@ import socket
 from typing import Final
 from urllib.parse import urlsplit
 
+from hal import inet
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.port import OnData, OnLost
@@ -120,19 +121,39 @@ async def open_tcp_port(device: str, clock: Clock | None = None) -> TcpPort:
     port = TcpPort(device, clock or SystemClock())
     try:
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
-            await asyncio.get_running_loop().create_connection(lambda: port, host, number)
+            await _connect(port, await _resolved(device, host, number))
     except TimeoutError as error:
         raise DeviceMissing(
             device, f"no answer within {CONNECT_TIMEOUT_S:g} s", "check power, cable, address and this host's netmask"
         ) from error
     except OSError as error:
-        raise _explain(device, host, error) from error
+        raise _explain(device, error) from error
     return port
 
 
-def _explain(device: str, host: str, error: OSError) -> HalError:
-    if isinstance(error, socket.gaierror):
-        return DeviceMissing(device, f"host name {host} is not known", "name the sensor by its IP address")
+async def _resolved(device: str, host: str, number: int) -> list[inet.Address]:
+    try:
+        return await inet.resolve(host, number)
+    except DeviceMissing as error:
+        raise DeviceMissing(device, f"{host}: {error.problem}", "name the sensor by its IP address") from error
+
+
+async def _connect(port: TcpPort, addresses: list[inet.Address]) -> None:
+    """To the first address that can be reached; raises what the last one has said."""
+    problem = OSError("no address")
+    for address in addresses:
+        host, interface = address[1][0], inet.scope(address)
+        try:
+            name = f"{host}%{interface}" if interface else host
+            await asyncio.get_running_loop().create_connection(lambda: port, name, address[1][1])
+        except OSError as error:
+            problem = error
+        else:
+            return
+    raise problem
+
+
+def _explain(device: str, error: OSError) -> HalError:
     if error.errno == errno.ECONNREFUSED:
         return DeviceRefused(device, "connection refused", "a sensor serves one client: stop the other, check the port")
     reason = os.strerror(error.errno) if error.errno else str(error)

@@ -63,6 +63,8 @@ class Reader:
             family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._sock = socket.socket(family, kind)
             self._sock.connect(address)
+        except UnicodeError as error:
+            raise NoAnswer(f"{self._where}: not a host name; check the address") from error
         except OSError as error:
             raise NoAnswer(f"{self._where}: {error.strerror or error}; check the address") from error
         self._sock.settimeout(_TIMEOUT_S)

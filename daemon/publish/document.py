@@ -264,6 +264,7 @@ def _limits() -> str:
         ("registers in one write", str(requests.MAX_WRITE), "exception 3"),
         ("address outside the tables", "", "exception 2"),
         ("any other function", "", "exception 1"),
+        ("an error of the daemon's own, which its log tells", "", "exception 4"),
         ("TCP connections", str(modbus.MAX_CONNECTIONS),
          f"the longest idle is dropped if idle for {modbus.EVICT_S:g} s, else the new one"),
         ("TCP without a request", f"{modbus.IDLE_S:g} s", "closed"),

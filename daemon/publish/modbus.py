@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 from collections import deque
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from daemon.publish.requests import BLOCKS, MAX_FRAME, Responder, frame_size
 from daemon.publish.snapshot import Snapshot, State
 from hal import inet
 from hal.arrival import STAMP_SPACE, kernel_age, stamp_arrivals
+from hal.asked import ASKED_SPACE, Source, asked_at, send_from, tell_asked
 from hal.clock import Clock
 from hal.inputs import Continuity
 from hal.odometry import RawOdometry
@@ -43,6 +45,7 @@ _WRITE_HIGH: Final = 16 * 1024
 _READ_HIGH: Final = 16 * 1024
 _RECEIVE_BUFFER: Final = 256 * 1024
 
+log = logging.getLogger(__name__)
 
 Allowed = Callable[[str], bool]
 
@@ -79,8 +82,12 @@ class UdpEndpoint:
         """``on_age``: told before each request how long ago the kernel received it, and 0 after the last."""
         self._sock = sock
         self._on_age = on_age
+        self._space = 0  # for what the kernel tells about a datagram
         if on_age is not None:
             stamp_arrivals(sock)
+            self._space += STAMP_SPACE
+        if tell_asked(sock):
+            self._space += ASKED_SPACE
         self._allowed = allowed
         self._responder = responder
         self._counts = counts
@@ -92,18 +99,23 @@ class UdpEndpoint:
         self._sock.close()
 
     def _serve(self) -> None:
-        self._serve_some()
-        if self._on_age is not None:
-            self._on_age(0.0)
+        try:
+            self._serve_some()
+        finally:
+            if self._on_age is not None:
+                self._on_age(0.0)
 
     def _serve_some(self) -> None:
         for _ in range(UDP_PER_TURN):
+            source: Source = ()
             try:
-                if self._on_age is None:
-                    frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
+                if self._space:
+                    frame, told, _, peer = self._sock.recvmsg(MAX_FRAME + 1, self._space)
+                    source = asked_at(told)
+                    if self._on_age is not None:
+                        self._on_age(kernel_age(told))
                 else:
-                    frame, stamp, _, peer = self._sock.recvmsg(MAX_FRAME + 1, STAMP_SPACE)
-                    self._on_age(kernel_age(stamp))
+                    frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
             except OSError:  # nothing more, or the network's complaint about an earlier answer
                 return
             if not self._allowed(peer[0]):
@@ -112,8 +124,9 @@ class UdpEndpoint:
                 self._counts.malformed += 1
                 continue
             self._counts.requests += 1
+            answer = self._responder.answer(frame)
             try:
-                self._sock.sendto(self._responder.answer(frame), peer)
+                send_from(self._sock, answer, source, peer)
             except OSError:
                 self._counts.unsent += 1
 
@@ -155,11 +168,13 @@ class Connection(asyncio.Protocol):
         self._heard = self._loop.time()
         share, transport = self._server.share, self._transport
         if share.begin():
-            if not self.waiting and self.serve(1):
-                self._server.wait(self)
-            elif len(self._buffer) > _READ_HIGH and transport is not None:
-                transport.pause_reading()
-            share.end()
+            try:
+                if not self.waiting and self.serve(1):
+                    self._server.wait(self)
+                elif len(self._buffer) > _READ_HIGH and transport is not None:
+                    transport.pause_reading()
+            finally:
+                share.end()
         elif transport is not None:
             transport.pause_reading()
             if not self.waiting:
@@ -285,12 +300,21 @@ class TcpEndpoint:
         connections = min(len(self._waiting), TCP_WAITING_PER_TURN)
         for _ in range(connections):
             connection = self._waiting.popleft()
-            connection.waiting = connection.serve(TCP_WAITING_PER_TURN // connections)
+            connection.waiting = self._served(connection, TCP_WAITING_PER_TURN // connections)
             if connection.waiting:
                 self._waiting.append(connection)
         if self._waiting:
             self._loop.call_soon(self._serve_waiting)
         self.share.end()
+
+    def _served(self, connection: Connection, most: int) -> bool:
+        """As :meth:`Connection.serve`; one that cannot be served is closed, and the others still have their turn."""
+        try:
+            return connection.serve(most)
+        except Exception:
+            log.exception("a Modbus client cannot be served; it is disconnected")
+            connection.abort()
+            return False
 
     def _sweep(self) -> None:
         now = self._loop.time()

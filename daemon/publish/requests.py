@@ -10,6 +10,7 @@ Answered: 3 and 4 (read holding, read input registers: both show the published b
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Callable
 from typing import Final
@@ -41,6 +42,8 @@ WRITE_SINGLE: Final = 6
 WRITE_MULTIPLE: Final = 16
 MAX_READ: Final = 125
 MAX_WRITE: Final = 123
+
+log = logging.getLogger(__name__)
 
 _READ: Final = struct.Struct(">HHHBBHH")
 _READ_ANSWER: Final = struct.Struct(">HHHBBB")
@@ -76,6 +79,7 @@ class Responder:
         self._block = b""
         self._make: tuple[Make, ...] = ()
         self._made: dict[int, bytes] = {}
+        self._told = ""
 
     def show(self, block: bytes, *beside: Make) -> None:
         """Put all blocks in place at once: no answer ever mixes two snapshots.
@@ -122,7 +126,16 @@ class Responder:
             return ExceptionResponse(function, ExcCodes.ILLEGAL_ADDRESS)
         except (ValueError, IndexError, struct.error, ModbusException):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
+        except Exception as error:  # noqa: BLE001  whatever it is, the client is told, and the log
+            self._failed(error)
+            return ExceptionResponse(function, ExcCodes.DEVICE_FAILURE)
         return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
+
+    def _failed(self, error: Exception) -> None:
+        """A defect of ours is told in full; once, as clients ask again and again."""
+        if repr(error) != self._told:
+            self._told = repr(error)
+            log.error("a Modbus request cannot be answered; its client is told exception 4", exc_info=error)
 
     def _read(self, function: int, body: bytes) -> ModbusPDU:
         holding = function == READ_HOLDING

@@ -5,7 +5,7 @@
 * What the line sends back of our own answers (adapters with echo) is no request.
 * A request for which this computer had no time until its master has given up is neither carried out nor answered: the
   answer would collide with the master's next request.
-* Nothing waits: an answer that the line does not take is dropped, and the line is opened anew.
+* Nothing waits: an answer that the line does not take is dropped, and after three in a row the line is opened anew.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ TURN_S: Final = 0.05
 """The loop tells this often that it has time for the line."""
 STRAY: Final = 2
 """Bytes that a line driver may add where the direction changes; more of them are the master's next request."""
+UNSENT: Final = 3
+"""Answers in a row that a line does not take, until it is opened anew: its adapter is wedged."""
 _FAST: Final = 19200
 _FAST_GAP_S: Final = 0.00175
 _CHARACTER: Final = 11.0  # bits
@@ -79,6 +81,8 @@ class RtuServer:
         self._answer = answer
         self._opener = opener
         self._port: Port | None = None
+        self._lost: asyncio.Future[HalError] | None = None
+        self._untaken = 0  # answers in a row
         self._heard = 0.0
         self._sent = b""
         self._echo_until = 0.0
@@ -90,14 +94,14 @@ class RtuServer:
         """Serve until cancelled.
 
         Raises:
-            HalError: the line cannot be opened, or has gone.
+            HalError: the line cannot be opened, has gone, or takes no answers.
         """
-        lost: asyncio.Future[HalError] = asyncio.get_running_loop().create_future()
+        self._lost, self._untaken = asyncio.get_running_loop().create_future(), 0
         self._port = await self._opener(self._line.path, self._line.baud, style=self._line.format)
         try:
             self._turns()
-            self._port.start(self._take, lost.set_result)
-            raise await lost
+            self._port.start(self._take, self._end)
+            raise await self._lost
         finally:
             for timer in (self._going, self._turn):
                 if timer is not None:
@@ -105,6 +109,10 @@ class RtuServer:
             self.frames.forget()
             self._port.close()
             self._port = None
+
+    def _end(self, error: HalError) -> None:
+        if self._lost is not None and not self._lost.done():
+            self._lost.set_result(error)
 
     def _turns(self) -> None:
         """Whatever comes after this was not there before it."""
@@ -152,8 +160,12 @@ class RtuServer:
             return
         try:
             self._port.write(frame)
-        except HalError:
-            self.unsent += 1  # a line that is gone tells so itself
+        except HalError as error:
+            self.unsent += 1
+            self._untaken += 1
+            if self._untaken == UNSENT:
+                self._end(error)
             return
+        self._untaken = 0
         self._sent = frame
         self._echo_until = now + _CHARACTER * len(frame) / self._line.baud + ECHO_S

@@ -26,6 +26,7 @@ from daemon.publish.snapshot import Snapshot
 from hal.adc import RawSamples
 from hal.errors import DeviceRefused
 from hal.lidar import VALID, RawScan
+from hal.share import Share
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +65,8 @@ UNIT: Final = 0.1
 BUFFER_BYTES: Final = 256 << 10
 """Bytes that may wait in this process for one client, and one frame."""
 LONGEST_REQUEST: Final = 4096
+REQUESTS_PER_TURN: Final = 4
+"""Of one client; each may want the whole map anew."""
 STUCK_S: Final = 60.0
 """A client that has taken nothing for so long is let go."""
 
@@ -100,7 +103,7 @@ class StreamServer:
     """Serves the stream at a path in the file system.
 
     Attributes:
-        clients: that are connected. tiles: of the map; None: there are none.
+        clients: that are connected. tiles: of the map; None: there are none. share: of the loop's time, for requests.
         place: where a keyframe lies in the map, by ID; None: it is not known.
 
     Args:
@@ -117,6 +120,7 @@ class StreamServer:
         self._faults: list[dict[str, object]] = []
         self.tiles: MapTiles | None = None
         self.place: Place = _nowhere
+        self.share = Share()
 
     async def run(self) -> None:
         """Serve until cancelled.
@@ -221,7 +225,7 @@ class StreamServer:
 
     def show(self, client: Client) -> None:
         """Send the tiles that a client has not seen yet, as far as it takes them."""
-        tiles = [] if self.tiles is None else self.tiles.since(client.shown)
+        tiles = [] if self.tiles is None or client.stuck else self.tiles.since(client.shown)
         while tiles and not client.stuck:
             size = count = 0
             while count < len(tiles) and size < TILE_BYTES:
@@ -262,7 +266,8 @@ class Client(asyncio.Protocol):
         self.replaced = 0
         self._server = server
         self._transport: asyncio.Transport | None = None
-        self._received = b""
+        self._received = bytearray()
+        self._again: asyncio.TimerHandle | None = None
         self._latest: dict[str, bytes] = {}
         self._events: deque[tuple[str, bytes]] = deque(maxlen=KEPT)
         self._raw: deque[tuple[str, bytes]] = deque(maxlen=RAW_KEPT)
@@ -288,21 +293,52 @@ class Client(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget it."""
         self._server.clients.discard(self)
-        if self._stuck is not None:
-            self._stuck.cancel()
+        for timer in (self._stuck, self._again):
+            if timer is not None:
+                timer.cancel()
 
     def data_received(self, data: bytes) -> None:
         """Take requests."""
         self._received += data
-        while len(self._received) >= 4:
-            length = int.from_bytes(self._received[:4], "little")
-            if length > LONGEST_REQUEST:
-                self._refuse(f"a request of {length} bytes; the longest is {LONGEST_REQUEST}")
-                return
-            if len(self._received) < 4 + length:
-                return
-            body, self._received = self._received[4 : 4 + length], self._received[4 + length :]
+        if self._again is None:
+            self._serve()
+
+    def _serve(self) -> None:
+        """Take a few requests; the others wait for a turn of their own, and nothing more is read until then."""
+        self._again, share, more = None, self._server.share, True
+        if share.begin():
+            try:
+                more = self._serve_some()
+            finally:
+                share.end()
+        if self._transport is None:
+            return
+        if more:
+            self._transport.pause_reading()
+            self._again = share.later(self._serve)
+        else:
+            self._transport.resume_reading()
+
+    def _serve_some(self) -> bool:
+        """Returns whether there are more."""
+        for _ in range(REQUESTS_PER_TURN):
+            if not self._whole():
+                return False
+            end = 4 + int.from_bytes(self._received[:4], "little")
+            body = bytes(self._received[4:end])
+            del self._received[:end]
             self._ask(body)
+        return self._whole()
+
+    def _whole(self) -> bool:
+        """Whether a whole request is there."""
+        if len(self._received) < 4:
+            return False
+        length = int.from_bytes(self._received[:4], "little")
+        if length > LONGEST_REQUEST:
+            self._refuse(f"a request of {length} bytes; the longest is {LONGEST_REQUEST}")
+            return False
+        return len(self._received) >= 4 + length
 
     def pause_writing(self) -> None:
         """It does not take what it has asked for."""
@@ -358,6 +394,7 @@ class Client(asyncio.Protocol):
 
     def _refuse(self, text: str) -> None:
         self.wants = frozenset()
+        self._received.clear()
         if self._transport is not None:
             self._transport.write(framed({"topic": "error", "text": text}))
             self._transport.close()

@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from daemon.logs import Sparing
 from hal import inet
+from hal.asked import ASKED_SPACE, Source, asked_at, send_from, tell_asked
 from hal.share import Reader, Share
 
 MAGIC: Final = b"LUSB"
@@ -86,6 +87,8 @@ def decode(data: bytes) -> Message:
 class Leases:
     """Who is subscribed until when. Pure: told the time, sends nothing.
 
+    A peer is whatever tells one from another: address, and that of ours which was asked.
+
     Attributes:
         refused: requests that came while the house was full.
     """
@@ -147,6 +150,7 @@ class Subscriptions:
         self._wanted = port
         self._allowed = allowed
         self._sock: socket.socket | None = None
+        self._space = 0  # for what the kernel tells about a datagram
         self._reader: Reader | None = None
         self._lines = Sparing(log, lines=1)  # one who comes and goes all the time must not fill the log
 
@@ -167,6 +171,7 @@ class Subscriptions:
         except OSError as error:
             device = f"pose subscriptions on {self._bind}:{self._wanted}"
             raise inet.refusal(device, "pose.receivers", self._wanted, error) from error
+        self._space = ASKED_SPACE if tell_asked(self._sock) else 0
         self._reader = Reader(self._sock.fileno(), partial(self._serve, self._sock), Share())
 
     async def close(self) -> None:
@@ -181,12 +186,12 @@ class Subscriptions:
         """Send to every subscriber; never waits."""
         if self._sock is None or not len(self.leases):
             return
-        for peer in self.leases.peers(asyncio.get_running_loop().time()):
-            self._send(self._sock, data, peer)
+        for peer, source in self.leases.peers(asyncio.get_running_loop().time()):
+            self._send(self._sock, data, peer, source)
 
-    def _send(self, sock: socket.socket, data: bytes, peer: Any) -> None:
+    def _send(self, sock: socket.socket, data: bytes, peer: Any, source: Source) -> None:
         try:
-            sock.sendto(data, peer)
+            send_from(sock, data, source, peer)
         except OSError:
             self.dropped += 1
         else:
@@ -196,7 +201,7 @@ class Subscriptions:
         now = asyncio.get_running_loop().time()
         for _ in range(_PER_TURN):
             try:
-                data, peer = sock.recvfrom(SIZE + 1)
+                data, told, _, peer = sock.recvmsg(SIZE + 1, self._space)
             except OSError:  # nothing more, or the network's complaint about an earlier datagram
                 return
             if not self._allowed(peer[0]):
@@ -206,9 +211,9 @@ class Subscriptions:
             except ValueError:
                 self.malformed += 1
                 continue
-            before = len(self.leases)
-            if (answer := self.leases.answer(peer, message, now)) is not None:
-                self._send(sock, encode(answer), peer)
+            before, source = len(self.leases), asked_at(told)
+            if (answer := self.leases.answer((peer, source), message, now)) is not None:
+                self._send(sock, encode(answer), peer, source)
             if (count := len(self.leases)) != before:
                 last = f"last heard of {peer[0]}:{peer[1]}"
                 self._lines.say(now, logging.INFO, f"pose datagrams: {count} subscribers, {last}")

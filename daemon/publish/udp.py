@@ -142,4 +142,7 @@ class PoseSender:
                 if receiver.address is None:
                     self._lost(receiver, error.problem)
                 pause = RETRY_S
+            except Exception:  # such as no thread left: the receiver is not to be given up for that
+                log.exception("pose receiver %s cannot be looked up; it is tried again", receiver.name)
+                pause = RETRY_S
             await asyncio.sleep(pause)

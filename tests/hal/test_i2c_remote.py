@@ -379,6 +379,8 @@ def test_why_there_is_no_connection(tmp_path: Path) -> None:
         open_remote(f"unix:{tmp_path}/none")
     with pytest.raises(DeviceMissing, match="host name is not known"):
         open_remote("tcp://no-such-host.invalid:1")
+    with pytest.raises(DeviceMissing, match="not a host name"):
+        open_remote("tcp://robot..local:1")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     with pytest.raises(DeviceMissing, match="no bus server there"):

@@ -8,6 +8,7 @@ import socket
 
 import pytest
 
+from hal import inet
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.opening import open_port
 from hal.tcp_port import TcpPort, parse_tcp_name
@@ -109,7 +110,6 @@ def test_bad_names(name: str) -> None:
 @pytest.mark.parametrize(
     ("error", "kind", "words"),
     [
-        (socket.gaierror(-2, "Name or service not known"), DeviceMissing, "host name lidar is not known"),
         (OSError(errno.EHOSTUNREACH, "Connect call failed"), DeviceMissing, "No route to host (check power"),
         (OSError("Multiple exceptions: a, b"), DeviceMissing, "Multiple exceptions: a, b"),
         (OSError(errno.ECONNREFUSED, "Connect call failed"), DeviceRefused, "a sensor serves one client"),
@@ -122,8 +122,30 @@ def test_connect_errors(error: OSError, kind: type[HalError], words: str, monkey
 
         monkeypatch.setattr(asyncio.get_running_loop(), "create_connection", fails)
         with pytest.raises(kind) as caught:
-            await open_port("tcp://lidar", 0)
+            await open_port("tcp://192.0.2.7", 0)
         assert words in str(caught.value)
-        assert caught.value.device == "tcp://lidar"
+        assert caught.value.device == "tcp://192.0.2.7"
+
+    asyncio.run(body())
+
+
+@pytest.mark.parametrize("name", ["robot..local", "no-such-host.invalid", f"{64 * 'a'}.local"])
+def test_a_name_that_is_not_known_or_cannot_be_one_is_missing(name: str) -> None:
+    with pytest.raises(DeviceMissing, match=rf"tcp://{name}: {name}: (not a host name|host name not known)"):
+        asyncio.run(open_port(f"tcp://{name}", 0))
+
+
+def test_the_next_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body() -> None:
+        server = await asyncio.start_server(lambda r, w: w.close(), "127.0.0.1", 0)
+        number = server.sockets[0].getsockname()[1]
+
+        async def resolve(host: str, port: int) -> list[inet.Address]:
+            return [(socket.AF_INET, (address, port)) for address in ("127.0.0.77", "127.0.0.1")]
+
+        monkeypatch.setattr(inet, "resolve", resolve)
+        (await open_port(f"tcp://lidar:{number}", 0)).close()
+        server.close()
+        await server.wait_closed()
 
     asyncio.run(body())

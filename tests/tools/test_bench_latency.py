@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import shutil
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tools.bench import latency
+from hal.beside import beside
+from tools.bench import _readers, latency
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
 
@@ -47,3 +52,66 @@ def test_what_is_missed_shows() -> None:
         "cycles, alone: late, p99", "p99.9 of all cycles over the bare loop's",
         "p99, loaded over alone", "scans missed",
     }  # fmt: skip
+
+
+class Echo(asyncio.DatagramProtocol):
+    """Answers every request, with as many bytes as the daemon; tells at which it is."""
+
+    def __init__(self, on_request: Callable[[int], None]) -> None:
+        self.requests = 0
+        self._on_request = on_request
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport: Any = transport
+
+    def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
+        self.requests += 1
+        self._transport.sendto(bytes(9 + 2 * _readers.REGISTERS), addr)
+        self._on_request(self.requests)
+
+
+async def echoing(on_request: Callable[[int], None]) -> tuple[asyncio.DatagramTransport, Echo, int]:
+    made = await asyncio.get_running_loop().create_datagram_endpoint(
+        lambda: Echo(on_request), local_addr=("127.0.0.1", 0)
+    )
+    return *made, int(made[0].get_extra_info("sockname")[1])
+
+
+def test_readers_that_are_told_to_end_ask_no_more() -> None:
+    """In the middle of a round."""
+    last = 2 * _readers.CLIENTS + 2
+
+    def end(number: int) -> None:
+        if number == last:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    async def run() -> tuple[int, int]:
+        transport, _, port = await echoing(end)
+        counts = await asyncio.wait_for(_readers.go(port), 20.0)
+        transport.close()
+        await asyncio.sleep(0)
+        return counts
+
+    asked, answered = asyncio.run(run())
+    assert asked == answered
+    assert last <= asked <= last + 2
+
+
+def test_the_load_asks_only_while_it_is_served(tmp_path: Path) -> None:
+    path = str(tmp_path / "stream")
+
+    async def run() -> tuple[tuple[int, int], int]:
+        asked = asyncio.Event()
+        transport, echo, port = await echoing(lambda number: asked.set())
+        server = await asyncio.start_unix_server(lambda reader, writer: writer.close(), path)
+        load = latency.Load(port, path)
+        load.turn(True)
+        await asyncio.wait_for(asked.wait(), 20.0)
+        counts = await beside(load.end, "end")
+        transport.close()
+        server.close()
+        await server.wait_closed()
+        return counts, echo.requests
+
+    (asked, answered), requests = asyncio.run(run())
+    assert asked == answered == requests > 0

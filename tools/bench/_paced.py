@@ -2,6 +2,8 @@
 
     python -m tools.bench._paced TELL        one JSON object with what is wanted; the outcome goes to standard output
 
+When the drive is over it says so and waits for a line, or the end, of standard input: who asks it ends before it does.
+
 It is the whole of `daemon.main.Daemon`, publishers and threads included; only the sensors' wires are left out. In turn
 for a while it runs *alone*, and then *loaded*: readers and a stuck client (the parent's), and the graph of 1000 submaps
 being solved without a pause (its own).
@@ -34,6 +36,7 @@ from estimator.closing import solve_graph
 from estimator.pipeline import new_state
 from estimator.records import Answer, Job
 from hal.adc import AdcStatus, RawSamples
+from hal.beside import beside
 from hal.clock import Clock, SystemClock
 from hal.i2c import BusOpener
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
@@ -147,6 +150,8 @@ class Feeder:
         clock.close()
         self._turn("")
         self.told.missed, self.told.scans = daemon.cycle.inbox.dropped, self._number
+        os.write(1, b"ended\n")
+        await beside(sys.stdin.readline, "parent")
         self.stop.set()
         await asyncio.Event().wait()
 

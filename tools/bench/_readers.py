@@ -14,6 +14,7 @@ from typing import Final
 CLIENTS: Final = 8
 RATE_HZ: Final = 100.0
 REGISTERS: Final = 64
+PATIENCE_S: Final = 1.0
 
 
 class Client(asyncio.DatagramProtocol):
@@ -36,6 +37,8 @@ async def go(port: int) -> tuple[int, int]:
     begun, turn = loop.time(), 0
     while not stop.is_set():
         for transport, client in clients:
+            if stop.is_set():
+                break
             client.asked += 1
             transport.sendto(struct.pack(">HHHBBHH", client.asked & 0xFFFF, 0, 6, 1, 4, 0, REGISTERS))
             await asyncio.sleep(1.0 / RATE_HZ / CLIENTS / 2)
@@ -44,8 +47,12 @@ async def go(port: int) -> tuple[int, int]:
         if now - begun > turn / RATE_HZ + 0.5:
             begun, turn = now, 0  # it was stopped for a while
         await asyncio.sleep(max(0.0, begun + turn / RATE_HZ - now))
-    await asyncio.sleep(0.2)
-    return sum(client.asked for _, client in clients), sum(client.answered for _, client in clients)
+    asked, until = sum(client.asked for _, client in clients), loop.time() + PATIENCE_S
+    while sum(client.answered for _, client in clients) < asked and loop.time() < until:  # noqa: ASYNC110
+        await asyncio.sleep(0.01)
+    for transport, _ in clients:
+        transport.close()
+    return asked, sum(client.answered for _, client in clients)
 
 
 def main() -> None:

@@ -139,17 +139,23 @@ def paced(folder: Path, drive: Path, fifo: bool, turns: int) -> dict[str, Any]:
             "receiver": f"127.0.0.1:{sink.getsockname()[1]}", "stretch_s": STRETCH_S,
         }  # fmt: skip
         command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
-        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes, text=True))
         undo.callback(child.kill)
         load = Load(modbus, stream)
         undo.callback(load._readers.kill)
+        assert child.stdin is not None
         assert child.stdout is not None
+        asked = answered = 0
         for line in child.stdout:
             if line.startswith("told "):
-                asked, answered = load.end()
                 child.wait(30.0)
                 return json.loads(line[5:]) | {"asked": asked, "answered": answered}
-            load.turn(line.strip() == "loaded")
+            if line.strip() == "ended":  # it still serves: what is asked until now is answered
+                asked, answered = load.end()
+                child.stdin.close()
+            else:
+                load.turn(line.strip() == "loaded")
     raise CannotRun("the daemon ended before its time; its log says why")
 
 

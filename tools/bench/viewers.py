@@ -85,7 +85,8 @@ def paced(folder: Path, turns: int) -> dict[str, Any]:
         page = Page(stream)
         undo.callback(page.kill)
         command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
-        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
+        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE}
+        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes, text=True))
         undo.callback(child.kill)
         assert child.stdout is not None
         on = False

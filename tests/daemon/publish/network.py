@@ -61,9 +61,9 @@ class Datagrams(asyncio.DatagramProtocol):
 
 
 @contextlib.asynccontextmanager
-async def udp_client(port: int) -> AsyncIterator[tuple[asyncio.DatagramTransport, Datagrams]]:
+async def udp_client(port: int, host: str = "127.0.0.1") -> AsyncIterator[tuple[asyncio.DatagramTransport, Datagrams]]:
     loop = asyncio.get_running_loop()
-    transport, protocol = await loop.create_datagram_endpoint(Datagrams, remote_addr=("127.0.0.1", port))
+    transport, protocol = await loop.create_datagram_endpoint(Datagrams, remote_addr=(host, port))
     try:
         yield transport, protocol
     finally:

@@ -260,8 +260,9 @@ def test_modbus_switched_off(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("no-such-host.invalid") == 1
-    assert "check the address" in capsys.readouterr().err
+    for host in ("no-such-host.invalid", "robot..local"):
+        assert status(host) == 1
+        assert "check the address" in capsys.readouterr().err
 
 
 def test_watching_shows_when_the_daemon_is_away(

@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import socket
+import struct
 
 import pytest
 from pymodbus.client import AsyncModbusUdpClient
@@ -13,6 +14,7 @@ from pymodbus.client import AsyncModbusUdpClient
 from daemon.publish import registers
 from daemon.publish.modbus import ModbusPublisher
 from hal import inet
+from hal.asked import asked_at
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing, DeviceRefused
 from tests.daemon.publish.network import (
@@ -92,6 +94,34 @@ def test_ipv6_and_all_addresses() -> None:
             await publisher.close()
 
     asyncio.run(run())
+
+
+def test_every_address_of_a_computer_answers_for_itself() -> None:
+    """As with Ethernet and WLAN: a connected client takes an answer from no other address than it has asked."""
+
+    async def run(write: bool) -> None:
+        publisher = ModbusPublisher(SystemClock(), write=write)
+        await publisher.start("0.0.0.0", 0)
+        for host in ("127.0.0.1", "127.0.0.2"):
+            async with udp_client(publisher.port, host) as (transport, datagrams):
+                transport.sendto(request(1, *BLOCK))
+                await datagrams.wait_for(1)
+        await publisher.close()
+
+    for write in (False, True):
+        asyncio.run(run(write))
+
+
+@pytest.mark.parametrize(
+    ("asked", "interface"), [("fe80::1", 3), ("fd00::1", 0), ("ff02::1", None)], ids=["link", "site", "group"]
+)
+def test_ipv6_is_answered_from_where_an_answer_can_come(asked: str, interface: int | None) -> None:
+    told = socket.inet_pton(socket.AF_INET6, asked) + struct.pack("@I", 3)
+    source = asked_at([(socket.IPPROTO_IPV6, socket.IPV6_PKTINFO, told)])
+    if interface is None:
+        assert source == ()
+    else:
+        assert source[0][2] == told[:16] + struct.pack("@I", interface)
 
 
 def test_before_the_first_snapshot_the_state_is_starting() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+import struct
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -99,6 +100,68 @@ def test_an_answer_that_the_kernel_does_not_take_is_dropped() -> None:
             await until(lambda: publisher.counts.unsent == 2)
             assert datagrams.answers == []
         endpoint.close()
+
+    asyncio.run(run())
+
+
+def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    """Here: whatever takes commands raises. Clients with many requests in a row are served afterwards, too."""
+
+    def broken(_: object) -> None:
+        raise RuntimeError("a defect")
+
+    def command(number: int) -> bytes:
+        return struct.pack(">HHHBBHHBHHiii", 9, 0, 23, 1, 16, 1000, 8, 16, number, 1, 0, 0, 0)
+
+    async def run() -> None:
+        async with (
+            publishing(write=True, on_command=broken) as publisher,
+            tcp_client(publisher.port) as (reader, writer),
+            udp_client(publisher.port) as (udp, datagrams),
+        ):
+            writer.write(request(1, *BLOCK) * 3 + command(1) + request(2, *BLOCK) * 3)
+            answers = [await read_answer(reader) for _ in range(7)]
+            assert [answer[7:9] for answer in answers] == [b"\x04\x80"] * 3 + [b"\x90\x04"] + [b"\x04\x80"] * 3
+            udp.sendto(command(2))
+            await datagrams.wait_for(1)
+            assert datagrams.answers[0][7:] == b"\x90\x04"
+            assert publisher._age_s == 0.0
+
+    asyncio.run(run())
+    assert caplog.text.count("RuntimeError: a defect") == 1
+
+
+def test_a_connection_that_cannot_be_served_is_closed_and_the_others_are_served(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def body(endpoint: modbus.TcpEndpoint) -> None:
+        (bad, bad_wire), (good, good_wire) = plugged(endpoint), plugged(endpoint)
+
+        def broken(_: int) -> bool:
+            raise RuntimeError("a defect")
+
+        monkeypatch.setattr(bad, "serve", broken)
+        endpoint.wait(bad)
+        good.data_received(request(1, *BLOCK) * 20)
+        await asyncio.sleep(0.1)
+        assert bad_wire.gone
+        assert len(good_wire.sent) == 20 * 137
+
+    in_virtual_time(body)
+
+
+def test_a_defect_leaves_no_age_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What comes over TCP afterwards is of now."""
+
+    async def run() -> None:
+        async with publishing(write=True) as publisher:
+            (endpoint,) = publisher._udp
+            monkeypatch.setattr(publisher._responder, "answer", None)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+                sock.sendto(request(1, *BLOCK), ("127.0.0.1", publisher.port))
+                with pytest.raises(TypeError):
+                    endpoint._serve()
+            assert publisher._age_s == 0.0
 
     asyncio.run(run())
 

@@ -291,7 +291,9 @@ def test_a_line_that_goes_is_told_and_can_be_opened_anew() -> None:
     run_virtual(run())
 
 
-def test_an_answer_that_the_line_does_not_take_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_that_takes_no_answers_is_opened_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A single one is only counted; the supervisor opens again what has raised."""
+
     def full(_: bytes) -> None:
         raise DeviceFault("line", "full")
 
@@ -299,11 +301,18 @@ def test_an_answer_that_the_line_does_not_take_is_counted(monkeypatch: pytest.Mo
         at = Line()
         running = asyncio.create_task(at.server.run())
         await asyncio.sleep(0)
+        for blocked in (True, True, False, True, True):
+            with monkeypatch.context() as patch:
+                if blocked:
+                    patch.setattr(at.slave, "write", full)
+                at.master.write(asked())
+                await asyncio.sleep(1.0)
+        assert (at.server.requests, at.server.unsent, running.done()) == (5, 4, False)
         monkeypatch.setattr(at.slave, "write", full)
         at.master.write(asked())
         await asyncio.sleep(1.0)
-        assert (at.server.requests, at.server.unsent, running.done()) == (1, 1, False)
-        running.cancel()
+        with pytest.raises(DeviceFault, match="full"):
+            await running
 
     run_virtual(run())
 

@@ -21,8 +21,10 @@ from hypothesis import strategies as st
 from daemon.publish import stream
 from daemon.publish.snapshot import Snapshot, State
 from daemon.publish.stream import Client, StreamServer, scan_message
+from hal.clock import run_virtual
 from hal.errors import DeviceRefused
 from hal.lidar import VALID, LidarGeometry, RawScan
+from tests.daemon.publish.network import Wire
 
 ROOT = Path(__file__).parents[3]
 GEOMETRY = LidarGeometry("m", "s", "f", 1440.0, 540.0, 0, 1080, 23, 60000, 0.001, 0.025, 0.0)
@@ -225,6 +227,30 @@ def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
         assert "weather; there are pose" in (await tap.frame())["text"]
 
     run(tmp_path / "stream", body)
+
+
+def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each may have the whole map sent anew: the loop goes on in between, and no more of them are read meanwhile."""
+    asked: list[frozenset[str]] = []
+
+    async def body() -> None:
+        server = serve(Path("unused"))
+        monkeypatch.setattr(server, "welcome", lambda client, fresh: asked.append(fresh))
+        client = Client(server)
+        wire = Wire(client)
+        client.connection_made(wire)
+        for turn in (1, 2):
+            client.data_received((stream.framed({"want": []}) + stream.framed({"want": ["map"]})) * 50)
+            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream.REQUESTS_PER_TURN, False)
+            await asyncio.sleep(2.0)
+            assert (len(asked), wire.reading) == (100 * turn, True)
+        assert asked == [frozenset(), frozenset({"map"})] * 100
+        client.data_received(stream.framed({"want": []}) * 50)
+        wire.close()
+        await asyncio.sleep(2.0)
+        assert len(asked) == 200 + stream.REQUESTS_PER_TURN, "who has gone asks no more"
+
+    run_virtual(body())
 
 
 def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

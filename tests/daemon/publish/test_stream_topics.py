@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import streambeat
+from daemon import maptiles, streambeat
 from daemon.maptiles import MapTiles
 from daemon.publish import stream
 from daemon.publish.stream import StreamServer
-from estimator import patch, pipeline
+from estimator import livemap, patch, pipeline
 from estimator.records import UNLIMITED, Scan
 from estimator.state import State
 from hal.adc import Blemish, RawSamples
@@ -165,6 +165,43 @@ def test_a_map_that_was_closed_is_drawn_anew_when_it_is_followed_again(tmp_path:
         tiles.close()
 
     run(tmp_path / "stream", body)
+
+
+def test_drawing_that_has_failed_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fails = [True, True]
+
+    def advance(task: livemap.Task) -> livemap.Progress:
+        if fails and fails.pop():
+            raise MemoryError
+        return draw(task)
+
+    draw = livemap.advance
+    monkeypatch.setattr(livemap, "advance", advance)
+    monkeypatch.setattr(maptiles, "AGAIN_S", 0.05)
+
+    async def body(server: StreamServer) -> None:
+        robot = Robot()
+        tiles = server.tiles = MapTiles(lambda: robot.state, server.on_tiles)
+        robot.drive(30)
+        loop = asyncio.get_running_loop()
+        tiles.follow(loop)
+        await until(lambda: bool(tiles.error))
+        tiles.follow(loop)
+        assert not tiles.busy, "not at once"
+        tiles.forget()
+        assert not tiles.error
+        tiles.follow(loop)
+        await until(lambda: bool(tiles.error))
+        await asyncio.sleep(0.06)
+        await drawn(server, tiles)
+        assert tiles.tiles
+        assert not tiles.error
+        tiles.close()
+
+    run(tmp_path / "stream", body)
+    assert caplog.text.count("it is tried again") == 2
 
 
 def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,19 +120,22 @@ def test_a_full_house_refuses_until_a_lease_runs_out() -> None:
 class Client:
     """A subscriber made of a socket and `struct`."""
 
-    def __init__(self) -> None:
+    def __init__(self, server: tuple[str, int] | None = None) -> None:
+        """``server``: takes datagrams from nowhere else."""
         self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.sock.bind(("127.0.0.1", 0))
         self.sock.setblocking(False)
+        if server is not None:
+            self.sock.connect(server)
 
     async def get(self) -> bytes:
         async with asyncio.timeout(5.0):
             return await asyncio.get_running_loop().sock_recv(self.sock, 512)
 
-    async def subscribe(self, port: int, lease: int) -> Message:
+    async def subscribe(self, port: int, lease: int, host: str = "127.0.0.1") -> Message:
         cookie = 0
         for _ in range(2):
-            self.sock.sendto(encode(Message(Status.ASK, lease, cookie)), ("127.0.0.1", port))
+            self.sock.sendto(encode(Message(Status.ASK, lease, cookie)), (host, port))
             answer = decode(await self.get())
             cookie = answer.cookie
         return answer
@@ -163,6 +166,22 @@ def test_a_subscriber_gets_what_receivers_get() -> None:
     asyncio.run(run())
 
 
+def test_who_has_subscribed_at_one_of_many_addresses_gets_all_from_there() -> None:
+    async def run() -> None:
+        server = Subscriptions("0.0.0.0", 0, lambda _: True)
+        await server.start()
+        clients = [(Client((host, server.port)), host) for host in ("127.0.0.1", "127.0.0.2")]
+        for client, host in clients:
+            assert (await client.subscribe(server.port, 30, host)).status is Status.GRANTED
+        server.send(b"pose")
+        for client, _ in clients:
+            assert await client.get() == b"pose"
+            client.sock.close()
+        await server.close()
+
+    asyncio.run(run())
+
+
 def test_a_stranger_gets_no_answer_and_a_gone_network_is_counted() -> None:
     class Gone:
         def sendto(self, data: bytes, peer: object) -> int:
@@ -175,7 +194,7 @@ def test_a_stranger_gets_no_answer_and_a_gone_network_is_counted() -> None:
         client.sock.sendto(encode(Message(Status.ASK, 10, 0)), ("127.0.0.1", server.port))
         await until(lambda: bool(asked))
         assert (server.sent, server.malformed, len(server.leases)) == (0, 0, 0)
-        subscribe(server.leases, asyncio.get_running_loop().time())
+        subscribe(server.leases, asyncio.get_running_loop().time(), peer=(PEER, ()))
         real, server._sock = server._sock, Gone()  # type: ignore[assignment]  # all that is asked of a socket
         server.send(b"data")
         assert server.dropped == 1
@@ -190,7 +209,7 @@ def test_a_lease_runs_out_without_a_word() -> None:
     async def run() -> None:
         server = Subscriptions("127.0.0.1", 0, lambda _: True)
         await server.start()
-        subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=("127.0.0.1", 9))
+        subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=(("127.0.0.1", 9), ()))
         for _ in range(60):
             server.send(b"data")
             await asyncio.sleep(0.1)
@@ -263,11 +282,11 @@ class _Fickle:
         self._left = 2 * times
         self._cookie = 0
 
-    def recvfrom(self, _: int) -> tuple[bytes, tuple[str, int]]:
+    def recvmsg(self, *_: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, tuple[str, int]]:
         if not self._left:
             raise BlockingIOError
         self._left -= 1
-        return encode(Message(Status.ASK, 10 * (self._left % 2), self._cookie)), PEER
+        return encode(Message(Status.ASK, 10 * (self._left % 2), self._cookie)), [], 0, PEER
 
     def sendto(self, data: bytes, _: object) -> None:
         self._cookie = decode(data).cookie

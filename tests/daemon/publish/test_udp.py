@@ -95,6 +95,30 @@ def test_an_unknown_name_is_tried_again_and_said_once(
     assert "plc.local:9: host name not known" in caplog.text
 
 
+def test_a_look_up_that_fails_in_another_way_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tries: list[float] = []
+
+    async def resolve(host: str, port: int) -> list[inet.Address]:
+        tries.append(asyncio.get_running_loop().time())
+        if len(tries) == 1:
+            raise RuntimeError("can't start new thread")
+        return [(socket.AF_INET, ("127.0.0.1", port))]
+
+    monkeypatch.setattr(inet, "resolve", resolve)
+
+    async def run() -> None:
+        sender = PoseSender(["plc.local:9"])
+        await sender.start()
+        await asyncio.sleep(1.5 * udp.RETRY_S)
+        assert sender.receivers[0].address == (socket.AF_INET, ("127.0.0.1", 9))
+        await sender.close()
+
+    run_virtual(run())
+    assert "can't start new thread" in caplog.text
+
+
 class Failing:
     """A socket whose sends fail as ordered."""
 
@@ -138,10 +162,21 @@ def test_a_receiver_that_never_reads_does_not_block() -> None:
         assert sender.receivers[0].sent + sender.receivers[0].dropped == 2000
 
 
-@pytest.mark.parametrize("text", ["", "plc", "plc:", ":15020", "plc:0", "plc:65536", "plc:x", "fe80::1:15020", "plc:¹"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "plc", "plc:", ":15020", "plc:0", "plc:65536", "plc:x", "fe80::1:15020", "plc:¹"),
+        *("robot..local:5000", ".local:5000", "..:5000", f"{64 * 'a'}.local:5000"),
+    ],
+)
 def test_what_is_not_a_receiver_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="Expected"):
         PoseSender([text])
+
+
+@pytest.mark.parametrize("text", [f"{63 * 'a'}.local.:5000", "plc:15020"])
+def test_a_name_that_can_be_one_is_taken(text: str) -> None:
+    assert PoseSender([text]).receivers[0].name == text
 
 
 def test_nobody_to_send_to_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

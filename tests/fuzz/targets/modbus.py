@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 from daemon.publish import modbus, registers, rtu_frames
 from daemon.publish.requests import MAX_FRAME, frame_size
+from hal.clock import VirtualLoop
+from hal.share import Share
 from tests.daemon.publish.network import plugged
 from tests.daemon.publish.test_registers import snapshot
 from tests.fuzz.test_modbus import check_answer, framed, responder, whole_frames
@@ -48,10 +50,10 @@ def mend(data: bytes) -> bytes:
 
 
 def feeder() -> Callable[[bytes], None]:
-    loop, answering = asyncio.new_event_loop(), responder()
+    loop, answering = VirtualLoop(), responder()
 
     async def stream(data: bytes) -> None:
-        endpoint = modbus.TcpEndpoint(responder(), modbus.Counts())
+        endpoint = modbus.TcpEndpoint(responder(), modbus.Counts(), share=Share(loop.time))
         connection, wire = plugged(endpoint)
         expected, faulty = whole_frames(data)
         cut = len(data) * 2 // 3
