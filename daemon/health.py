@@ -83,7 +83,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.LIDAR_MISFIT: (
         "what the lidar measures does not fit the map where the robot must be, or anywhere after a start",
-        "was the robot moved by hand? is the lidar covered, shifted on its mount, or does it measure wrongly?",
+        "was the robot moved by hand, or does it drive where the map knows nothing yet? is the lidar covered, shifted on "
+        "its mount, or does it measure wrongly?",
     ),
     Fault.ADC_BUS_MISSING: (
         "the photodiode's I2C bus is not there",
@@ -224,7 +225,7 @@ class Vitals:
         lamps: what is wrong with lamps and survey.
         cycles, overruns, jobs_failed: counters; short: of cycles without map work or laser for lack of time.
         lateness: worst lateness of the loop lately, seconds.
-        alert: the bound on the position error is above the limit that is set, and was not before.
+        alert: the bound on the position error is above the limit that is set, and this has been said.
         failed: names of parts that are down at the moment.
     """
 
@@ -348,7 +349,7 @@ def _photodiode(now: Vitals, before: Vitals) -> Iterable[Fault]:
 
 
 def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
-    if now.odometry is False:
+    if now.odometry is False and now.cycles > 0:  # readings count from the first cycle on
         yield Fault.ODOMETRY_SILENT
     if now.odometry_jumps > before.odometry_jumps:
         yield Fault.ODOMETRY_JUMPS

@@ -28,7 +28,8 @@ log = logging.getLogger(__name__)
 Told = Callable[[str], None]
 """Told the end of something: empty, or why it came to nothing."""
 
-NOT_HERE: Final = "this run cannot do that"
+NO_RECORDER: Final = "this run keeps no flight recorder: start it with --record DIR --last MINUTES"
+NO_MAPS: Final = "this run stores no maps: set map.folder"
 ASKED: Final = 8
 """Requests that are waited for, the latest: a client hears of its last one only."""
 
@@ -70,9 +71,9 @@ class Orders:
         if code is CommandCode.SAVE_MAP:
             feeds.on_save(told)
         elif code is CommandCode.DUMP_RECORDER:
-            told(NOT_HERE) if feeds.on_dump is None else feeds.on_dump(told)
+            told(NO_RECORDER) if feeds.on_dump is None else feeds.on_dump(told)
         elif code is CommandCode.SWITCH_MAP:
-            told(NOT_HERE) if feeds.on_switch is None else feeds.on_switch(request.map_id, told)
+            told(NO_MAPS) if feeds.on_switch is None else feeds.on_switch(request.map_id, told)
         else:
             self._to_cycle(request)
 

@@ -250,3 +250,7 @@ def test_cycles_that_leave_out_map_work_or_laser_are_a_fault_while_they_are_many
     many, few = replace(before, t_mono=10.0, cycles=800, short=60), replace(before, t_mono=10.0, cycles=800, short=20)
     assert assess(replace(many, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == (Fault.OVERLOADED,)
     assert assess(replace(few, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == ()
+
+
+def test_before_the_first_cycle_nobody_has_looked_for_odometry() -> None:
+    assert assess(replace(WELL, cycles=0, odometry=False), replace(BEFORE, cycles=0)) == ()

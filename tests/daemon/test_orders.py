@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from daemon.network import Feeds
-from daemon.orders import ASKED, NOT_HERE, Orders
+from daemon.orders import ASKED, NO_RECORDER, Orders
 from daemon.publish.holding import CommandCode, Outcome, Request
 from estimator.records import Command, Order
 from tests.daemon.publish.test_registers import snapshot
@@ -93,7 +93,7 @@ def test_orders_at_any_rate_do_not_fill_the_log(caplog: pytest.LogCaptureFixture
 
     lines = go_on(60)
     assert len(lines) <= 70
-    assert lines[:2] == ["Modbus: DUMP_RECORDER", f"Modbus: DUMP_RECORDER refused: {NOT_HERE}"]
+    assert lines[:2] == ["Modbus: DUMP_RECORDER", f"Modbus: DUMP_RECORDER refused: {NO_RECORDER}"]
     assert sum("more such lines were left out" in line for line in lines) == 5
     assert "(1990 more such lines were left out before it)" in lines[10]
     clock.t += 60.0
