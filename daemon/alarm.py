@@ -38,8 +38,8 @@ class Alarm:
 
     Attributes:
         on: the alert is raised. With a limit it is raised until the first bound says otherwise: who knows nothing does
-            not say that all is well. said: it has gone to the log, which is so once the bound was within the limit, or has
-            had the time to get there. Without any bound, as while a place is looked for, state and reason say enough.
+            not say that all is well. said: it has gone to the log: not before the bound was within the limit, or had
+            the time to get there. Without any bound, as while a place is looked for, state and reason say enough.
     """
 
     def __init__(self, limit_m: float = 0.0) -> None:

@@ -108,6 +108,8 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
             f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
             "one, or import one: lumiloop map import"
         )
+    if start is None and store.refused:
+        log.error("no map in %s can be used; a new one is begun", store.folder)
     if start is not None:
         start = replace(start, localise=config.localise)
         meta = start.stored.meta
@@ -176,7 +178,7 @@ class Store:
             return None
         by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
         for _, files in groupby(by_map, key=lambda one: one.map_id):
-            elsewhere = True
+            elsewhere, refused = True, False
             for generation in files:
                 try:
                     start = self._read(generation, judge)
@@ -184,12 +186,13 @@ class Store:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:
                     self._refuse(generation.path, error)
-                    elsewhere = False
+                    elsewhere, refused = False, True
                 else:
+                    if refused:
+                        log.warning("%s is used, the newest good generation of this map", generation.path)
                     self._origin = generation.path
                     return start
             if not elsewhere:
-                log.error("no map in %s can be used; a new one is begun", self.folder)
                 return None
         return None
 

@@ -119,7 +119,7 @@ def test_a_broken_map_is_kept_aside_and_the_generation_before_it_loaded(
     assert start.content == content(seed=1)
     assert store.refused
     assert names(tmp_path) == [name(1), name(2, more=".broken")]
-    for said in (str(broken) + ".broken", "is refused", "the generation before it is used"):
+    for said in (f"{broken}.broken is refused", f"{tmp_path / name(1)} is used, the newest good generation"):
         assert said in caplog.text
     store.save(content(seed=3), MAP)
     assert names(tmp_path) == [name(1), name(2, more=".broken"), name(3)]
@@ -151,8 +151,17 @@ def test_what_was_forgotten_does_not_come_back_where_the_new_map_is_broken(
     store.save(content(Shape(map_id=5)), 5)
     store.close()
     tmp_path.joinpath(name(2, 5)).write_bytes(b"")
-    assert Store(tmp_path).load() is None
+    assert started(MapConfig(folder=str(tmp_path)), None)[1] is None
     assert "a new one is begun" in caplog.text
+    assert "is used" not in caplog.text
+
+
+def test_who_only_looks_says_nothing_of_what_is_begun(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tmp_path.joinpath(name(1)).write_bytes(content()[:900])
+    assert Store(tmp_path, mend=False).load() is None
+    assert "it ends" in caplog.text or "cut off" in caplog.text
+    assert "begun" not in caplog.text
+    assert "is used" not in caplog.text
 
 
 def test_each_building_has_its_own_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
