@@ -130,7 +130,7 @@ def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, tex
 
 @pytest.mark.parametrize("device", ["/dev/ttyACM0@baud", "/dev/ttyACM0@", "/dev/ttyUSB0@19201"])
 def test_what_is_no_line_rate_is_refused(device: str) -> None:
-    with pytest.raises(ValueError, match="Expected a line rate of 19200, .* behind `@`"):
+    with pytest.raises(ValueError, match=r"Expected a line rate of 19200, .* behind `@`"):
         parse_lidar(device)
 
 
