@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Final
 
 from daemon.state import HELD
@@ -11,6 +12,8 @@ from daemon.state_memory import Memory
 
 CLEAR_S: Final = 1.0
 """The bound has to be within the limit for this long before the alert is over: it must not chatter."""
+SETTLE_S: Final = 10.0
+"""From the first bound of a run on it has this long to come within the limit; an alert before that is not said."""
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +38,8 @@ class Alarm:
 
     Attributes:
         on: the alert is raised. With a limit it is raised until the first bound says otherwise: who knows nothing does
-            not say that all is well. said: it has gone to the log.
+            not say that all is well. said: it has gone to the log: not before the bound was within the limit, or had
+            the time to get there. Without any bound, as while a place is looked for, state and reason say enough.
     """
 
     def __init__(self, limit_m: float = 0.0) -> None:
@@ -43,24 +47,26 @@ class Alarm:
         self.on = limit_m > 0.0
         self.said = False
         self._within_since: float | None = None
-        self._was_within = False
+        self._expected = math.inf  # when the bound should be within the limit: `t_mono`, seconds
 
     def take(self, t_mono: float, bound_m: float | None) -> bool:
         """Take one cycle's bound (None: there is none) and say whether the alert is raised."""
         if self.limit_m <= 0.0:
             return False
+        if bound_m is not None:
+            self._expected = min(self._expected, t_mono + SETTLE_S)
         if bound_m is None or not bound_m <= self.limit_m:
             self._within_since = None
-            self._raise(bound_m)
+            self._raise(t_mono, bound_m)
         else:
             self._within_since = t_mono if self._within_since is None else self._within_since
             if t_mono - self._within_since >= CLEAR_S:
-                self._clear(bound_m)
+                self._clear(t_mono, bound_m)
         return self.on
 
-    def _raise(self, bound_m: float | None) -> None:
+    def _raise(self, t_mono: float, bound_m: float | None) -> None:
         self.on = True
-        if self._was_within and not self.said:  # before the first bound there is nothing to be alarmed about
+        if t_mono >= self._expected and not self.said:
             said = "there is no bound on it" if bound_m is None else f"it may be {bound_m:.2f} m"
             log.warning(
                 "alert: the position error may be above the limit of %.2f m that `integrity.alert_m` sets: %s; stop or "
@@ -70,7 +76,8 @@ class Alarm:
             )
             self.said = True
 
-    def _clear(self, bound_m: float) -> None:
+    def _clear(self, t_mono: float, bound_m: float) -> None:
         if self.said:
             log.info("alert over: the position error is below %.2f m, the limit is %.2f m", bound_m, self.limit_m)
-        self.on, self.said, self._was_within = False, False, True
+        self.on = self.said = False
+        self._expected = min(self._expected, t_mono)

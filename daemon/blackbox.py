@@ -123,6 +123,7 @@ class BlackBox:
         self._disk, self._clock, self._header = disk, clock, header
         self._every_s = EVERY_S if math.isinf(keep_s) else max(LEAST_S, keep_s / SHARE)
         self._ring = not math.isinf(keep_s)
+        self._gap = False
         self._bytes = 0
         self._due = clock.now() + self._every_s
         self._cycle: Cycle | None = None
@@ -162,6 +163,9 @@ class BlackBox:
         now = record.t_mono
         if record.cycle == 1:
             self.flight.prepare()
+        if self._gap and not self._disk.error:  # what comes after a gap replays from a state alone
+            self._due = now
+        self._gap = bool(self._disk.error)
         if self._ring:  # what is kept as a whole needs no dumps
             self._watch_faults(now)
         if self._pending is not None and now >= self._pending[0]:

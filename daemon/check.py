@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from pathlib import Path
+from typing import Final
 
 from daemon import cli
-from daemon.config import Config
-from daemon.folders import maps_folder
+from daemon.config import Config, Mount
+from daemon.folders import can_be_made, maps_folder
+
+FAR_M: Final = 5.0
+"""A lidar is on its robot."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -18,7 +23,7 @@ def main(args: argparse.Namespace) -> int:
     A bus that is not here is a remark, not a refusal: files are also checked on other computers.
     """
     settings: Config = args.settings
-    remarks = []
+    remarks = implausible(settings.lidar.mount)
     if settings.lights.survey:
         from daemon.photodiode import profile_of
         from daemon.surveyfile import SurveyError, read_survey
@@ -41,6 +46,19 @@ def main(args: argparse.Namespace) -> int:
     return cli.OK
 
 
+def implausible(mount: Mount) -> list[str]:
+    """What of a mount may be meant in other units."""
+    said = [
+        f"`lidar.mount.{axis}` = {metres:g}: metres from the robot's centre; is that meant?"
+        for axis, metres in (("x", mount.x), ("y", mount.y))
+        if abs(metres) > FAR_M
+    ]
+    eighths = mount.yaw / (math.pi / 4)
+    if mount.yaw and abs(mount.yaw) < 6.3 and abs(eighths - round(eighths)) < 2e-3:
+        said.append(f"`lidar.mount.yaw` = {mount.yaw:g}: degrees; is {math.degrees(mount.yaw):.0f} meant?")
+    return said
+
+
 def look_at_maps(settings: Config) -> tuple[bool, str]:
     """Whether there is a map to begin with, and one line about the folder; nothing in it is touched.
 
@@ -48,6 +66,8 @@ def look_at_maps(settings: Config) -> tuple[bool, str]:
     """
     folder = maps_folder(settings.map.folder)
     if not os.access(folder, os.F_OK):
+        if not can_be_made(folder):
+            return False, f"{folder}: cannot be made by this user, maps cannot be kept; name another in `map.folder`"
         return False, f"{folder}: not there yet, maps will be kept in it"
     if not folder.is_dir():
         return False, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"

@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 from daemon import cli
+from daemon.extras import how_to_install
 
 Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
 OURS = ("daemon", "estimator", "hal", "taps")
@@ -117,7 +118,7 @@ def needing(extra: str, module: str, name: str) -> cli.Body:
             missing = (error.name or "").partition(".")[0]
             if missing in OURS:
                 raise
-            return cli.fail(f"this command needs {missing}, which is not installed: pip install 'lumiloop[{extra}]'")
+            return cli.fail(f"this command needs {missing}, which is not installed: {how_to_install(extra)}")
         return cli.loaded(module, name)(args)
 
     return cli.configured(body)

@@ -10,13 +10,13 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, Final
 
-from daemon.wholefile import defect_in, reason_of, sync_folder
-from hal.errors import DeviceRefused
+from daemon.wholefile import defect_in, reason_of, sync_folder, write_whole
 from hal.replay.recording import LONGEST, Kind, pack_frame, pack_head, segment_name
 
 log = logging.getLogger(__name__)
@@ -51,11 +51,17 @@ class SegmentWriter:
         busy_since: when the write began that has not ended yet (`time.monotonic`), None: there is none.
     """
 
-    def __init__(self, parent: Path, name: str, header: dict[str, Any], segment_bytes: int = SEGMENT_BYTES) -> None:
-        """Make the folder and open the first segment.
+    def __init__(
+        self,
+        parent: Path,
+        name: str,
+        header: dict[str, Any],
+        segment_bytes: int = SEGMENT_BYTES,
+        beside: Mapping[str, bytes] | None = None,
+    ) -> None:
+        """Make the folder and open the first segment; where that is not possible it is tried again, as later on.
 
-        Raises:
-            DeviceRefused: that is not possible; names the folder, why, and what to do.
+        ``beside``: files of the folder, by name, that every segment needs; they are written before the first.
         """
         self.records = self.bytes = self.lost = self.taken = 0
         self.error = ""
@@ -63,6 +69,7 @@ class SegmentWriter:
         self.closed: Callable[[int, Path], None] = _nobody
         self._header = header
         self._segment_bytes = segment_bytes
+        self._beside = dict(beside or {})
         self._segment = -1
         self._file = -1
         self._good = 0  # bytes of the open segment that end with a whole record
@@ -75,12 +82,12 @@ class SegmentWriter:
         self._synced_at = time.monotonic()
         self._dirty = False
         self._stop = threading.Event()
+        self.folder = parent / f"{name}-{token_hex(4)}"  # if it can be made later only: nobody else's, unseen
         try:
             self.folder = _new_folder(parent, name)
             self._open()
         except OSError as error:
-            problem = f"cannot be recorded into: {error.strerror or error}"
-            raise DeviceRefused(str(parent), problem, "free space, or name a folder that may be written") from error
+            self._fail(error, [])
         self._thread = threading.Thread(target=self._work, name="lumiloop-disk", daemon=True)
         self._thread.start()
 
@@ -191,6 +198,9 @@ class SegmentWriter:
         """Start the next segment with a head of its own."""
         self._segment += 1
         self.folder.mkdir(parents=True, exist_ok=True)  # somebody may have cleaned up behind us
+        for name in list(self._beside):
+            write_whole(self.folder / name, self._beside[name])
+            del self._beside[name]
         path = self.folder / segment_name(self._segment)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         head = pack_head({**self._header, "segment": self._segment})

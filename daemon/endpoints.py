@@ -95,9 +95,9 @@ def parse_lidar(text: str) -> LidarPlace:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", serial):
             raise ValueError(f"Expected a serial number behind `auto:`, as in auto:H0906091, got `{text}`")
         return LidarPlace(AUTO, serial)
-    if (rate := re.fullmatch(r"(/.*)@(\d+)", text)) is None:
+    if (rate := re.fullmatch(r"(/.*)@(\d+)", text) or re.fullmatch(r"(/dev/tty\w+)@(.*)", text)) is None:
         return LidarPlace(text)
-    if int(rate[2]) not in SCIP_BAUDS:
+    if not rate[2].isdecimal() or int(rate[2]) not in SCIP_BAUDS:
         raise ValueError(f"Expected a line rate of {', '.join(map(str, SCIP_BAUDS))} behind `@`, got `{text}`")
     return LidarPlace(rate[1], baud=int(rate[2]))
 

@@ -7,11 +7,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from daemon.extras import how_to_install
 from estimator.calibrate import Calibrated
 from estimator.calibrate_wheels import WheelFit
 from estimator.survey import Surveyed
 
-_MISSING: Final = "no picture: matplotlib is not installed (pip install 'lumiloop[plot]')"
+_MISSING: Final = f"no picture: matplotlib is not installed ({how_to_install('plot')})"
 
 
 def draw_calibration(found: Calibrated, path: Path) -> str:

@@ -104,9 +104,16 @@ class Flight:
         self._segments: dict[int, _Segment] = {0: _Segment(t_mono=-math.inf, state=True)}
         self._said_full = False
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._ring = -1 if math.isinf(keep_s) else _begin_ring(folder)
+        self._ring = -1
+        self._mark_ring()
         self._thread = threading.Thread(target=self._work, name="lumiloop-flight", daemon=True)
         self._thread.start()
+
+    def _mark_ring(self) -> None:
+        """Mark the folder as a ring, where it is to be one: at the start, or once there is a folder."""
+        if self._ring < 0 and not math.isinf(self._keep_s):
+            with contextlib.suppress(OSError):  # the recording itself says what is wrong with the disk
+                self._ring = _begin_ring(self._folder)
 
     def prepare(self) -> None:
         """The estimator has been loaded; what is still missing is loaded here, and not within a cycle."""
@@ -140,6 +147,7 @@ class Flight:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while (task := self._tasks.get()) is not None:
             try:
+                self._mark_ring()
                 task()
             except Exception:  # a defect here must not end the recording, and is told in full
                 log.exception("the recording's folder cannot be looked after")

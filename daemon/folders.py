@@ -23,6 +23,14 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
     return Path(user) / "lumiloop" if user else state_folder(environment)
 
 
+def can_be_made(folder: Path) -> bool:
+    """Whether a folder that is not there could be made by this user, as far as rights tell."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    stores = folder.is_dir() and os.statvfs(folder).f_blocks > 0  # else files in it are not files, as in /proc
+    return stores and os.access(folder, os.W_OK | os.X_OK)
+
+
 def maps_folder(configured: str) -> Path:
     """Where maps are kept: as ``map.folder`` says, else beside what is learned."""
     return Path(configured) if configured else state_folder() / "maps"

@@ -83,8 +83,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.LIDAR_MISFIT: (
         "what the lidar measures does not fit the map where the robot must be, or anywhere after a start",
-        "was the robot moved by hand, or does it drive where the map knows nothing yet? is the lidar covered, shifted on "
-        "its mount, or does it measure wrongly?",
+        "was the robot moved by hand, or does it drive where the map knows nothing yet? is the lidar covered, shifted "
+        "on its mount, or does it measure wrongly?",
     ),
     Fault.ADC_BUS_MISSING: (
         "the photodiode's I2C bus is not there",

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon import matchplot
+from daemon.extras import how_to_install
 from daemon.results import OutputRefused
 from estimator import icp, journal, matching
 from estimator.journal import Entry, LightSaid, Pairs, Told
@@ -207,7 +208,7 @@ class MatchJournal:
         if self.choice.failed:
             said.append(f"{self.failed} matches were no result" + self._beyond())
         if self.kept and not matchplot.available():
-            said.append("no pictures of matches: matplotlib is not installed (pip install 'lumiloop[plot]')")
+            said.append(f"no pictures of matches: matplotlib is not installed ({how_to_install('plot')})")
         return said
 
     def _cleared(self) -> str:

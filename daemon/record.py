@@ -31,7 +31,6 @@ from estimator.records import UNLIMITED, Array, Command, Limits, Order
 from estimator.result import StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
-from hal.errors import DeviceRefused
 from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
@@ -160,10 +159,8 @@ class Recorder:
         """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
 
         ``lights``, ``start``: what the estimator is told of lights, and the map that it begins with: a replay has to
-        tell it again. ``keep_s``: how far back it reaches, see `daemon.flight`.
-
-        Raises:
-            DeviceRefused: the folder cannot be made or written.
+        tell it again. ``keep_s``: how far back it reaches, see `daemon.flight`. Where nothing can be written, now or
+        later, :attr:`error` says so and it is tried again: a robot is to know its place on a full disk, too.
         """
         started = datetime.fromtimestamp(clock.utc(), UTC)
         header: dict[str, Any] = {
@@ -176,21 +173,10 @@ class Recorder:
             **({} if start is None else {MAP: {"sha256": hashlib.sha256(start.content).hexdigest()}}),
         }
         self._clock = clock
-        self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header)
-        if lights is not None and lights.residuals:
-            self._keep(RESIDUALS, lights.residuals)
-        if start is not None:
-            self._keep(START, start.content)
+        beside = {RESIDUALS: lights.residuals} if lights is not None and lights.residuals else {}
+        beside |= {} if start is None else {START: start.content}  # too large for every head
+        self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header, beside=beside)
         self.box: Final = BlackBox(self.disk, clock, header, keep_s)
-
-    def _keep(self, name: str, content: bytes) -> None:
-        """Once beside the segments: it is too large for every head."""
-        try:
-            write_whole(self.disk.folder / name, content)
-        except OSError as error:
-            self.disk.close()
-            problem = f"cannot be recorded into: {error.strerror or error}"
-            raise DeviceRefused(str(self.disk.folder), problem, "free space, or name another folder") from error
 
     @property
     def error(self) -> str:

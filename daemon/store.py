@@ -6,7 +6,8 @@ is moved aside under the same name with ``.broken`` and never deleted.
 
 Kept of the map in use are the two newest generations, of which one may fail, and the one that this run began with: it
 is the last that a whole run has proved, should this run spoil the map. Of every other map (RESET begins one, and each
-building has its own) the newest generation is kept, of the seven latest.
+building has its own) the newest good generation is kept, of the seven latest: nothing goes but behind a file that has
+been read.
 """
 
 from __future__ import annotations
@@ -42,7 +43,6 @@ MOST_BROKEN: Final = 8
 """Files that a failing disk has spoilt while they were saved, kept for who wants to know."""
 START: Final = "start.lumimap"
 """File of a recording's folder: the map that the run began with."""
-"""Folder below the state directory."""
 NEWEST: Final = 2
 OTHERS: Final = 7
 
@@ -108,6 +108,8 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
             f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
             "one, or import one: lumiloop map import"
         )
+    if start is None and store.refused:
+        log.error("no map in %s can be used; a new one is begun", store.folder)
     if start is not None:
         start = replace(start, localise=config.localise)
         meta = start.stored.meta
@@ -143,6 +145,7 @@ class Store:
         self._mend = mend
         self.refused = False
         self._origin: Path | None = None
+        self._good: dict[Path, bool] = {}
         self._lock: int | None = None
 
     def generations(self) -> list[Generation]:
@@ -175,7 +178,7 @@ class Store:
             return None
         by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
         for _, files in groupby(by_map, key=lambda one: one.map_id):
-            elsewhere = True
+            elsewhere, refused = True, False
             for generation in files:
                 try:
                     start = self._read(generation, judge)
@@ -183,12 +186,13 @@ class Store:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:
                     self._refuse(generation.path, error)
-                    elsewhere = False
+                    elsewhere, refused = False, True
                 else:
+                    if refused:
+                        log.warning("%s is used, the newest good generation of this map", generation.path)
                     self._origin = generation.path
                     return start
             if not elsewhere:
-                log.error("no map in %s can be used; a new one is begun", self.folder)
                 return None
         return None
 
@@ -305,28 +309,47 @@ class Store:
 
     def _let_go(self, map_id: int) -> None:
         for generation in self._superfluous(map_id):
-            log.debug("%s: an older generation goes", generation.path)
+            log.info("%s goes: an older generation", generation.path)
             generation.path.unlink(missing_ok=True)
         sync_folder(self.folder)
 
     def _superfluous(self, map_id: int) -> Iterator[Generation]:
-        mine = others = 0
-        seen: set[int] = set()
+        """What newer files make up for: of this map the one just verified, of others one that has been read."""
+        others: dict[int, list[Generation]] = {}
+        mine = 0
         for generation in self.generations():
             if generation.number == 0:
                 continue
-            if generation.map_id == map_id:
-                mine += 1
-                if mine > NEWEST and generation.path != self._origin:
-                    yield generation
-            elif generation.map_id in seen:
+            if generation.map_id != map_id:
+                others.setdefault(generation.map_id, []).append(generation)
+                continue
+            mine += 1
+            if mine > NEWEST and generation.path != self._origin:
                 yield generation
+        for files in others.values():
+            if len(files) > 1:
+                yield from files[1 + self._newest_good(files) :]
+        if len(others) > OTHERS:
+            usable = [files for files in others.values() if self._newest_good(files) < len(files)]
+            for files in usable[OTHERS:]:
+                log.warning("%s goes: %d maps of other places are newer", files[0].path, OTHERS)
+                yield from files[: 1 + self._newest_good(files)]
+
+    def _newest_good(self, files: list[Generation]) -> int:
+        """Place of the first generation of one map that can be read; their number where none can."""
+        return next((place for place, generation in enumerate(files) if self._is_good(generation)), len(files))
+
+    def _is_good(self, generation: Generation) -> bool:
+        """Whether a file can be read; each is looked at once, maps are large."""
+        if generation.path not in self._good:
+            try:
+                read(generation.path.read_bytes())
+            except (BadMap, OSError) as error:
+                log.warning("%s cannot be used: %s; the generation before it is kept", generation.path, error)
+                self._good[generation.path] = False
             else:
-                seen.add(generation.map_id)
-                others += 1
-                if others > OTHERS:
-                    log.warning("%s goes: %d maps of other places are newer", generation.path, OTHERS)
-                    yield generation
+                self._good[generation.path] = True
+        return self._good[generation.path]
 
     def close(self) -> None:
         """Let others use the folder; idempotent."""

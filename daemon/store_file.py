@@ -49,7 +49,7 @@ class BadMap(Exception):
         remedy: what a person can do, or what the daemon does. advice: the same for who has named the file himself.
     """
 
-    remedy = "it is kept; the generation before it is used"
+    remedy = "it is kept, and done without"
     advice = "name another, for instance the generation before it"
 
 

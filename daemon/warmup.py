@@ -7,13 +7,15 @@ lock; and the daemon wants to go on talking to its devices meanwhile, hence the 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import fcntl
 import gc
 import hashlib
 import logging
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,6 +38,8 @@ TIMED_TURNS: Final = 5
 
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
+LOOK_S: Final = 0.5
+"""Seconds between two looks for the first kernel that has been compiled."""
 
 
 class CannotLoad(Exception):
@@ -93,9 +97,9 @@ def load(lights: Lights | None = None) -> Warmth:
 
 
 def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]) -> None:
-    """Do ``work``, which loads ``what`` of the estimator, and ``say`` before and after that kernels are compiled.
+    """Do ``work``, which loads ``what`` of the estimator, and ``say`` (in another thread) that kernels are compiled.
 
-    Nothing is done and nothing said where an earlier start has left them.
+    Nothing is done where an earlier start has left all of them, and nothing said where it has left these.
 
     Raises:
         CannotLoad: as for :func:`load`.
@@ -105,13 +109,33 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
         if mark.exists():
             return
         begun, before = time.monotonic(), _compiled()
-        say("first start of this version: its kernels are being compiled, which takes a minute or more")
-        work()
+        with _announced(say, before):
+            work()
         mark.touch()
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
-    count = len(_compiled() - before)
-    say(f"{count} kernels compiled in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
+    if count := len(_compiled() - before):
+        say(f"{count} kernels compiled in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
+
+
+@contextlib.contextmanager
+def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
+    """``say`` that kernels are being compiled as soon as the first one is there that was not ``before``."""
+    done = threading.Event()
+
+    def look() -> None:
+        while not done.wait(LOOK_S):
+            if _compiled() - before:
+                say("first start of this version: its kernels are being compiled, which takes a minute or more")
+                return
+
+    looking = threading.Thread(target=look, name="lumiloop-compiling", daemon=True)
+    looking.start()
+    try:
+        yield
+    finally:
+        done.set()
+        looking.join()
 
 
 def _compiled() -> set[Path]:

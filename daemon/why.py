@@ -20,6 +20,7 @@ from typing import Any, Final
 from daemon import cli, warmup, whyplot, whysaid
 from daemon.config import Config
 from daemon.cycle import CycleRecord
+from daemon.extras import how_to_install
 from daemon.folders import state_folder
 from daemon.replay import NOTHING_GIVEN, config_for, lights_for, start_for
 from daemon.rerun import Rerun
@@ -77,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
 def _draw(out: Path, told: list[Moment], utc: float, rerun: Rerun) -> int:
     picture = whyplot.draw(told, utc, rerun.render())
     if picture is None:
-        return cli.fail("pictures need matplotlib: pip install 'lumiloop[plot]'")
+        return cli.fail(f"pictures need matplotlib: {how_to_install('plot')}")
     Folder(out.parent).write(out.name, picture)
     return cli.OK
 

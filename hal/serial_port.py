@@ -130,7 +130,7 @@ async def open_serial_port(device: str, baud: int, clock: Clock | None = None, s
         opening.add_done_callback(_close_late)
         raise
     except (ValueError, OSError, termios.error) as error:
-        raise explain_open_error(device, baud, error) from error
+        raise explain_open_error(device, baud, error, style) from error
     return SerialPort(line, clock or SystemClock())
 
 
@@ -167,7 +167,7 @@ def _errno_of(error: BaseException | None) -> int:
     return 0
 
 
-def explain_open_error(device: str, baud: int, error: BaseException) -> HalError:
+def explain_open_error(device: str, baud: int, error: BaseException, style: str = "8N1") -> HalError:
     """Turn what the operating system said about an open into one of the four nouns, with the remedy."""
     number = _errno_of(error)
     path = Path(device)
@@ -179,6 +179,9 @@ def explain_open_error(device: str, baud: int, error: BaseException) -> HalError
         return DeviceRefused(device, "permission denied", f"add the user to group {_group_of(path)} and log in again")
     if number in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(device, "in use by another program", f"find it with: fuser -v {device}")
+    if number == errno.EINVAL and style != "8N1" and _is_character_device(path):
+        remedy = "name another behind the line rate; a pseudo-terminal takes 8N1 alone"
+        return DeviceRefused(device, f"does not take the character format {style}", remedy)
     if number in (errno.ENOTTY, errno.EISDIR, errno.EINVAL) or not _is_character_device(path):
         return DeviceRefused(device, NOT_SERIAL, "name the sensor's own device file, such as /dev/ttyACM0")
     if isinstance(error, ValueError):

@@ -80,6 +80,10 @@ files() {
     (cd "$SOURCE/docs" && find . -type f) | while read -r page; do
         put 644 "docs/$page" "/usr/share/doc/lumiloop/docs/$page"
     done
+    for program in "$SOURCE"/tools/clients/[!_]* "$SOURCE"/tools/transmitter/[!_]*; do
+        if [ -f "$program" ]; then put 644 "${program#"$SOURCE/"}" "/usr/share/doc/lumiloop/${program#"$SOURCE/"}"; fi
+    done
+    ln -sfn examples "$DESTDIR/usr/share/doc/lumiloop/systemd" # as the pages name them
     if [ ! -e "$DESTDIR/etc/lumiloop/lumiloop.toml" ]; then
         put 644 systemd/lumiloop.toml /etc/lumiloop/lumiloop.toml
     fi

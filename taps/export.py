@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon import cli, warmup
+from daemon.extras import how_to_install
 from daemon.replay import Given
 from daemon.results import OutputRefused, kitti, tum
 from daemon.wholefile import write_whole
@@ -42,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
             raise
-        return cli.fail(f"MCAP files need {error.name}, which is not installed: pip install 'lumiloop[mcap]'")
+        return cli.fail(f"MCAP files need {error.name}, which is not installed: {how_to_install('mcap')}")
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return cli.fail(str(error))
     except OSError as error:

@@ -12,6 +12,7 @@ import numpy as np
 
 from daemon import cli
 from daemon.config import Config
+from daemon.extras import how_to_install
 from daemon.photodiode import profile_of
 from daemon.planning import picture
 from daemon.planning.choose import Goals, Plan, choose, codes_for, plan_of
@@ -156,7 +157,7 @@ def _write(args: argparse.Namespace, hall: Hall, plan: Plan, receiver: Receiver,
         if math.isfinite(apart):
             sys.stdout.write(f"codes are used again, {apart:.1f} m apart at least\n")
     if (drawn := picture.draw(hall, plan)) is None:
-        cli.say("pictures need matplotlib: pip install 'lumiloop[plot]'")
+        cli.say(f"pictures need matplotlib: {how_to_install('plot')}")
     else:
         folder.write("plan.png", drawn)
         sys.stdout.write(f"{folder.path / 'plan.png'}: links, accuracy, blind axes\n")

@@ -135,9 +135,10 @@ def _serial() -> str:
     return f"""## Serial line (RTU)
 
 `modbus.serial = "/dev/ttyUSB1@115200#1"`: the line, its rate, our unit. Without a rate it is 19200 bit/s; characters
-are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2). An answer goes
-out 3.5 characters after its request at the earliest; a request that pauses for more than {1e3 * SILENCE_S:g} ms is
-given up. What is sent to unit 0 is carried out and not answered. Adapters that echo are fine.
+are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2); a
+pseudo-terminal (socat, a gateway's) takes 8N1 alone. An answer goes out 3.5 characters after its request at the
+earliest; a request that pauses for more than {1e3 * SILENCE_S:g} ms is given up. What is sent to unit 0 is carried out
+and not answered. Adapters that echo are fine.
 
 Let the master wait for half a second or more. A request that this computer had no time for within {1e3 * PATIENCE_S:g}
 ms, or that the master's next one has overtaken, is neither carried out nor answered: the answer would collide with the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,12 +10,14 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
+from daemon.check import implausible, look_at_maps
 from daemon.config import Config
-from daemon.endpoints import AUTO, subscription_port
-from daemon.folders import maps_folder, runtime_folder, state_folder
+from daemon.endpoints import ANYBODY, AUTO, parse_endpoint, subscription_port
+from daemon.folders import can_be_made, maps_folder, runtime_folder, state_folder
 from daemon.probe import is_bus
 from daemon.publish.snapshot import LinkUse, State
 from daemon.surveyfile import SurveyError, read_survey
+from hal.inet import refusal
 from taps.doctor.host import Heard, Host
 from taps.stream import path_of
 
@@ -88,6 +91,8 @@ def configuration(case: Case) -> Iterator[Finding]:
         yield remark(about, "none named: built-in values are looked at", "name the daemon's: --config FILE")
     else:
         yield good(about, str(case.file))
+    for said in implausible(case.settings.lidar.mount):
+        yield remark(about, said, "correct it, or leave it if it is so")
 
 
 def clock(case: Case) -> Iterator[Finding]:
@@ -120,7 +125,7 @@ def cache(case: Case) -> Iterator[Finding]:
 
 def disk(case: Case) -> Iterator[Finding]:
     """Room for maps and recordings."""
-    for folder in {_maps(case.settings) or state_folder(), state_folder()}:
+    for folder in filter(can_be_made, {_maps(case.settings) or state_folder(), state_folder()}):
         free = case.host.free_bytes(folder)
         if free < FREE_BYTES:
             text = f"{free >> 20} MB are free where {folder} is: maps cannot be saved when it is full"
@@ -221,10 +226,28 @@ def ports(case: Case) -> Iterator[Finding]:
         if why := case.host.taken(kind, settings.bind, port):
             bad = True
             name = "TCP" if kind is socket.SOCK_STREAM else "UDP"
-            low = "ports below 1024 need a right of their own" if port < 1024 else f"`ss -lnp` says who has {port}"
-            yield fix("ports", f"{key}: {name} {settings.bind}:{port}: {why}", f"{low}; or set another {key}")
+            refused = refusal(name, key, port, why)
+            others = why.errno == errno.EADDRINUSE
+            remedy = f"`ss -lnp` says who has {port}; or set another {key}" if others else refused.remedy
+            yield fix("ports", f"{key}: {name} {settings.bind}:{port}: {refused.problem}", remedy)
     if not bad:
         yield good("ports", ", ".join(sorted({f"{key} {port}" for key, _, port in wanted})) + " can be had")
+
+
+def rtu(case: Case) -> Iterator[Finding]:
+    """The serial line for Modbus."""
+    line = case.settings.modbus.line
+    if line is not None and not case.runs:
+        yield _unusable("modbus", line.path, case.host) or good("modbus", f"{line.path} can be opened")
+
+
+def receivers(case: Case) -> Iterator[Finding]:
+    """Hosts that pose datagrams are sent to."""
+    for receiver in case.settings.pose.receivers:
+        host, _ = parse_endpoint(receiver)
+        if host != ANYBODY and (why := case.host.resolved(host)):
+            remedy = "correct the name in pose.receivers, or write the address; is the network up?"
+            yield fix("receivers", f"{receiver}: {why}", remedy)
 
 
 def maps(case: Case) -> Iterator[Finding]:
@@ -233,8 +256,6 @@ def maps(case: Case) -> Iterator[Finding]:
     if not settings.map.kept:
         yield remark("maps", "are not kept: `map.folder` is none")
         return
-    from daemon.check import look_at_maps
-
     try:
         usable, text = look_at_maps(settings)
     except SurveyError:
@@ -342,5 +363,5 @@ def sockets(case: Case) -> Iterator[Finding]:
 
 CHECKS: Final[tuple[Check, ...]] = (
     *(configuration, survey, disk, cache, lidar, photodiode),
-    *(ports, maps, sockets, daemon, lamps, clock, realtime),
+    *(ports, rtu, receivers, maps, sockets, daemon, lamps, clock, realtime),
 )

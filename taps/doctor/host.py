@@ -97,8 +97,16 @@ class Host:
             folder = folder.parent
         return shutil.disk_usage(folder).free
 
-    def taken(self, kind: socket.SocketKind, host: str, port: int) -> str:
-        """Why a server could not listen there; empty: it could."""
+    def resolved(self, host: str) -> str:
+        """Why a name stands for no address; empty: it does, or is one."""
+        try:
+            socket.getaddrinfo(host, None)
+        except OSError as error:
+            return error.strerror or str(error)
+        return ""
+
+    def taken(self, kind: socket.SocketKind, host: str, port: int) -> OSError | None:
+        """Why a server could not listen there; None: it could."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.socket(family, kind) as sock:
             if kind is socket.SOCK_STREAM:
@@ -106,8 +114,8 @@ class Host:
             try:
                 sock.bind((host, port))
             except OSError as error:
-                return error.strerror or str(error)
-        return ""
+                return error
+        return None
 
     def warm(self, lights: bool) -> bool:
         """Whether the kernels of this version have been compiled here.

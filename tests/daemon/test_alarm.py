@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.alarm import CLEAR_S, Alarm, bounded
+from daemon.alarm import CLEAR_S, SETTLE_S, Alarm, bounded
 from daemon.publish.snapshot import State
 from daemon.reasons import Reason
 from daemon.state_evidence import Evidence
@@ -30,6 +30,28 @@ def test_who_knows_nothing_does_not_say_that_all_is_well(caplog: pytest.LogCaptu
         assert all(run(alarm, [None] * 20))
     assert caplog.messages == [], "before the first bound there is nothing to be alarmed about"
     assert not alarm.said
+
+
+def test_a_bound_that_never_comes_within_the_limit_is_said_once_it_has_had_the_time(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    alarm = Alarm(0.02)
+    with caplog.at_level(logging.INFO):
+        run(alarm, [None] * 300)
+        run(alarm, [0.03] * round(10.0 * SETTLE_S), 30.0)
+        assert not alarm.said, "it may still be settling"
+        run(alarm, [0.03, None, 0.03], 30.0 + SETTLE_S)
+        assert alarm.said
+        run(alarm, [0.01] * 20, 50.0)
+    assert not alarm.said
+    assert len(caplog.messages) == 2
+    assert "the limit of 0.02 m" in caplog.messages[0]
+
+
+def test_a_start_whose_bound_settles_is_no_alarm(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        run(Alarm(0.02), [None] * 20 + [0.05] * 30 + [0.01] * 20)
+    assert caplog.messages == []
 
 
 @pytest.mark.parametrize("bad", [None, 0.51, float("nan"), float("inf")])

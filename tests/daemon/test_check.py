@@ -79,6 +79,32 @@ def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pyte
     assert "the survey is not used: `photodiode.bus` is empty" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("mount", "remark"),
+    [
+        ("x = 20.0", "`lidar.mount.x` = 20: metres from the robot's centre; is that meant?"),
+        ("yaw = 1.5708", "`lidar.mount.yaw` = 1.5708: degrees; is 90 meant?"),
+        ("yaw = -3.1416", "`lidar.mount.yaw` = -3.1416: degrees; is -180 meant?"),
+        ("y = 4.9, yaw = 1.5", ""),
+        ("yaw = 90.0", ""),
+    ],
+)
+def test_a_mount_in_other_units_is_remarked(
+    mount: str, remark: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(f'map.folder = "none"\nlidar.mount = {{ {mount} }}\n')
+    assert cli.main(["check", str(file)]) == cli.OK
+    assert capsys.readouterr().out.splitlines()[1:] == ([remark] if remark else [])
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text('map.folder = "/proc/maps"\n')
+    assert cli.main(["check", str(file)]) == cli.OK
+    assert "/proc/maps: cannot be made by this user" in capsys.readouterr().out
+
+
 def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     maps, file = tmp_path / "maps", tmp_path / "robot.toml"
     file.write_text(f'[map]\nfolder = "{maps}"\n')

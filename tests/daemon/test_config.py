@@ -128,6 +128,12 @@ def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, tex
     assert expected in refused(tmp_path, text)
 
 
+@pytest.mark.parametrize("device", ["/dev/ttyACM0@baud", "/dev/ttyACM0@", "/dev/ttyUSB0@19201"])
+def test_what_is_no_line_rate_is_refused(device: str) -> None:
+    with pytest.raises(ValueError, match=r"Expected a line rate of 19200, .* behind `@`"):
+        parse_lidar(device)
+
+
 def test_the_parts_of_a_place_are_told_apart() -> None:
     assert parse_lidar("auto:H0906091") == LidarPlace("auto", serial="H0906091")
     assert parse_lidar("/dev/ttyUSB0@115200") == LidarPlace("/dev/ttyUSB0", baud=115200)

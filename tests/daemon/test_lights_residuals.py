@@ -6,14 +6,13 @@ import base64
 import errno
 import json
 import logging
-import threading
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import daemon.record
+import daemon.disk
 from daemon import disk
 from daemon.config import Config, LightsConfig, PhotodiodeConfig
 from daemon.lights import RESIDUALS, Lights, from_header, load_lights, lost_residuals, new_state
@@ -24,7 +23,6 @@ from estimator.cdma_profile import PROFILE_A
 from estimator.lamps import Survey
 from estimator.residual import ResidualMap
 from hal.clock import SystemClock
-from hal.errors import DeviceRefused
 from hal.replay.recording import Kind, open_recording
 from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.test_record import wait_for
@@ -111,10 +109,11 @@ def test_no_room_for_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(daemon.record, "write_whole", full)
-    with pytest.raises(DeviceRefused, match="No space left on device"):
-        Recorder(tmp_path, Config(), SystemClock(), Lights(SURVEY, PROFILE_A, None, b"a map"))
-    assert "lumiloop-disk" not in [thread.name for thread in threading.enumerate()]
+    monkeypatch.setattr(daemon.disk, "write_whole", full)
+    recorder = Recorder(tmp_path, Config(), SystemClock(), Lights(SURVEY, PROFILE_A, None, b"a map"))
+    assert "No space left on device" in recorder.error, "what cannot be replayed without it is not recorded"
+    recorder.close()
+    assert not list(recorder.disk.folder.iterdir())
 
 
 @pytest.mark.parametrize(

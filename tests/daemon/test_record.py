@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import math
 import os
 import subprocess
 import sys
@@ -16,12 +17,16 @@ import pytest
 from daemon import disk
 from daemon.config import Config
 from daemon.disk import SegmentWriter
+from daemon.flight import RING
+from daemon.lights import RESIDUALS, Lights
 from daemon.record import Recorder
+from estimator.cdma_profile import PROFILE_A
 from hal.clock import SystemClock
-from hal.errors import DeviceMissing, DeviceRefused, HalError
+from hal.errors import DeviceMissing, HalError
 from hal.port import Port, memory_pair
 from hal.replay.recording import Frame, Kind, open_recording
 from hal.replay.report import LogReport
+from tests.daemon.mapmaker import SURVEY
 
 
 @pytest.fixture(autouse=True)
@@ -195,10 +200,28 @@ def test_each_run_gets_a_folder_of_its_own(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run-2", "run-3"]
 
 
-def test_a_place_that_cannot_be_written_is_refused_at_the_start(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DeviceRefused, match=r"file: cannot be recorded into: Not a directory \(free space"):
-        Recorder(tmp_path / "file", Config(), SystemClock())
+@pytest.mark.parametrize("keep_s", [math.inf, 60.0])
+def test_a_place_that_cannot_be_written_at_the_start_is_tried_again(
+    tmp_path: Path, keep_s: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = tmp_path / "file"
+    place.write_text("")
+    recorder = Recorder(place, Config(), SystemClock(), Lights(SURVEY, PROFILE_A, None, b"a map"), keep_s=keep_s)
+    assert recorder.failing == {"recorder"}
+    assert f"recording into {recorder.disk.folder} has stopped: Not a directory" in caplog.text
+    recorder.disk.put(Kind.RX, 0, 1.0, b"lost")
+    wait_for(lambda: recorder.disk.lost == 1)
+    place.unlink()
+    wait_for(lambda: not recorder.error)
+    recorder.disk.put(Kind.RX, 0, 2.0, b"kept")
+    recorder.box.flight.prepare()
+    if not math.isinf(keep_s):
+        wait_for(lambda: (recorder.disk.folder / RING).exists())
+    recorder.close()
+    frames, _ = read(place)
+    assert [frame.payload for frame in frames if frame.kind == Kind.RX] == [b"kept"]
+    assert frames[0].kind == Kind.NOTE
+    assert (recorder.disk.folder / RESIDUALS).read_bytes() == b"a map"
 
 
 def test_the_header_says_what_was_recorded_with_what(tmp_path: Path) -> None:

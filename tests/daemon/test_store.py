@@ -14,7 +14,7 @@ from daemon import store as module
 from daemon.config import MapConfig
 from daemon.folders import maps_folder
 from daemon.lights import Lights, new_state
-from daemon.store import NEWEST, NoMap, Store, recorded_start, started
+from daemon.store import NEWEST, OTHERS, NoMap, Store, recorded_start, started
 from daemon.store_file import Damaged
 from daemon.store_tables import digest_of
 from estimator.cdma_profile import PROFILE_A
@@ -81,6 +81,30 @@ def test_of_other_maps_the_newest_generation_is_kept_of_the_seven_latest(
     assert "maps of other places are newer" in caplog.text
 
 
+def test_a_good_generation_of_another_map_stays_where_the_newer_one_is_broken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store_with(tmp_path, 1, 2, 3).close()
+    (tmp_path / name(1)).write_bytes(content(seed=1))
+    broken = tmp_path / name(3)
+    broken.write_bytes(broken.read_bytes()[:900])
+    store = Store(tmp_path)
+    with caplog.at_level(logging.INFO):
+        for _ in range(2):
+            store.save(content(Shape(map_id=5)), 5)
+    assert names(tmp_path) == [name(4, 5), name(5, 5), name(2), name(3)]
+    assert f"{tmp_path / name(1)} goes: an older generation" in caplog.text
+    assert caplog.text.count(f"{broken} cannot be used") == 1
+
+
+def test_maps_that_cannot_be_read_do_not_push_out_those_that_can(tmp_path: Path) -> None:
+    store = store_with(tmp_path, 1)
+    for map_id in range(1, OTHERS + 2):
+        store.save(content(Shape(map_id=map_id)), map_id)
+        (tmp_path / name(1 + map_id, map_id)).write_bytes(b"")
+    assert name(1) in names(tmp_path)
+
+
 @pytest.mark.parametrize("spoil", [lambda good: good[:900], lambda good: b"x" + good[1:], lambda good: b""])
 def test_a_broken_map_is_kept_aside_and_the_generation_before_it_loaded(
     tmp_path: Path, spoil: object, caplog: pytest.LogCaptureFixture
@@ -95,7 +119,7 @@ def test_a_broken_map_is_kept_aside_and_the_generation_before_it_loaded(
     assert start.content == content(seed=1)
     assert store.refused
     assert names(tmp_path) == [name(1), name(2, more=".broken")]
-    for said in (str(broken) + ".broken", "is refused", "the generation before it is used"):
+    for said in (f"{broken}.broken is refused", f"{tmp_path / name(1)} is used, the newest good generation"):
         assert said in caplog.text
     store.save(content(seed=3), MAP)
     assert names(tmp_path) == [name(1), name(2, more=".broken"), name(3)]
@@ -127,8 +151,17 @@ def test_what_was_forgotten_does_not_come_back_where_the_new_map_is_broken(
     store.save(content(Shape(map_id=5)), 5)
     store.close()
     tmp_path.joinpath(name(2, 5)).write_bytes(b"")
-    assert Store(tmp_path).load() is None
+    assert started(MapConfig(folder=str(tmp_path)), None)[1] is None
     assert "a new one is begun" in caplog.text
+    assert "is used" not in caplog.text
+
+
+def test_who_only_looks_says_nothing_of_what_is_begun(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tmp_path.joinpath(name(1)).write_bytes(content()[:900])
+    assert Store(tmp_path, mend=False).load() is None
+    assert "it ends" in caplog.text or "cut off" in caplog.text
+    assert "begun" not in caplog.text
+    assert "is used" not in caplog.text
 
 
 def test_each_building_has_its_own_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -190,19 +190,34 @@ def test_kernels_of_light_are_counted_only_where_there_is_a_photodiode() -> None
 
 def test_a_command_says_once_that_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
+    monkeypatch.setattr(warmup, "LOOK_S", 0.002)
+    kernels: set[Path] = {Path("of another part")}
+    monkeypatch.setattr(warmup, "_compiled", lambda: set(kernels))
+    first = threading.Event()
     said: list[str] = []
-    done: list[int] = []
+
+    def say(text: str) -> None:
+        said.append(text)
+        first.set()
 
     def work() -> None:
-        assert len(said) == 1, "said before it is done"
-        done.append(1)
+        kernels.add(Path("made"))
+        assert first.wait(5.0), "said before it is done"
 
     for _ in range(2):
-        warmup.load_aloud(said.append, "warm", work)
-    assert len(done) == 1
+        warmup.load_aloud(say, "warm", work)
     assert said[0].startswith("first start of this version: its kernels are being compiled")
-    assert said[1].startswith("0 kernels compiled in 0 s")
+    assert said[1].startswith("1 kernels compiled in 0 s")
     assert len(said) == 2
+
+
+def test_a_command_whose_kernels_are_there_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
+    monkeypatch.setattr(warmup, "LOOK_S", 0.002)
+    said: list[str] = []
+    warmup.load_aloud(said.append, "export", lambda: time.sleep(0.02))
+    assert said == []
+    assert (tmp_path / "export").exists()
 
 
 def test_a_command_that_cannot_load_leaves_no_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

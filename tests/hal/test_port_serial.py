@@ -171,6 +171,15 @@ def test_errno_inside_a_wrapped_termios_error() -> None:
     assert "not a serial port" in str(explain_open_error("/dev/null", 19200, wrapped))
 
 
+def test_a_line_that_does_not_take_a_character_format_is_named_with_it() -> None:
+    wrapped = serial.SerialException("Could not configure port: (22, 'Invalid argument')")
+    wrapped.__context__ = termios.error(errno.EINVAL, "Invalid argument")
+    error = explain_open_error("/dev/null", 19200, wrapped, "8E1")
+    assert "does not take the character format 8E1" in str(error)
+    assert "8N1" in error.remedy
+    assert "not a serial port" in str(explain_open_error("/dev/null", 19200, wrapped, "8N1"))
+
+
 def test_permission_remedy_names_the_group_of_the_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Entry:
         gr_name = "uucp"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
+import os
 import re
 import socket
 from collections.abc import Callable
@@ -42,7 +44,7 @@ class Computer(Host):
     t_utc: float = 1.76e9
     follows: bool | None = True
     room: int = 10 << 30
-    ports: dict[int, str] = field(default_factory=dict)
+    ports: dict[int, int] = field(default_factory=dict)
     compiled: bool = True
     no_cache: str = ""
     rights: bool = True
@@ -74,8 +76,11 @@ class Computer(Host):
     def free_bytes(self, folder: Path) -> int:
         return self.room
 
-    def taken(self, kind: socket.SocketKind, host: str, port: int) -> str:
-        return self.ports.get(port, "")
+    def taken(self, kind: socket.SocketKind, host: str, port: int) -> OSError | None:
+        return OSError(self.ports[port], os.strerror(self.ports[port])) if port in self.ports else None
+
+    def resolved(self, host: str) -> str:
+        return "Name or service not known" if host == "nohost" else ""
 
     def warm(self, lights: bool) -> bool:
         if self.no_cache:
@@ -144,9 +149,14 @@ CASES = {
     "no converter": (broken(bus=EMPTY), "photodiode", "no mcp3221 at 0x4d; there is 0x48", "check power, SDA and SCL"),
     "no time": (broken(t_utc=12.0), "clock", "before 2025", "timedatectl set-ntp true"),
     "disk full": (broken(room=5 << 20), "disk", "5 MB are free", "free some space"),
-    "port taken": (broken(ports={1502: "Address already in use"}), "ports", "TCP 127.0.0.1:1502", "`ss -lnp` says who"),
+    "port taken": (broken(ports={1502: errno.EADDRINUSE}), "ports", "TCP 127.0.0.1:1502", "`ss -lnp` says who"),
+    "no such address": (
+        broken(ports={1502: errno.EADDRNOTAVAIL}),
+        *("ports", "does not have that address", "set bind to an address of this computer"),
+    ),
+    "no right to the port": (broken(ports={1502: errno.EACCES}), "ports", "Permission denied", "log"),
     "odometry port taken": (
-        broken(ports={7000: "Address already in use"}),
+        broken(ports={7000: errno.EADDRINUSE}),
         "ports",
         "UDP 127.0.0.1:7000",
         "odometry.port",
@@ -199,7 +209,7 @@ def test_what_works_worse_than_it_could_is_a_note(name: str, file: Path, capsys:
 
 
 def test_the_first_to_fix_is_named_last(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer(ttys=[], room=0, ports={1502: "Address already in use"})) == cli.FAILED
+    assert asked(file, Computer(ttys=[], room=0, ports={1502: errno.EADDRINUSE})) == cli.FAILED
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("4 to fix; first: disk: free some space")
 
@@ -220,6 +230,25 @@ def test_files_that_are_wrong(file: Path, tmp_path: Path, capsys: pytest.Capture
 def test_another_sensor_than_the_one_configured(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert asked(file, Computer(), "lidar.device=auto:H1") == cli.FAILED
     assert "serial H0906091, configured is H1" in capsys.readouterr().out
+
+
+def test_lines_receivers_and_mounts_are_looked_at(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("modbus.serial=/dev/ttyS99@9600,8N1", 'pose.receivers=["nohost:5600", "*:5601"]', "lidar.mount.x=20")
+    assert asked(file, Computer(missing={"/dev/ttyS99"}), *words) == cli.FAILED
+    said = capsys.readouterr().out
+    assert re.search(r"FIX +modbus +/dev/ttyS99: not there", said)
+    assert re.search(r"FIX +receivers +nohost:5600: Name or service not known", said)
+    assert re.search(r"note +configuration +`lidar.mount.x` = 20: metres", said)
+    assert asked(file, Computer(), words[0]) == cli.OK
+
+
+def test_a_folder_that_cannot_be_made_is_not_a_full_disk(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file.write_text(CONFIG + 'map.folder = "/proc/maps"\n')
+    assert asked(file, Computer(room=0)) == cli.FAILED
+    said = capsys.readouterr().out
+    assert "FIX  maps" in said
+    assert "/proc/maps: cannot be made by this user" in said
+    assert "where /proc" not in said
 
 
 def test_a_running_daemon_is_listened_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,8 +272,12 @@ def test_the_computer_itself_answers() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         port = sock.getsockname()[1]
-        assert "in use" in host.taken(socket.SOCK_DGRAM, "127.0.0.1", port)
-    assert host.taken(socket.SOCK_DGRAM, "127.0.0.1", port) == ""
+        why = host.taken(socket.SOCK_DGRAM, "127.0.0.1", port)
+        assert why is not None
+        assert why.errno == errno.EADDRINUSE
+    assert host.taken(socket.SOCK_DGRAM, "127.0.0.1", port) is None
+    assert host.resolved("127.0.0.1") == ""
+    assert host.resolved("no host") != ""
     assert host.realtime() in (True, False)
     assert isinstance(host.lidars(), list)
     assert isinstance(host.buses(), list)

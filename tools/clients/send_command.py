@@ -31,13 +31,13 @@ class Commander:
         self._transaction = 0
 
     def order(self, name: str, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), map_id: int = 0) -> int:
-        """Give an order; returns its number."""
+        """Give an order; returns its number. Raises ValueError for numbers that its registers cannot hold."""
         (before,) = struct.unpack(">H", self._ask(struct.pack(">BHH", 3, COMMAND, 1))[2:])
         number = before % 0xFFFF + 1
         if name == "switch_map":
-            self._ask(struct.pack(">BHHBI", 16, MAP_ID, 2, 4, map_id))
-        x, y, yaw = round(pose[0] * 1e4), round(pose[1] * 1e4), round(pose[2] * 1e6)
-        body = struct.pack(">HHiii", number, 1 + COMMANDS.index(name), x, y, yaw)
+            self._ask(struct.pack(">BHHB", 16, MAP_ID, 2, 4) + _packed(">I", map_id))
+        scaled = (scale * value for scale, value in zip((1e4, 1e4, 1e6), pose, strict=True))
+        body = struct.pack(">HH", number, 1 + COMMANDS.index(name)) + _packed(">iii", *scaled)
         self._ask(struct.pack(">BHHB", 16, COMMAND, 8, 16) + body)
         return number
 
@@ -66,11 +66,19 @@ class Commander:
                     answer = self._sock.recv(512)
                     if answer[:2] == frame[:2]:
                         if answer[7] & 0x80:
-                            raise ValueError(f"Modbus exception {answer[8]} (1: set modbus.write = true)")
+                            hint = " (set modbus.write = true)" if answer[8] in (1, 2) else ""
+                            raise ValueError(f"Modbus exception {answer[8]}{hint}")
                         return answer[7:]
             except TimeoutError:
                 continue
         raise TimeoutError("no answer")
+
+
+def _packed(form: str, *numbers: float) -> bytes:
+    try:
+        return struct.pack(form, *map(round, numbers))
+    except (struct.error, OverflowError, ValueError):  # too large, infinite, no number
+        raise ValueError("out of range: metres to 214748, radians to 2147, a map's ID of 8 digits") from None
 
 
 def main(words: list[str]) -> str:

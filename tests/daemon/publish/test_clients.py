@@ -200,7 +200,7 @@ def test_commander_where_writing_is_not_allowed() -> None:
     async def run() -> None:
         async with publishing() as publisher:
             commander = send_command.Commander("127.0.0.1", publisher.port)
-            with pytest.raises(ValueError, match=r"modbus\.write"):
+            with pytest.raises(ValueError, match=r"exception 2 \(set modbus\.write = true\)"):
                 await asyncio.to_thread(commander.order, "reset")
             commander.close()
 
@@ -212,6 +212,13 @@ def test_commander_where_writing_is_not_allowed() -> None:
 )
 def test_commander_says_what_it_cannot_read(words: str) -> None:
     with pytest.raises(ValueError, match="Commands: set_pose, reset"):
+        send_command.main(words.split())
+
+
+@pytest.mark.parametrize("words", ["set_pose 1e9 0 0", "set_pose 0 inf 0", "set_pose 0 0 nan", "switch_map 100000000"])
+def test_commander_says_what_does_not_fit(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(send_command.Commander, "_ask", lambda self, body: bytes(4))
+    with pytest.raises(ValueError, match="out of range: metres to 214748"):
         send_command.main(words.split())
 
 

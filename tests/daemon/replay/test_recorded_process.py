@@ -60,9 +60,12 @@ def test_the_ring_of_a_killed_run_is_a_dump_after_the_next_start_and_is_repeated
 
 
 @pytest.mark.realtime
-def test_a_folder_that_cannot_be_written_stops_the_start(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with fake_lidar(tmp_path / "lidar"), running(tmp_path / "lidar", "--record", str(tmp_path / "file")) as daemon:
-        _, said = daemon.process.communicate(timeout=20.0)
-        assert daemon.process.returncode == cli.FAILED
-        assert "file: cannot be recorded into: Not a directory (free space, or name a folder" in said
+def test_a_folder_that_cannot_be_written_costs_the_recording_and_no_more(tmp_path: Path) -> None:
+    place = tmp_path / "file"
+    place.write_text("")
+    with fake_lidar(tmp_path / "lidar"), running(tmp_path / "lidar", "--record", str(place)) as daemon:
+        daemon.until(30.0, "state", State.TRACKING)
+        daemon.until(10.0, "fault", 402)
+        code, said, _ = daemon.stop()
+    assert code == cli.OK
+    assert "has stopped: Not a directory" in said
