@@ -28,17 +28,22 @@ class Commander:
         self._sock = socket.socket(family, kind)
         self._sock.settimeout(0.5)
         self._sock.connect(address)
-        self._transaction = 0
+        self._transaction, self.close = 0, self._sock.close
 
     def order(self, name: str, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), map_id: int = 0) -> int:
         """Give an order; returns its number. Raises ValueError for numbers that its registers cannot hold."""
+        try:
+            place = struct.pack(
+                ">iii", *(round(scale * value) for scale, value in zip((1e4, 1e4, 1e6), pose, strict=True))
+            )
+            switch = struct.pack(">BHHBI", 16, MAP_ID, 2, 4, map_id)
+        except (struct.error, OverflowError, ValueError):  # too large, infinite, no number
+            raise ValueError("out of range: metres to 214748, radians to 2147, a map's ID of 8 digits") from None
         (before,) = struct.unpack(">H", self._ask(struct.pack(">BHH", 3, COMMAND, 1))[2:])
         number = before % 0xFFFF + 1
         if name == "switch_map":
-            self._ask(struct.pack(">BHHB", 16, MAP_ID, 2, 4) + _packed(">I", map_id))
-        scaled = (scale * value for scale, value in zip((1e4, 1e4, 1e6), pose, strict=True))
-        body = struct.pack(">HH", number, 1 + COMMANDS.index(name)) + _packed(">iii", *scaled)
-        self._ask(struct.pack(">BHHB", 16, COMMAND, 8, 16) + body)
+            self._ask(switch)
+        self._ask(struct.pack(">BHHBHH", 16, COMMAND, 8, 16, number, 1 + COMMANDS.index(name)) + place)
         return number
 
     def wait(self, number: int, seconds: float = 30.0) -> str:
@@ -51,17 +56,13 @@ class Commander:
             time.sleep(0.05)
         return "running"
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._sock.close()
-
     def _ask(self, body: bytes) -> bytes:
         """An answer's body. A write is repeated when its answer is lost: the same number does nothing twice."""
         self._transaction = (self._transaction + 1) & 0xFFFF
         frame = struct.pack(">HHHB", self._transaction, 0, len(body) + 1, 1) + body
         for _ in range(5):
             self._sock.send(frame)
-            try:
+            with contextlib.suppress(TimeoutError):
                 while True:
                     answer = self._sock.recv(512)
                     if answer[:2] == frame[:2]:
@@ -69,16 +70,7 @@ class Commander:
                             hint = " (set modbus.write = true)" if answer[8] in (1, 2) else ""
                             raise ValueError(f"Modbus exception {answer[8]}{hint}")
                         return answer[7:]
-            except TimeoutError:
-                continue
         raise TimeoutError("no answer")
-
-
-def _packed(form: str, *numbers: float) -> bytes:
-    try:
-        return struct.pack(form, *map(round, numbers))
-    except (struct.error, OverflowError, ValueError):  # too large, infinite, no number
-        raise ValueError("out of range: metres to 214748, radians to 2147, a map's ID of 8 digits") from None
 
 
 def main(words: list[str]) -> str:
