@@ -30,7 +30,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/soak"))
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the processes that are watched must not outlive this one
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what is watched must not outlive this one
     rows, watch = (
         of_processes(options.real, options.seed, options.out) if options.real else of_days(options.days, options.seed)
     )
