@@ -52,24 +52,15 @@ def test_the_graph_is_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "a.png").stat().st_size > 10_000
 
 
-def soak(days: str, out: Path, slope_mb_h: float) -> None:
-    command = [sys.executable, "-m", "tools.soak", "--days", days, "--out", str(out)]
+@pytest.mark.system
+@pytest.mark.timeout(1800)
+def test_a_day(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tools.soak", "--days", "1", "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode in (0, 1), done.stdout + done.stderr
-    rows = {row["name"]: row["value"] for row in json.loads((out / "days.json").read_text())}
-    assert rows["memory, slope"] < slope_mb_h, done.stdout
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = {row["name"]: row["value"] for row in json.loads((tmp_path / "days.json").read_text())}
+    assert rows["memory, slope"] <= 0.5, done.stdout
     assert rows["files, most less least"] == rows["threads, most less least"] == 0.0
     assert rows["cycles in TRACKING"] > 0.3
     assert rows["position error, median"] < 0.3
-    assert (out / "days.png").exists()
-
-
-@pytest.mark.system
-def test_a_quarter_of_a_day(tmp_path: Path) -> None:
-    soak("0.25", tmp_path, 3.0)  # the allocator's own ups and downs of some MB weigh more over four hours
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_day(tmp_path: Path) -> None:
-    soak("1", tmp_path, 0.5)
+    assert (tmp_path / "days.png").exists()
