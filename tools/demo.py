@@ -106,10 +106,10 @@ def free_port() -> int:
 
 
 def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) -> Path:
-    """The daemon's configuration for this run."""
+    """The daemon's configuration for this run; its stream is found by the name, which no other run has."""
     path = folder / CONFIG
     text = (
-        f'name = "demo"\nbind = "127.0.0.1"\n\n'
+        f'name = "demo-{os.getpid()}"\nbind = "127.0.0.1"\n\n'
         f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
         f'[map]\nfolder = "none"\n\n[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\nwrite = true\n'
     )
