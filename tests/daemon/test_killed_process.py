@@ -66,8 +66,8 @@ def test_a_robot_that_stands_is_tracking_again_soon_after_a_kill(tmp_path: Path)
             daemon.process.kill()
             daemon.process.communicate(timeout=10.0)
         with running(link, *keys) as daemon:
-            daemon.reading(PATIENCE_S)
-            ready = daemon.until(PATIENCE_S, "state", State.RELOCATING)
+            ready = daemon.reading(PATIENCE_S)
+            assert ready["state"] is not State.TRACKING
             ready_s = processor_s(daemon.process.pid)
             after = daemon.until(PATIENCE_S, "state", State.TRACKING)
             tracking_s = processor_s(daemon.process.pid)
