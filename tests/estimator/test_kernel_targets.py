@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.rotation import turn
+
 ROOT = Path(__file__).parents[2]
 WAYS: dict[str, dict[str, str]] = {
     "as usual": {},
@@ -64,7 +66,12 @@ def test_an_index_that_is_out_of_bounds_is_noticed() -> None:
     assert said == {"as usual": "", "indices checked": "noticed\n", "generic processor": ""}
 
 
-@pytest.mark.parametrize("way", OTHERS)
+def marked(way: str) -> object:
+    """One way with each commit: these two take four minutes."""
+    return pytest.param(way, marks=[] if OTHERS.index(way) == turn(len(OTHERS)) else [pytest.mark.slow])
+
+
+@pytest.mark.parametrize("way", [marked(way) for way in OTHERS])
 def test_the_estimators_tests_pass(way: str) -> None:
     files = [f"tests/estimator/test_{name}.py" for name in CHOSEN]
     done = child(way, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow and not system", *files)

@@ -6,25 +6,16 @@ A third of the cells runs with the system tests, another third with every commit
 from __future__ import annotations
 
 import dataclasses
-import subprocess
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from tests.faults.matrix import DEVICES, TIMES, WORDS, Cell, cells, objections, play
+from tests.rotation import turn
 
-ROOT = Path(__file__).parents[2]
 CELLS = cells()
-
-
-def turn() -> int:
-    """Which third it is, by the commit."""
-    asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
-    return int(asked.stdout.strip() or "0", 16) % 3
-
-
-TURN = turn()
+TURN = turn(3)
 
 
 def third(cell: Cell) -> int:
