@@ -67,7 +67,7 @@ def test_a_robot_that_stands_is_tracking_again_soon_after_a_kill(tmp_path: Path)
             daemon.process.communicate(timeout=10.0)
         with running(link, *keys) as daemon:
             ready = daemon.reading(PATIENCE_S)
-            assert ready["state"] is not State.TRACKING
+            assert ready["state"] != State.TRACKING, "the place has to be found first"
             ready_s = processor_s(daemon.process.pid)
             after = daemon.until(PATIENCE_S, "state", State.TRACKING)
             tracking_s = processor_s(daemon.process.pid)
