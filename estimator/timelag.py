@@ -56,7 +56,7 @@ SCALE: Final = (0.5, 2.0)
 """Laser's turn by wheels' turn: beyond, they do not tell of the same."""
 STAMPS_S: Final = 0.005
 """One sigma of what stamps, and the time that a sweep takes, leave open."""
-LEAST_S, SIGMAS = 0.1, 4.0
+LEAST_S, SIGMAS = 0.1, 3.0
 """A lag that is told is greater than this by so many of its deviations; once told, half of it will do.
 
 Stamps at the arrival of scans whose sweep nobody knows are late by 0.09 s, filters in motor controllers by 0.07 s: both
@@ -177,20 +177,34 @@ def judged(lag: TimeLag) -> Lag | None:
     clear = R[wrong].min() - least >= REFUTED * variance and others.min() - least >= OTHERS * variance
     if not clear or least > (STILL_LEFT if lag.told else LEFT) * R[NONE]:
         return None
-    if lag.told is None and not stands_without(lag, best, wrong, variance):
+    parts = left_out(lag)
+    if lag.told is None and not stands(parts, best, wrong, variance):
         return None
-    sigma = math.sqrt(2.0 * variance / bend * STEP_S**2 + STAMPS_S**2)
-    told = Lag(float(LAGS[best]) + STEP_S * slope / bend, sigma)
-    return told if abs(told.lag_s) - SIGMAS * sigma > (0.5 * LEAST_S if lag.told else LEAST_S) else None
+    tau = float(LAGS[best]) + STEP_S * slope / bend
+    sigma = math.sqrt(2.0 * variance / bend * STEP_S**2 + scatter(parts, tau) + STAMPS_S**2)
+    return Lag(tau, sigma) if abs(tau) - SIGMAS * sigma > (0.5 * LEAST_S if lag.told else LEAST_S) else None
 
 
-def stands_without(lag: TimeLag, best: int, wrong: slice, variance: float) -> bool:
-    """Whether a lag, by its index, still stands whichever two blocks in a row are left out; ``wrong``: lags it denies.
+def left_out(lag: TimeLag) -> Array:
+    """R, (n, lags), with each two blocks in a row left out that hold something.
 
-    Slip is over within two blocks, and it would have to come again, and in the same way.
+    Slip is over within two blocks: it would have to come again, and in the same way, to speak for a lag in all rows.
     """
     sums, own = lag.sums + np.roll(lag.sums, 1, 0), lag.own + np.roll(lag.own, 1, 0)
     R = left_over(lag.sums.sum(0) - sums, lag.own.sum(0) - own)
-    least = R[:, best]
-    clear = R[:, wrong].min(1) - least >= STILL_REFUTED * variance
-    return bool((clear & (least <= STILL_LEFT * R[:, NONE])).all())
+    return np.asarray(R[own[:, 0] > 0.0])
+
+
+def stands(R: Array, best: int, wrong: slice, variance: float) -> bool:
+    """Whether a lag, by its index, stands in each row; ``wrong``: lags that it denies."""
+    clear = R[:, wrong].min(1) - R[:, best] >= STILL_REFUTED * variance
+    return bool((clear & (R[:, best] <= STILL_LEFT * R[:, NONE])).all())
+
+
+def scatter(R: Array, tau: float) -> float:
+    """Variance of the lag ``tau`` by how far the rows' lags lie from it (jackknife, two of n left out)."""
+    rows, best = np.arange(len(R)), np.clip(R.argmin(1), 1, len(LAGS) - 2)
+    before, here, after = R[rows, best - 1], R[rows, best], R[rows, best + 1]
+    bend = np.maximum(before - 2.0 * here + after, NOISE_RAD**2)
+    off = LAGS[best] + STEP_S * np.clip(0.5 * (before - after) / bend, -1.0, 1.0) - tau
+    return max(0.5 * len(R) - 1.0, 1.0) * float(np.mean(off * off))
