@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import socket
 import struct
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tools.bench.vm import bench, image, places, world
+from tools.bench.vm.__main__ import tried
 from tools.bench.vm.guest import agent
-from tools.bench.vm.machine import Ports, _words
+from tools.bench.vm.machine import Machine, Order, Ports, _words
 from tools.bench.vm.scenarios import PARTS, SCENARIOS, WRITTEN
 from tools.bench.world import agreement
 from tools.bench.world.room import room
@@ -28,7 +32,7 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) == len(set(SCENARIOS)) == len(WRITTEN)
     assert len(SCENARIOS) >= 25
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
-    assert [part.__name__.rpartition("_")[2] for part in PARTS] == ["system", "devices", "process"]
+    assert [part.__name__.rpartition("_")[2] for part in PARTS] == ["system", "devices", "photodiode", "process"]
 
 
 def test_what_is_missing_is_said_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,6 +111,46 @@ def test_the_disk_is_never_written_to_and_only_loopback_is_listened_on(tmp_path:
     forwards = [part for word in words for part in word.split(",") if part.startswith("hostfwd=")]
     assert len(forwards) == 3
     assert all(":127.0.0.1:" in forward for forward in forwards)
+
+
+class Agent(Machine):
+    """A machine whose agent gives one answer to everything."""
+
+    def __init__(self, answer: bytes, folder: Path) -> None:
+        super().__init__(subprocess.Popen(["true"]), folder, Ports(1, 2, 3))
+        self._agent, self.far = socket.socketpair()
+        self._lines = self._agent.makefile("rb")
+        self.far.sendall(answer)
+
+    def close(self) -> None:
+        self._drop()
+        self.far.close()
+        self.process.wait()
+
+
+def test_an_insidethat_is_started_anew_fails_its_order_and_not_the_bench(tmp_path: Path) -> None:
+    inside = Agent(b'{"up": true}\n', tmp_path)
+    with pytest.raises(Order, match="started anew while"):
+        inside.run("true")
+    inside.close()
+    inside = Agent(b'{"code": 0, "out": ""}\n', tmp_path)
+    inside.reboot()
+    asked = json.loads(inside.far.recv(4096))["run"]
+    begun = time.monotonic()
+    done = agent.obey({"run": [*asked[:2], asked[2].replace("systemctl reboot", "sleep 5")]})
+    assert done == {"code": 0, "out": ""}
+    assert time.monotonic() - begun < 0.4, "it is answered before it is carried out"
+    inside.close()
+
+
+def test_a_scenario_that_builds_on_one_that_failed_fails_itself() -> None:
+    def needs_more(bench: object) -> str:
+        """It needs what has not been seen."""
+        raise KeyError("drive")
+
+    result = tried(needs_more, object())  # type: ignore[arg-type]  # it looks at nothing of it
+    assert not result.passed
+    assert result.said == "what it builds on has not been seen: KeyError('drive')"
 
 
 def test_a_transaction_of_the_adapter_is_understood() -> None:

@@ -37,6 +37,8 @@ def tried(scenario: Scenario, bench: Bench) -> Result:
     try:
         told, passed = scenario(bench), True
         seen = told if isinstance(told, Seen) else Seen(told)
+    except LookupError as error:
+        seen, passed = Seen(f"what it builds on has not been seen: {error!r}"), False
     except (Order, OSError, ValueError, StopIteration) as error:
         seen, passed = Seen(f"{error}" or repr(error)), False
     seconds = time.monotonic() - begun

@@ -27,6 +27,7 @@ from tools.clients.read_modbus import Reader
 
 UNIT: Final = "lumiloop.service"
 CONFIG: Final = "/etc/lumiloop/lumiloop.toml"
+SAVE_MAP, DONE, REFUSED = 3, 2, 3
 COME_ID: Final = "0f26ad5c5f9d4f6fa1a3c8a7e7c1d9b4"
 OVER_ID: Final = "5c0cb1d0b8a64f27a0a5f5a4b0b9d3e1"
 PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
