@@ -75,9 +75,13 @@ def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pyte
     assert golden.judged(blessed, trajectory, [], 10).same
     assert not golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same, "another loop"
+    away = golden.judged(blessed, Trajectory(np.arange(25.0), moved), [], 10)
+    assert not away.same
+    assert "same machine: moved by 0.000002 m" in away.said
     monkeypatch.setattr(golden, "environment", lambda: "another processor")
     assert golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
-    far = poses + np.array((0.0, 1.1e-3, 0.0))
+    near, far = (poses + np.array((0.0, off, 0.0)) for off in (0.9e-3, 1.1e-3))
+    assert golden.judged(blessed, Trajectory(np.arange(25.0), near), [], 10).same
     assert not golden.judged(blessed, Trajectory(np.arange(25.0), far), [], 10).same
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same
     assert golden.largest_difference(blessed, Trajectory(np.arange(24.0), poses[:24]), 10) == float("inf")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 import tty
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -43,7 +45,7 @@ LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
 
 
 @pytest.mark.parametrize("path", sorted(BUILT_IN.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
+def test_scenarios_that_come_with_the_benchare_whole(path: Path) -> None:
     made = load(path)
     assert made.title != path.stem
     assert all(one.until <= made.drive.seconds and one.from_ < made.drive.seconds for one in made.expect)
@@ -112,6 +114,29 @@ def test_a_robot_computer_that_does_not_answer_is_told_so(tmp_path: Path, capsys
     assert main([str(file), "--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}"]) == 2
     assert "nobody answers at 127.0.0.1 port 9" in capsys.readouterr().out
     assert not (tmp_path / "l").exists()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_bench_that_is_ended_leaves_no_daemon(number: int, tmp_path: Path) -> None:
+    """In the middle of waiting for a pose."""
+    command = [sys.executable, "-m", "tools.bench.world", "lap", "--local", "--out", str(tmp_path / "out")]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment) as bench:
+        assert bench.stdout is not None
+        assert "waiting for a pose" in bench.stdout.readline()
+        (log,) = tmp_path.glob("lumiloop-world-*/daemon.log")
+        (child,) = Path(f"/proc/{bench.pid}/task/{bench.pid}/children").read_text().split()
+        bench.send_signal(number)
+        said = bench.communicate(timeout=60.0)[0]
+    end = time.monotonic() + 10.0
+    while Path("/proc", child).exists() and "Z" not in Path("/proc", child, "stat").read_text().rpartition(")")[2]:
+        assert time.monotonic() < end, "the daemon goes on"
+        time.sleep(0.02)
+    if number != signal.SIGKILL:
+        assert bench.returncode == 2
+        assert "ended before its end" in said
+        assert not log.parent.exists()
 
 
 # the judge

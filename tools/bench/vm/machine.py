@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tools.bench.vm.image import Image
-from tools.bench.vm.places import CannotBench
+from tools.bench.vm.places import LEASH, CannotBench
 
 BOOT_S, QUIT_S = 400.0, 10.0
 MODBUS, ODOMETRY = 1502, 5601
@@ -233,7 +233,7 @@ def started(image: Image, folder: Path, ports: Ports) -> Iterator[Machine]:
         said = stack.enter_context((folder / "qemu").open("wb"))
         environment = {**os.environ, "TMPDIR": str(folder)}
         process = subprocess.Popen(
-            _words(image, folder, ports), stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
+            [*LEASH, *_words(image, folder, ports)], stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
         )
         machine = Machine(process, folder, ports)
         stack.callback(machine.stop)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import signal
 import sys
 import time
 from collections.abc import Generator
@@ -133,6 +134,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (ScenarioError, CannotPlay, CannotCompare, HalError, FaultError, ValueError, OSError) as reason:
         say(f"cannot be played: {reason}")
         return CANNOT
+    except KeyboardInterrupt:
+        say("ended before its end")
+        return CANNOT
     told = facts(
         robot="a process here" if options.local else options.modbus, lidar=options.lidar or "pty",
         light=options.light or "-", scenarios="\n".join(find(name).read_text() for name in options.scenario or ["lap"]),
@@ -147,4 +151,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())
