@@ -149,6 +149,25 @@ def test_what_cannot_be_is_said_or_skipped_with_its_reason(tmp_path: Path) -> No
     assert "--operator terminal" in skipped["test_lidar.py::test_is_unplugged_and_plugged_in_again"]
 
 
+def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Path) -> None:
+    code, said, _ = suite(tmp_path, "-k", "light_levels")
+    assert code == 0, said
+    file = tmp_path / "old.json"
+    old = json.loads((tmp_path / "report" / "results.json").read_text())
+    file.write_text(json.dumps(old))
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(file))
+    assert code == 0, said
+    (swing,) = [one for one in old["results"][0]["figures"] if one["name"] == "swing of the signal"]
+    swing["value"] *= 3.0
+    file.write_text(json.dumps(old))
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(file))
+    assert code == 1
+    assert "worse than before: test_photodiode.py::test_light_levels: swing of the signal" in said
+    assert "swing of the signal" in (tmp_path / "report" / "report.html").read_text()
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / "none.json"))
+    assert (code, "name the results.json" in said) == (4, True)
+
+
 @pytest.mark.parametrize("name", ["/dev/i2c-1", "@0x4d", "/dev/i2c-1@4d,", "/dev/i2c-1@"])
 def test_a_converter_that_is_named_wrongly(name: str) -> None:
     with pytest.raises(pytest.UsageError, match="as /dev/i2c-1@0x4d"):
