@@ -1,7 +1,8 @@
 """Sessions with a Zenoh router: one that is away is waited for, said once, and come back to.
 
 Sessions are clients: everything passes through the router, nothing listens on the robot, and what was declared is
-declared again when the router is back. Calls that wait for the network are made in a thread.
+declared again when the router is back. Calls that wait for the network are made in threads for which nobody waits at
+a stop.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import json
 import re
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -18,10 +20,12 @@ import zenoh
 
 from daemon import cli
 from daemon.endpoints import parse_endpoint
+from hal.beside import beside
 
 LEASE_S: Final = 5.0
-"""Who has been silent for so long is gone, for the other side."""
+"""Who has been silent for so long is gone, for the other side; who does not answer so long is not there."""
 RETRY_S: Final = 1.0
+CLOSE_S: Final = 2.0
 BEAT_S: Final = 0.5
 ASK_S: Final = 3.0
 """A question to others is answered by then, or not at all."""
@@ -69,6 +73,7 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             "scouting/multicast/enabled": False,
             "timestamping/enabled": True,  # the caches for those who come late need it
             "transport/link/tx/lease": round(1e3 * LEASE_S),
+            "transport/unicast/open_timeout": round(1e3 * LEASE_S),
         }.items():
             made.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
@@ -94,7 +99,7 @@ async def joined(router: str, file: Path | None = None, say: Say = cli.say) -> A
     said = False
     while True:
         try:
-            session = await asyncio.to_thread(zenoh.open, made)
+            session = await beside(partial(zenoh.open, made), "zenoh")
             break
         except zenoh.ZError:
             if not said:
@@ -106,7 +111,9 @@ async def joined(router: str, file: Path | None = None, say: Say = cli.say) -> A
     try:
         yield session
     finally:
-        await asyncio.to_thread(session.close)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CLOSE_S):
+                await beside(session.close, "zenoh")
 
 
 async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = cli.say) -> None:
@@ -124,7 +131,7 @@ async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say:
 
 async def listed(session: zenoh.Session, key: str) -> list[str]:
     """Liveliness tokens that there are."""
-    replies = await asyncio.to_thread(lambda: list(session.liveliness().get(key, timeout=ASK_S)))
+    replies = await beside(lambda: list(session.liveliness().get(key, timeout=ASK_S)), "zenoh")
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
@@ -137,7 +144,7 @@ async def answers(session: zenoh.Session, key: str, seconds: float = ASK_S) -> l
         )
         return [parts(reply.ok) for reply in replies if reply.ok is not None]
 
-    return await asyncio.to_thread(ask)
+    return await beside(ask, "zenoh")
 
 
 class Declared(Protocol):

@@ -25,6 +25,7 @@ from taps.zenohlink import BadEndpoint, answers, joined, watched
 CONTENT_S: Final = 60.0
 """A map may take so long to come."""
 TRIES: Final = 3
+PAUSE_S: Final = 1.0
 AGAIN_S: Final = 300.0
 """So often it is looked for newer ones, whatever has been heard."""
 RETRY_S: Final = 15.0
@@ -103,14 +104,8 @@ class Fetcher:
         Raises:
             Refused: nothing came, or it is not taken.
         """
-        offers = []
-        for _, content, _ in await answers(session, key_of(kind)):
-            try:
-                offers.append(messages.read(content, Offer))
-            except Unreadable as error:
-                cli.say(f"what is offered as {kind} is not one: {error}")
         held = self._records.held().get(kind)
-        offer = chosen(kind, offers, held)
+        offer = chosen(kind, await self._offers(session, kind), held)
         if offer is None:
             assert held is not None
             return f"{kind} version {held.version} is here already"
@@ -125,6 +120,20 @@ class Fetcher:
         if kind == MAP and modbus is not None:
             note = await switched(modbus, offer.map_id)
         return f"{offer.said()} is in {where}; {note}"
+
+    async def _offers(self, session: zenoh.Session, kind: str) -> list[Offer]:
+        """What is shared; who shares may just be coming back, as after a router's restart."""
+        offers: list[Offer] = []
+        for left in reversed(range(TRIES)):
+            for _, content, _ in await answers(session, key_of(kind)):
+                try:
+                    offers.append(messages.read(content, Offer))
+                except Unreadable as error:
+                    cli.say(f"what is offered as {kind} is not one: {error}")
+            if offers or not left:
+                break
+            await asyncio.sleep(PAUSE_S)
+        return offers
 
     async def _content(self, session: zenoh.Session, offer: Offer) -> bytes:
         for _ in range(TRIES):

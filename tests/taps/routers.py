@@ -10,6 +10,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
 import zenoh
 
 from daemon.config import Config
@@ -52,6 +53,17 @@ def told_to(made: Router, name: str = "agv", **more: Any) -> Namespace:
     """What the command line would say."""
     given = {"router": made.address, "zenoh": None, "settings": Config(name=name), "rate": 20.0}
     return Namespace(**{**given, **more})
+
+
+class Heard:
+    """What has been said to people so far; called with words: whether they are among it, so often."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys, self._said = capsys, ""
+
+    def __call__(self, words: str, times: int = 1) -> bool:
+        self._said += self._capsys.readouterr().err
+        return self._said.count(words) >= times
 
 
 async def until(what: Callable[[], Any], seconds: float = 10.0) -> Any:

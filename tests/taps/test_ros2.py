@@ -107,7 +107,7 @@ def test_who_comes_late_gets_what_stands_still_also_after_the_router_was_gone(
         with zenoh.open(config("client", made.address)) as session:
             kept = [Subscriber(session, topic) for topic in ("/tf_static", "/lumiloop/state", "/map")]
             pose = Subscriber(session, "/pose")
-            await until(lambda: all(one.got for one in kept) and pose.got, 3.0)
+            await until(lambda: all(one.got for one in kept) and pose.got, 4.0)
             assert [one.got[0][1][0] for one in kept[1:]] == [1, 1]
             assert JAZZY.deserialize_cdr(kept[2].got[0][0], "nav_msgs/msg/OccupancyGrid").info.width == 128
 
