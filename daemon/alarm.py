@@ -67,9 +67,10 @@ class Alarm:
     def _raise(self, t_mono: float, bound_m: float | None) -> None:
         self.on = True
         if t_mono >= self._expected and not self.said:
-            said = "there is no bound on it" if bound_m is None else f"it may be {bound_m:.2f} m"
+            known = bound_m is not None and math.isfinite(bound_m)
+            said = f"it may be {bound_m:.3g} m" if known else "there is no bound on it"
             log.warning(
-                "alert: the position error may be above the limit of %.2f m that `integrity.alert_m` sets: %s; stop or "
+                "alert: the position error may be above the limit of %.3g m that `integrity.alert_m` sets: %s; stop or "
                 "go slow, read state and reason, and drive to where the pose is known",
                 self.limit_m,
                 said,
@@ -78,6 +79,6 @@ class Alarm:
 
     def _clear(self, t_mono: float, bound_m: float) -> None:
         if self.said:
-            log.info("alert over: the position error is below %.2f m, the limit is %.2f m", bound_m, self.limit_m)
+            log.info("alert over: the position error is below %.3g m, the limit is %.3g m", bound_m, self.limit_m)
         self.on = self.said = False
         self._expected = min(self._expected, t_mono)

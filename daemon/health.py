@@ -68,7 +68,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.LIDAR_MISSING: ("the lidar is not there", "check power, cable and `lidar.device`; run `lumiloop probe`"),
     Fault.LIDAR_REFUSED: (
         "the lidar's port may not be used",
-        "join the group dialout, close other programs that use it, or name another `lidar.device`",
+        "serial: join the group dialout; Ethernet: it serves one client; close what else uses it, or name another "
+        "`lidar.device`",
     ),
     Fault.LIDAR_BROKEN: (
         "the lidar reports a fault of its own, or its port is open and nothing answers",

@@ -102,6 +102,8 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
     if not config.kept:
         return None, None
     store = Store(maps_folder(config.folder), mend)
+    if mend and not config.localise:
+        store.claim()
     start = store.load(judge_for(lights))
     if start is None and config.localise:
         raise NoMap(
@@ -147,6 +149,13 @@ class Store:
         self._origin: Path | None = None
         self._good: dict[Path, bool] = {}
         self._lock: int | None = None
+
+    def claim(self) -> None:
+        """Take the folder for this process before there is a map to save: what keeps it from that is said at once."""
+        try:
+            self._use()
+        except OSError as error:
+            log.error("no map can be kept in %s: %s; name another `map.folder`, or end that", self.folder, said(error))
 
     def generations(self) -> list[Generation]:
         """All that are there, newest first."""

@@ -91,7 +91,7 @@ class Keeper:
         self._about, self._clock = about, clock
         self._saved: Revision | None = None  # the revision that is on the disk
         self._map_of = map_id()
-        self._anew = False
+        self._anew = self._last = False
         self._due = clock.now() + FIRST_S
         self._waiting: list[Told] = []
         self._over = asyncio.Event()
@@ -164,7 +164,7 @@ class Keeper:
         with contextlib.suppress(asyncio.TimeoutError):
             async with asyncio.timeout(STOP_S):
                 await self._over.wait()
-                self._due = self._clock.now()
+                self._due, self._last = self._clock.now(), True
                 self._go_on()
                 await self._over.wait()
         if not self._over.is_set():
@@ -251,7 +251,8 @@ class Keeper:
         if path is not None:
             self._saved = revision
             self.saves += 1
-            log.log(logging.INFO if waiting or self.error or self.saves == 1 else logging.DEBUG, "map saved: %s", path)
+            news = waiting or self.error or self.saves == 1 or self._last
+            log.log(logging.INFO if news else logging.DEBUG, "map saved: %s", path)
         else:
             self._anew |= self._saved is not None and self._saved[0] != self._map_id()
         if error and not self.error:

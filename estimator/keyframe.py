@@ -17,11 +17,15 @@ from estimator.records import Array, Scan
 if TYPE_CHECKING:
     from estimator.submap import Settled
 
+Square = tuple[int, int, int]
 Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
 """Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
 
 ANYWHERE = np.diag((1e3, 1e3, 10.0))
 """Covariance (m, m, rad) of a place that no way joins with the others."""
+
+NEAR_M, NEAR_RAD = 0.4, 0.25 * math.pi
+"""What is nearer together is kept only so often; along the way keyframes lie 0.25 m apart, so a first lap is kept."""
 
 LONGEST_M = 1e6
 """Ranges beyond are kept as this: they say the same, and fit into single precision."""
@@ -122,10 +126,22 @@ class Keyframe:
         return unturned(self.bearing_rad, self.turned_rad), self.range_m.astype(np.float64), self.beam
 
 
-def square_of(T_map_keyframe: Array) -> tuple[int, int, int]:
-    """Half metre square and eighth of a turn; who drives along an axis is well within an eighth."""
+def near(one: Array, other: Array) -> bool:
+    """Whether two keyframes look at the same from the same place; who drives along an axis is well within an eighth."""
+    x, y, yaw = (one - other).tolist()
+    return math.hypot(x, y) < NEAR_M and abs(se2.wrap(yaw)) < NEAR_RAD
+
+
+def square_of(T_map_keyframe: Array) -> Square:
+    """Half metre square and eighth of a turn, by which keyframes are listed."""
     x, y, yaw = T_map_keyframe.tolist()
     return math.floor(2.0 * x), math.floor(2.0 * y), math.floor(yaw * 4.0 / math.pi + 0.5) % 8
+
+
+def squares_about(T_map_keyframe: Array) -> list[Square]:
+    """The squares in which all are listed that are `near`."""
+    i, j, k = square_of(T_map_keyframe)
+    return [(i + a, j + b, (k + c) % 8) for a in (0, -1, 1) for b in (0, -1, 1) for c in (0, -1, 1)]
 
 
 def unturned(bearing_rad: Array, turned_rad: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from estimator import absolute, adrift, keyframe, localmap, se2, watch
 from estimator.atlas import OWN
 from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
-from estimator.keyframe import Keyframe, Submap, square_of
+from estimator.keyframe import Keyframe, Submap, near, square_of, squares_about
 from estimator.lines import lines_of
 from estimator.matchers import Matcher
 from estimator.records import Array, Scan
@@ -128,20 +129,33 @@ def update_map(state: State, scan: Scan, points: ScanPoints) -> None:
 
 
 def retire(state: State, newest: Keyframe) -> None:
-    """Bound what is kept per area: of the keyframes of one place and heading, the newest few stay."""
-    place = square_of(newest.T_map_keyframe)
-    here = [key for key in state.places.get(place, ()) if key in state.keyframes]
-    here.append(newest.key)
-    atlas = state.atlas  # what is adrift, or watched, may lie elsewhere: it takes the place of nothing older
+    """Bound what is kept per area: of the keyframes near one place with one heading, the newest few stay.
+
+    Were they counted by the squares that list them, squares that a lap only touches would go on filling up for hours.
+    """
+    T, atlas = newest.T_map_keyframe, state.atlas
+    # what is adrift, or watched, may lie elsewhere: it takes the place of nothing older
     since = max(atlas.since, atlas.kept if atlas.held else 0, 0 if atlas.watch is None else atlas.watch.since)
-    older, here = [key for key in here if key < since], [key for key in here if key >= since]
-    while len(here) > state.settings.keep:
-        drop(state, here.pop(0))
-    state.places[place] = older + here
+    here = sorted(key for key, T_key in listed(state, T, newest.key) if key >= since and near(T, T_key))
+    for key in here[: -state.settings.keep]:
+        drop(state, key)
     if atlas.held:
         own = [key for key in state.keyframes if key >= atlas.kept]
         for key in own[: -OWN * SIZE]:
             drop(state, key)
+
+
+def listed(state: State, T_map: Array, newest: int) -> Iterator[tuple[int, Array]]:
+    """The newest keyframe and those about its place, with theirs; who has moved along with the map is listed anew."""
+    about = [newest]
+    for square in squares_about(T_map):
+        about += state.places.pop(square, ())
+    for key in about:
+        frame = state.keyframes.get(key)
+        if frame is not None:
+            T_key = frame.T_map_keyframe
+            state.places.setdefault(square_of(T_key), []).append(key)
+            yield key, T_key
 
 
 def drop(state: State, key: int) -> None:

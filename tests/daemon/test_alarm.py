@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 import pytest
@@ -66,7 +67,8 @@ def test_one_cycle_above_the_limit_raises_it_and_it_is_said_once(
         assert alarm.said
         assert len(caplog.messages) == 1
         assert "integrity.alert_m" in caplog.messages[0]
-        assert "0.50 m" in caplog.messages[0]
+        assert "limit of 0.5 m" in caplog.messages[0]
+        assert ("no bound" in caplog.messages[0]) == (bad is None or not math.isfinite(bad))
         after = run(alarm, [0.2] * 20, 3.0)
     assert after[0]
     assert not after[-1]

@@ -294,6 +294,19 @@ def test_maps_are_kept_in_the_state_directory(tmp_path: Path, monkeypatch: pytes
     assert maps_folder("/srv/maps") == Path("/srv/maps")
 
 
+def test_a_second_daemon_on_one_folder_is_told_at_its_start(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    settings = MapConfig(folder=str(tmp_path))
+    first, _ = started(settings, None)
+    assert first is not None
+    assert not caplog.messages
+    started(settings, None)
+    assert f"no map can be kept in {tmp_path}: another process keeps its maps there" in caplog.text
+    first.close()
+    caplog.clear()
+    started(settings, None)
+    assert not caplog.messages
+
+
 def test_a_folder_that_cannot_be_read_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "file"
     file.write_text("")

@@ -288,14 +288,21 @@ def test_a_map_just_loaded_is_not_saved_until_the_robot_knows_its_place_in_it(tm
     asyncio.run(run())
 
 
-def test_at_the_stop_what_is_new_is_saved_and_the_folder_is_free(tmp_path: Path) -> None:
+def test_at_the_stop_what_is_new_is_saved_and_told_and_the_folder_is_free(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     async def run() -> None:
         bench = Bench(tmp_path)
         bench.drive()
+        await bench.turn(FIRST_S)
+        bench.drive()
+        caplog.clear()
+        with caplog.at_level(logging.INFO):
+            await bench.keeper.finish()
+        assert caplog.text.count("map saved") == 1
+        assert bench.files == 2
         await bench.keeper.finish()
-        assert bench.files == 1
-        await bench.keeper.finish()
-        assert bench.files == 1
+        assert bench.files == 2
         Store(tmp_path).save(content(), 5)
 
     asyncio.run(run())
