@@ -202,9 +202,7 @@ def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]
         raise Refused("maps are not kept: `map.folder` is none")
     store = Store(maps_folder(settings.map.folder), mend=False)
     try:
-        return keep(
-            settings, content, map_id
-        ), "the next start goes on in it, if no daemon saves its own map until then"
+        return keep(settings, content, map_id), "the next start goes on in it"
     except BadMap as error:
         raise Refused(f"{store.folder}: {error}") from None
     except OSError as error:

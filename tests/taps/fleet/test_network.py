@@ -22,7 +22,9 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
 from tests.daemon import mapmaker
 from tests.daemon.mapmaker import Shape
+from tests.taps.routers import free_port
 from tests.taps.serving import served
+from tests.taps.test_docs import commands
 
 ROOT = Path(__file__).parents[3]
 ROBOTS: Final = 5
@@ -125,13 +127,43 @@ class View:
         """Robots that speak, and have told something in the last two seconds."""
         return {name for name, one in self.told()["robots"].items() if one["alive"] and one["age_s"] < 2.0}
 
-    def until(self, what: Callable[[], object], seconds: float) -> float:
-        """Wait until something is true; how long that took."""
+    def until(self, what: Callable[[], object], seconds: float) -> None:
+        """Wait until something is true."""
         begun = time.monotonic()
         while not what():
             assert time.monotonic() < begun + seconds, self.told()
             time.sleep(0.1)
-        return time.monotonic() - begun
+
+
+def test_the_commands_of_the_documents(tmp_path: Path) -> None:
+    """In their order, against a router of their own: what ends by itself ends well, the rest runs until it is told."""
+    address, lasting = f"127.0.0.1:{free_port()}", []
+    shutil.copy(ROOT / "systemd/lights/room-of-16.toml", tmp_path / "lights.toml")
+    (tmp_path / "hall.lumimap").write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    (tmp_path / "lumiloop.toml").write_text('name = "agv1"\n[lights]\nsurvey = "own.toml"\n')
+    (tmp_path / "run" / "lumiloop").mkdir(parents=True)
+    environment = {"XDG_STATE_HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path / "run"), "PYTHONPATH": str(ROOT)}
+    with ExitStack() as stack:
+        for name in ("agv1", "lumiloop"):
+            stack.enter_context(served(tmp_path / "run" / "lumiloop" / f"{name}.stream"))
+        for words in commands(ROOT / "docs" / "fleet.md"):
+            told = [address if word.endswith(":7447") else word for word in words]
+            told += [] if address in told else ["--router", address]
+            command, given = [sys.executable, "-m", "daemon", *told], {**os.environ, **environment}
+            if {"router", "ros2", "join", "share", "--watch", "--follow"} & set(words):
+                running = subprocess.Popen(command, cwd=tmp_path, env=given, stdout=subprocess.DEVNULL)
+                stack.callback(running.kill)
+                lasting.append(running)
+                time.sleep(3.0)
+            else:
+                subprocess.run(command, cwd=tmp_path, env=given, check=True, timeout=60.0, stdout=subprocess.DEVNULL)
+        assert [one.poll() for one in lasting] == [None] * 6
+        for one in reversed(lasting):
+            one.terminate()
+            assert one.wait(10.0) == 0, one.args
+    assert (tmp_path / "fleet.png").exists()
+    assert (tmp_path / "own.toml").exists()
+    assert len(list((tmp_path / "lumiloop" / "maps").glob("*.lumimap"))) == 1
 
 
 def test_five_robots_a_lossy_line_a_partition_and_a_dead_router(tmp_path: Path) -> None:
