@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Final
 
 import zenoh
 
 from daemon import cli
 from taps.fleet import messages
-from taps.zenohlink import Say, listed, withdraw
+from taps.zenohlink import BEAT_S, Say, listed, withdraw
+
+ALONE_S: Final = 5.0
+"""A name is taken from nobody before its speaker has been gone for so long, with the router there: after a router's
+death some are back later than others."""
 
 
 class Claim:
@@ -39,8 +44,14 @@ class Claim:
     async def run(self) -> None:
         """Have the name whenever nobody else has it, until cancelled."""
         await self._begin()
+        alone = 0.0
         try:
-            await asyncio.Event().wait()
+            while True:
+                await asyncio.sleep(BEAT_S)
+                free = not self._before() and bool(self._session.info.routers_zid())
+                alone = alone + BEAT_S if free else 0.0
+                if alone >= ALONE_S and not self.mine:
+                    self._settle(True)
         finally:
             if self._listening is not None:
                 withdraw(self._listening)
@@ -60,27 +71,30 @@ class Claim:
             instance = str(sample.key_expr).rpartition("/")[2]
             loop.call_soon_threadsafe(self._heard, instance, there)
 
-        self._settle()
+        self._settle(not self._before())
         self._listening = self._session.liveliness().declare_subscriber(everybody, heard, history=True)
 
     def _heard(self, instance: str, there: bool) -> None:
         if instance == self._instance:
             return
         (self._others.add if there else self._others.discard)(instance)
-        self._settle()
+        if self.mine and self._before():
+            self._settle(False)
 
-    def _settle(self) -> None:
-        before = min(self._others, default="")
-        mine = not before or self._instance < before
-        if self._token is not None and mine == self.mine:
-            return
+    def _before(self) -> str:
+        """Who has the name before us; empty: nobody."""
+        first = min(self._others, default="")
+        return first if first and first < self._instance else ""
+
+    def _settle(self, mine: bool) -> None:
+        """The name is ours from now on, or is not."""
         self.mine = mine
         self._put(messages.alive if mine else messages.waiting)
         if mine:
             self._say(f"{self._robot} is in the fleet")
         else:
             self._say(
-                f"the fleet has a robot {self._robot} already, on {messages.host_of(before)}; this one, on "
+                f"the fleet has a robot {self._robot} already, on {messages.host_of(self._before())}; this one, on "
                 f"{self._host}, tells nothing until that one has gone: give one of them another `name`"
             )
         self._on_change(mine)

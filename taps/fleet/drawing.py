@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from taps.fleet.messages import Cells, MapHead
-from taps.fleet.roster import Member
+from taps.fleet.roster import Member, number, printable
 from taps.tiles import FREE, UNSEEN, WALL
 
 Chart = tuple[MapHead, Cells]
@@ -35,7 +35,8 @@ HEADS: Final = ("", "robot", "state", "x m", "y m", "deg", "bound m", "map", "su
 
 def table(members: Sequence[Member], now: float) -> list[str]:
     """A line for each robot, and one above."""
-    rows = [HEADS, *(_row(label_of(k), member, now) for k, member in enumerate(members))]
+    told = (_row(label_of(k), member, now) for k, member in enumerate(members))
+    rows = [HEADS, *(tuple(map(printable, row)) for row in told)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEADS))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
@@ -51,7 +52,7 @@ def _row(label: str, member: Member, now: float) -> tuple[str, ...]:
         ("-",) * 3 if place is None else (f"{place[0]:.2f}", f"{place[1]:.2f}", f"{math.degrees(place[2]):.0f}")
     )
     at = (member.pose.agvPosition if member.pose is not None else None) or {}
-    bound = at.get("deviationRange")
+    bound = number(at.get("deviationRange"))
     survey = None if state is None else state.held.get("survey")
     said = "GONE" if not member.speakers else "?" if state is None else state.state_name
     faults = () if state is None else state.faults
@@ -63,7 +64,7 @@ def _row(label: str, member: Member, now: float) -> tuple[str, ...]:
         x,
         y,
         theta,
-        f"{bound:.2f}" if isinstance(bound, (int, float)) else "-",
+        "-" if bound is None else f"{bound:.2f}",
         member.map_id or "-",
         "-" if survey is None else str(survey.version),
         f"{now - member.t_heard:.0f}" if math.isfinite(member.t_heard) else "-",
@@ -117,7 +118,7 @@ def picture(chart: Chart, members: Sequence[Member]) -> tuple[npt.NDArray[np.uin
     said = []
     for k, member, row, column in on_chart(chart, members):
         name, colour = COLOURS[k % len(COLOURS)]
-        said.append(f"{member.name} {name}" + ("" if member.localised else " (where it was last)"))
+        said.append(f"{printable(member.name)} {name}" + ("" if member.localised else " (where it was last)"))
         _disc(pixels, scale * row, scale * column, colour)
         assert member.place is not None
         nose = 1.6 * DISC_PX * np.array((math.sin(member.place[2]), math.cos(member.place[2])))

@@ -22,6 +22,7 @@ from daemon.store_file import BadMap
 from daemon.store_tables import read
 from daemon.surveyfile import SurveyError, dump, read_survey
 from daemon.wholefile import reason_of, write_whole
+from estimator.cdma_profile import PROFILES, Profile
 from estimator.lamps import Survey
 from taps.fleet.messages import SCHEMA, Held
 
@@ -97,8 +98,8 @@ def map_id_of(content: bytes, name: str) -> int:
         raise Refused(f"{name}: {error}") from None
 
 
-def survey_in(content: bytes, name: str) -> Survey:
-    """The survey in a file.
+def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Survey:
+    """The survey in a file; ``profile``: air interface that its lamps have to have, None: any.
 
     Raises:
         Refused: it is none that could be used.
@@ -107,7 +108,7 @@ def survey_in(content: bytes, name: str) -> Survey:
         path = Path(folder) / "survey"
         path.write_bytes(content)
         try:
-            return read_survey(path)
+            return read_survey(path, profile)
         except SurveyError as error:
             raise Refused(str(error).replace(str(path), name)) from None
 
@@ -193,7 +194,8 @@ def place(offer: Offer, content: bytes, settings: Config, survey: Path | None) -
     where = survey or (Path(settings.lights.survey) if settings.lights.survey else None)
     if where is None:
         raise Refused("where should the survey go? set `lights.survey`, or name a file with --survey FILE")
-    return place_survey(survey_in(content, offer.name), where)
+    profile = PROFILES[settings.photodiode.profile]
+    return place_survey(survey_in(content, offer.name, profile), where)
 
 
 def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]:

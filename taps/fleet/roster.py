@@ -4,10 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Final
 
 from taps.fleet import messages
 from taps.fleet.messages import Cells, LoopTold, MapHead, PoseTold, StateTold, Unreadable
 from taps.tiles import UNSEEN
+
+FARTHEST: Final = 1e6
+"""No number that is shown is larger, in m or rad."""
+
+
+def number(told: object) -> float | None:
+    """A finite number; None where it is none."""
+    if isinstance(told, bool) or not isinstance(told, (int, float)) or not abs(told) < FARTHEST:
+        return None
+    return float(told)
+
+
+def printable(text: str) -> str:
+    """Without what a terminal takes for orders."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 @dataclass(slots=True)
@@ -36,11 +52,8 @@ class Member:
         at = self.pose.agvPosition if self.pose is not None else None
         if at is None:
             return None
-        found = [at.get(name) for name in ("x", "y", "theta")]
-        if not all(isinstance(value, (int, float)) and math.isfinite(value) for value in found):
-            return None
-        x, y, theta = (float(value) for value in found if isinstance(value, (int, float)))
-        return x, y, theta
+        x, y, theta = (number(at.get(name)) for name in ("x", "y", "theta"))
+        return None if x is None or y is None or theta is None else (x, y, theta)
 
     @property
     def map_id(self) -> str:
@@ -122,7 +135,7 @@ class Roster:
             newest = max(versions.values(), default=0)
             if behind := [name for name, version in versions.items() if version < newest]:
                 found.append(f"{', '.join(behind)}: not the newest {kind}, {newest}: `lumiloop fleet fetch` there")
-        return found
+        return [printable(line) for line in found]
 
     def chart(self) -> tuple[MapHead, Cells] | None:
         """The map that most robots are in, as the robot tells it that has seen most of it."""

@@ -110,6 +110,22 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
         await asyncio.gather(other, return_exceptions=True)
         await until(lambda: not roster.problems())
 
+    async def without_router(made: Router) -> None:
+        """Who waits for the name hears of nobody while the router is away: that is no reason to take it."""
+        await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
+        other = asyncio.ensure_future(speaking(made, tmp_path / "other", "agv"))
+        await until(lambda: roster.members["agv"].waiting)
+        made.end()
+        await asyncio.sleep(1.0)
+        made.begin()
+        await until(lambda: roster.members["agv"].speakers and roster.members["agv"].waiting)
+        for _ in range(40):
+            await asyncio.sleep(0.05)
+            assert roster.members["agv"].place == (1.0, 2.0, 3.0)
+        other.cancel()
+        await asyncio.gather(other, return_exceptions=True)
+        assert not heard("agv is in the fleet", 2)
+
     async def hand_over(made: Router) -> None:
         first = asyncio.ensure_future(speaking(made, tmp_path / "s", "agv"))
         await until(lambda: "agv" in roster.members and roster.members["agv"].place == (1.0, 2.0, 3.0))
@@ -122,6 +138,8 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
 
     with served(tmp_path / "s"), served(tmp_path / "other", place=(9.0, 9.0, 0.0)), router() as made:
         asyncio.run(beside(body(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
+        roster, heard = Roster(), Heard(capsys)
+        asyncio.run(beside(without_router(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
         roster = Roster()
         asyncio.run(beside(hand_over(made), looking(made, roster)))
 

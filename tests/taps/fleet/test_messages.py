@@ -108,6 +108,25 @@ def test_one_robot_that_tells_rubbish_does_not_hide_the_others() -> None:
     assert "agv2" in "\n".join(drawing.table(roster.sorted(), 6.0))
 
 
+@pytest.mark.parametrize("x", ['"1"', "null", "1e999", "1" + 400 * "0", "[1]", "true"])
+def test_a_place_that_is_none_is_shown_as_none(x: str) -> None:
+    roster = Roster()
+    content = b'{"seq": 1, "t_utc": 0, "agvPosition": {"x": %s, "y": 0, "theta": 0, "mapId": 3}}' % x.encode()
+    roster.take(messages.key("agv1", "pose"), content, b"", 1.0)
+    assert roster.members["agv1"].place is None
+    assert drawing.table(roster.sorted(), 1.0)[1].split()[:4] == ["1", "agv1", "GONE", "-"]
+
+
+def test_what_others_tell_does_not_reach_the_terminal_as_orders() -> None:
+    roster = Roster()
+    state = StateTold(t_utc=1.0, state_name="\x1b[2J", meaning="line\nline \x07\u202e", faults=())
+    roster.take("lumiloop/agv\x1b]0;x/state", messages.encode(state), b"", 1.0)
+    roster.take("lumiloop/agv\x1b]0;x/pose", b"\x1b", b"", 1.0)
+    lines = [*drawing.table(roster.sorted(), 1.0), *roster.problems()]
+    assert len(lines) == 3
+    assert all(line.isprintable() for line in lines)
+
+
 def test_who_is_there_twice_and_who_is_behind_is_said() -> None:
     roster = Roster()
     assert roster.token(messages.alive("agv1", messages.instance_of("z1", "cart 7", 5)), True) == "agv1"

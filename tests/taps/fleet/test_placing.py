@@ -8,9 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.config import Config, LightsConfig, MapConfig
+from daemon.config import Config, LightsConfig, MapConfig, PhotodiodeConfig
 from daemon.store import Store
 from daemon.surveyfile import dump, read_survey
+from estimator.cdma_profile import PROFILES
 from estimator.lamps import Lamp, Receiver, Survey
 from taps.fleet.messages import Held
 from taps.fleet.placing import MAP, RECORD, SURVEY, Offer, Records, Refused, check, chosen, offer_of, place
@@ -53,6 +54,20 @@ def test_a_survey_keeps_the_robots_own_receiver_and_the_file_before(tmp_path: Pa
     assert placed.receiver.x == -0.25
     assert read_survey(tmp_path / "lights.toml.before").lamps == LAMPS[:1]
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml", "lights.toml.before"}
+
+
+def test_a_survey_is_read_for_the_air_interface_that_this_robot_has(tmp_path: Path) -> None:
+    """Where it says no depth, the profile's counts; codes that the profile does not have are refused."""
+    path = tmp_path / "shared.toml"
+    path.write_text("lamp = [{ lamp_id = 1, code = 3, x = 0.0, y = 0.0, z = 3.0 }]")
+    offer, content = offer_of(SURVEY, path, 1)
+    given = msgspec.structs.replace(settings(tmp_path), photodiode=PhotodiodeConfig(profile="B"))
+    assert PROFILES["B"].depth != PROFILES["A"].depth
+    place(offer, content, given, None)
+    assert read_survey(tmp_path / "lights.toml").depth == PROFILES["B"].depth
+    path.write_text("lamp = [{ lamp_id = 1, code = 500, x = 0.0, y = 0.0, z = 3.0 }]")
+    with pytest.raises(Refused, match="code 500 is none of profile"):
+        place(*offer_of(SURVEY, path, 2), settings(tmp_path), None)
 
 
 def test_a_survey_needs_a_place(tmp_path: Path, survey: Path) -> None:
