@@ -144,6 +144,29 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
         asyncio.run(beside(hand_over(made), looking(made, roster)))
 
 
+def test_of_two_that_have_spoken_the_first_keeps_the_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a partition: the one that claimed it later stops, and goes on when the first has gone."""
+    monkeypatch.setattr("taps.fleet.claim.ALONE_S", 1.0)
+    roster, heard = Roster(), Heard(capsys)
+
+    async def body(made: Router) -> None:
+        await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
+        with zenoh.open(config("client", made.address)) as session:
+            session.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
+            await until(lambda: heard("the fleet has a robot agv already, on cart"))
+            await asyncio.sleep(0.2)
+            last = roster.members["agv"].pose
+            await asyncio.sleep(0.5)
+            assert roster.members["agv"].pose is last
+        await until(lambda: heard("agv is in the fleet", 2))
+        await until(lambda: roster.members["agv"].pose is not last)
+
+    with served(tmp_path / "s"), router() as made:
+        asyncio.run(beside(body(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
+
+
 def test_a_router_that_dies_is_said_and_all_go_on_when_it_is_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
