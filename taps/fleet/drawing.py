@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from taps.fleet.messages import Cells, MapHead
-from taps.fleet.roster import Member, number, printable
+from taps.fleet.messages import Cells, MapHead, printable
+from taps.fleet.roster import Member, number
 from taps.tiles import FREE, UNSEEN, WALL
 
 Chart = tuple[MapHead, Cells]

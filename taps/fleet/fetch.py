@@ -17,7 +17,7 @@ from daemon.publish.client import NoAnswer, address_of
 from hal.serving import work_until_told
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, Unreadable
-from taps.fleet.placing import KINDS, MAP, MOST_BYTES, Offer, Records, Refused, chosen, place, sha256_of
+from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, chosen, place, sha256_of
 from taps.fleet.share import key_of
 from taps.view.orders import OrderRefused, switch_map
 from taps.zenohlink import BadEndpoint, answers, joined, watched
@@ -109,8 +109,6 @@ class Fetcher:
         if offer is None:
             assert held is not None
             return f"{kind} version {held.version} is here already"
-        if not 0 <= offer.size <= MOST_BYTES:
-            raise Refused(f"{offer.said()}: is said to have {offer.size} bytes; at most {MOST_BYTES} are taken")
         survey: Path | None = self._args.survey
         where, note = place(offer, await self._content(session, offer), self._args.settings, survey)
         try:

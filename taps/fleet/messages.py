@@ -118,7 +118,12 @@ def claimed_of(instance: str) -> int:
 
 def host_of(instance: str) -> str:
     """On which computer."""
-    return instance.split(".", 2)[-1]
+    return printable(instance.split(".", 2)[-1])
+
+
+def printable(text: str) -> str:
+    """Without what a terminal takes for orders."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def state_told(pose: Pose, faults: Faults | None, held: dict[str, Held], map_name: str) -> StateTold:

@@ -10,9 +10,10 @@ import hashlib
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
+from msgspec import Meta
 
 from daemon.config import Config
 from daemon.folders import maps_folder, state_folder
@@ -24,7 +25,7 @@ from daemon.surveyfile import SurveyError, dump, read_survey
 from daemon.wholefile import reason_of, write_whole
 from estimator.cdma_profile import PROFILES, Profile
 from estimator.lamps import Survey
-from taps.fleet.messages import SCHEMA, Held
+from taps.fleet.messages import SCHEMA, Held, printable
 
 SURVEY, MAP = "survey", "map"
 KINDS: Final = (SURVEY, MAP)
@@ -47,14 +48,14 @@ class Offer(msgspec.Struct, frozen=True, kw_only=True):
     schema: int = SCHEMA
     kind: str
     name: str
-    version: int
-    sha256: str
-    size: int
-    map_id: int = 0
+    version: Annotated[int, Meta(ge=0)]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    size: Annotated[int, Meta(ge=0, le=MOST_BYTES)]
+    map_id: Annotated[int, Meta(ge=0, lt=1 << 32)] = 0
 
     def said(self) -> str:
         """For people."""
-        return f"{self.kind} {self.name} version {self.version}"
+        return f"{self.kind} {printable(self.name)} version {self.version}"
 
 
 def sha256_of(content: bytes) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from taps.fleet import messages
-from taps.fleet.messages import Cells, LoopTold, MapHead, PoseTold, StateTold, Unreadable
+from taps.fleet.messages import Cells, LoopTold, MapHead, PoseTold, StateTold, Unreadable, printable
 from taps.tiles import UNSEEN
 
 FARTHEST: Final = 1e6
@@ -19,11 +19,6 @@ def number(told: object) -> float | None:
     if isinstance(told, bool) or not isinstance(told, (int, float)) or not abs(told) < FARTHEST:
         return None
     return float(told)
-
-
-def printable(text: str) -> str:
-    """Without what a terminal takes for orders."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 @dataclass(slots=True)
