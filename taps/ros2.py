@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import time
 from typing import Final
 
 import zenoh
 
 from daemon import cli
-from daemon.config import Config
 from hal.serving import work_until_told
 from taps import rmw, rostypes
-from taps.frames import Hello, NotTheStream
-from taps.ros import TOPICS, Out, Translator
-from taps.stream import Lost, Stream, path_of
+from taps.follow import follow
+from taps.frames import NotTheStream
+from taps.ros import TOPICS, Out
+from taps.stream import Stream, path_of
 from taps.zenohlink import BadEndpoint, joined, listed, watched, withdraw
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
@@ -108,21 +107,3 @@ class Talker:
     def close(self) -> None:
         """Leave the graph."""
         withdraw(*self._tokens, *(publisher for publisher, _ in self._publishers.values()))
-
-
-async def follow(stream: Stream, settings: Config, talker: Talker) -> None:
-    """Pass on all that is told, until cancelled.
-
-    Raises:
-        NotTheStream: the other end is no daemon of this version.
-    """
-    translator = Translator(settings.lidar.mount)
-    async with contextlib.aclosing(stream.frames()) as frames:
-        async for frame in frames:
-            if isinstance(frame, Lost):
-                cli.say(f"{frame.text}; waiting")
-            elif isinstance(frame, Hello):
-                translator = Translator(settings.lidar.mount)
-            else:
-                for out in translator.take(frame):
-                    talker.send(out)
