@@ -30,7 +30,7 @@ COLOURS: Final = (
     ("cyan", (6, 182, 212)),
     ("pink", (236, 72, 153)),
 )
-HEADS: Final = ("", "robot", "state", "x m", "y m", "deg", "bound m", "map", "survey", "age s", "faults")
+HEADS: Final = ("", "robot", "state", "x m", "y m", "deg", "bound m", "map", "survey", "age s", "said")
 
 
 def table(members: Sequence[Member], now: float) -> list[str]:
