@@ -29,7 +29,6 @@ async def photograph(browser: str, address: str, out: Path, seconds: float) -> N
     Raises:
         BrowserError: it is not, for two minutes.
     """
-    out.mkdir(parents=True, exist_ok=True)
     async with tab(browser, address, DESKTOP) as page:
         await page.until(SEEN, 60.0)
         await asyncio.sleep(seconds)
@@ -48,6 +47,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=40.0, help="of driving before (default %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="default: %(default)s")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="lumiloop-page-") as name:
         folder = Path(name)
         try:
