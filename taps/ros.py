@@ -26,6 +26,8 @@ STEP_S: Final = 0.5
 """The computer's calendar may be put right by less without the stamps jumping."""
 AGAIN_S: Final = 5.0
 """What stands still is said again so often, for those who came later."""
+UNKNOWN: Final = np.zeros((1, 1), np.float32)
+"""A map of which nothing is known; one without any cell is more than some programs can read."""
 SLOWEST_HZ: Final = 1.0
 """Of diagnostics."""
 
@@ -40,7 +42,7 @@ class Topic:
 
 
 TOPICS: Final = {
-    "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan; the stamp is the first beam's"),
+    "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan after REP-117; the stamp is the first beam's"),
     "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while there is one"),
     "/odom": Topic("nav_msgs/msg/Odometry", "the pose in odom, smooth, with the velocity"),
     "/tf": Topic("tf2_msgs/msg/TFMessage", "map > odom > base_link"),
@@ -302,9 +304,12 @@ class Translator:
 
     def _map(self) -> Iterator[Out]:
         """The map, when it has changed and some time has gone by."""
-        if not self._fresh or not self._tiles or 0.0 <= self._now - self._drawn < AGAIN_S:
+        if not self._fresh or 0.0 <= self._now - self._drawn < AGAIN_S:
             return
         self._fresh, self._drawn = False, self._now
+        if not self._tiles:  # after RESET: whoever comes late must not be given the map that was
+            yield from self.grid(self._now, (0.0, 0.0), self._resolution, UNKNOWN)
+            return
         columns, rows = zip(*self._tiles, strict=True)
         left, below, side = min(columns), min(rows), len(next(iter(self._tiles.values())))
         whole = np.zeros(((max(rows) - below + 1) * side, (max(columns) - left + 1) * side), np.float32)
