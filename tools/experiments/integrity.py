@@ -1,4 +1,6 @@
-"""Integrity runs: ``python -m tools.experiments.integrity --count 10 --jobs 2``; resumable, one file a scenario.
+"""Integrity: is what the daemon says of random drives ever wrong? ``python -m tools.experiments.integrity --count 10``.
+
+Resumable, one file a scenario.
 
 Every scenario of :mod:`tools.experiments.integrity_scene` goes through the daemon's own cycle in virtual time; the
 published state is judged against the truth. Tracks are kept in ``<out>/<kind>-<seed>.npz`` and not made again; delete
