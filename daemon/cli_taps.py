@@ -26,6 +26,8 @@ def add(commands: Commands[argparse.ArgumentParser]) -> None:
     _plan(commands.add_parser("plan", help="where to hang how many lamps over a floor, and what comes of it"))
     _metrics(commands.add_parser("metrics", help="serve Prometheus metrics and VDA 5050's position, on this computer"))
     _foxglove(commands.add_parser("foxglove", help="serve a running daemon live for the Foxglove app"))
+    _ros2(commands.add_parser("ros2", help="a running daemon as a node of ROS 2, which need not be installed (Zenoh)"))
+    _fleet(commands.add_parser("fleet", help="all robots on one map; join, share a survey and a map, fetch them"))
     _lamps(commands.add_parser("lamps", help="which lamps are dead, dimming or moved, and when to replace them"))
 
 
@@ -46,6 +48,69 @@ def _foxglove(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
     listening(parser)
     parser.set_defaults(body=needing("foxglove", "taps.foxglove_live", "main"))
+
+
+def _ros2(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--domain", type=int, default=0, metavar="N", help="ROS_DOMAIN_ID; default: 0")
+    parser.add_argument(
+        "--namespace", default="", metavar="NAME", help="before every topic, as in /agv1; default: none"
+    )
+    parser.add_argument("--humble", action="store_true", help="for ROS 2 Humble, whose types have no hash")
+    _meeting(parser)
+    listening(parser)
+    parser.set_defaults(body=needing("zenoh", "taps.ros2", "main"))
+
+
+def _fleet(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="and draw it")
+    _meeting(parser)
+    cli.config_arguments(parser)
+    parser.set_defaults(body=needing("zenoh", "taps.fleet.show", "main"))
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB")
+    join = verbs.add_parser("join", help="tell the fleet what this robot's daemon tells, until stopped")
+    join.add_argument("--rate", type=_hertz, default=5.0, metavar="HZ", help="poses a second, at most; default: 5")
+    listening(join)
+    join.set_defaults(body=needing("zenoh", "taps.fleet.robot", "main"))
+    share = verbs.add_parser("share", help="offer a survey, a map, or both, until stopped")
+    share.add_argument("--survey", type=Path, metavar="FILE", help="lamps that all robots see")
+    share.add_argument("--map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    share.add_argument(
+        "--version", type=int, metavar="N", help="larger is newer; default: when the file was changed, s"
+    )
+    cli.config_arguments(share)
+    share.set_defaults(body=needing("zenoh", "taps.fleet.share", "main"))
+    fetch = verbs.add_parser("fetch", help="take what is offered, check it, put it to its place")
+    fetch.add_argument("what", nargs="*", choices=("survey", "map", []), metavar="survey|map", help="default: both")
+    fetch.add_argument("--survey", type=Path, metavar="FILE", help="where the survey goes; default: `lights.survey`")
+    fetch.add_argument("--switch", action="store_true", help="have the running daemon go on in the map (SWITCH_MAP)")
+    fetch.add_argument("--follow", action="store_true", help="take newer ones, too, until stopped")
+    cli.config_arguments(fetch)
+    fetch.set_defaults(body=needing("zenoh", "taps.fleet.fetch", "main"))
+    router = verbs.add_parser("router", help="be the router that they all meet at, until stopped")
+    router.add_argument("--listen", default="127.0.0.1:7447", metavar="HOST:PORT", help="default: %(default)s")
+    cli.config_arguments(router)
+    router.set_defaults(body=needing("zenoh", "taps.fleet.share", "router"))
+    for verb in (join, share, fetch, router):
+        _meeting(verb)
+        for option in verb._actions:  # argparse has no other way: what was said before the verb counts
+            if option.dest in ("router", "zenoh", "config", "set", "print_config"):
+                option.default = argparse.SUPPRESS
+
+
+def _meeting(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--router", default="127.0.0.1:7447", metavar="HOST:PORT", help="Zenoh router; default: %(default)s"
+    )
+    parser.add_argument("--zenoh", type=Path, metavar="FILE", help="Zenoh's own configuration: certificates, rights")
+
+
+def _hertz(text: str) -> float:
+    rate = float(text)
+    if not 0.1 <= rate <= 50.0:
+        raise argparse.ArgumentTypeError(f"{text} Hz: name 0.1 to 50")
+    return rate
 
 
 def _plan(parser: argparse.ArgumentParser) -> None:

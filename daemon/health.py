@@ -79,7 +79,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.LIDAR_GARBLED: ("more than 5 % of the lidar's frames are damaged", "check cable, shielding and USB hub"),
     Fault.LIDAR_GAPS: ("more than 2 % of the lidar's scans are missing", "check the computer's load and the line rate"),
     Fault.LIDAR_LATE: (
-        "scans arrive more than two periods after they were measured",
+        "scans arrive more than two periods after they were measured, or are all stamped late against the wheels",
         "take load off the computer; look for a slow line, a USB hub or a network in between",
     ),
     Fault.LIDAR_MISFIT: (
@@ -156,7 +156,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "wheel slip; if it lasts, check odometry scale and lidar mount",
     ),
     Fault.ODOMETRY_GAPS: (
-        "odometry readings are lost, late, or come more seldom than before",
+        "odometry readings are lost, late, stamped late against the scans, or come more seldom than before",
         "check the network and the sender's load; send ten readings per second or more",
     ),
     Fault.PROTECTION_ALERT: (
@@ -217,7 +217,8 @@ class Vitals:
     Attributes:
         link, error: of the lidar driver. silent: no valid scan for three scan periods.
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
-        late: counter of scans that arrived late. misfit: what they say is at odds with the map.
+        late: counter of scans that arrived late. lag: seconds by which they are stamped later than the wheels' turns,
+            0: none is known. misfit: what they say is at odds with the map.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the laser.
         readings, readings_missed, readings_old: counters of odometry readings that came, were lost, and came late.
         readings_seldom: they come more seldom than before.
@@ -243,6 +244,7 @@ class Vitals:
     disagree: bool = False
     late: int = 0
     misfit: bool = False
+    lag: float = 0.0
     readings: int = 0
     readings_missed: int = 0
     readings_old: int = 0
@@ -274,20 +276,19 @@ def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
 
 
 def describe(fault: Fault, now: Vitals | None = None) -> str:
-    """One line for a log: number, meaning, remedy, and what the device's driver says of it ``now``."""
+    """One line for a log: number, meaning, remedy, and what the device's driver or the data say of it ``now``."""
     text, remedy = FAULTS[fault]
     line = f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
-    error = None if now is None else _words(fault, now)
-    return line if error is None else f"{line}: {error}"
+    return f"{line}: {words}" if now is not None and (words := _words(fault, now)) else line
 
 
-def _words(fault: Fault, now: Vitals) -> HalError | None:
-    """The driver's error that a fault stands for, if it stands for one."""
-    if now.error is not None and fault is _noun(now.error):
-        return now.error
-    if now.adc_error is not None and fault is _adc_noun(now.adc_error):
-        return now.adc_error
-    return None
+def _words(fault: Fault, now: Vitals) -> str:
+    """The driver's error that a fault stands for, or the lag, if it stands for one."""
+    for error, noun in ((now.error, _noun), (now.adc_error, _adc_noun)):
+        if error is not None and fault is noun(error):
+            return str(error)
+    late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
+    return f"scans are {now.lag:+.2f} s late against the wheels" if now.lag and late else ""
 
 
 def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
@@ -301,7 +302,7 @@ def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.LIDAR_GARBLED
     if not down and missed > FEW + 0.02 * (scans + missed):
         yield Fault.LIDAR_GAPS
-    if now.late - before.late > FEW + 0.05 * scans:
+    if now.late - before.late > FEW + 0.05 * scans or (now.lag > 0.0 and not down):
         yield Fault.LIDAR_LATE
     if now.misfit:
         yield Fault.LIDAR_MISFIT
@@ -359,7 +360,7 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
     readings, missed = now.readings - before.readings, now.readings_missed - before.readings_missed
     old = now.readings_old - before.readings_old
     bad = missed > FEW + 0.05 * (readings + missed) or old > FEW + 0.05 * readings or now.readings_seldom
-    if now.odometry and bad:
+    if now.odometry and (bad or now.lag < 0.0):
         yield Fault.ODOMETRY_GAPS
     if now.alert:
         yield Fault.PROTECTION_ALERT

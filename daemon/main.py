@@ -39,7 +39,7 @@ from daemon.notify import notify
 from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
-from daemon.realtime import claim, line_up
+from daemon.realtime import claim, give_back, line_up
 from daemon.sampleclock import SampleClock
 from daemon.stallwatch import StallWatch
 from daemon.store import NoMap, Start, judge_for, started
@@ -394,6 +394,7 @@ def main(args: argparse.Namespace) -> int:
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
     recorder = None
+    give_back()
     try:
         world = _world(settings)
         log.info("%s", _whereabouts(settings, args.record, world.stream))

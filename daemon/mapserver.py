@@ -19,6 +19,9 @@ from daemon.pixels import BadPicture, Picture, read_picture
 Trinary = npt.NDArray[np.int8]
 """(rows, columns), row 0 at the bottom: 1 occupied, 0 free, -1 unknown."""
 
+OCCUPIED: Final = 0.65
+FREE: Final = 0.196
+"""map_server's trinary thresholds; 205 reads as 0.19608, just above FREE, so that unknown stays unknown."""
 MODES: Final = ("trinary", "scale", "raw")
 KNOWN: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 MOST_CELLS: Final = 50_000_000
@@ -41,8 +44,8 @@ class Description:
     resolution: float
     origin: tuple[float, float, float]
     negate: bool = False
-    occupied: float = 0.65
-    free: float = 0.196
+    occupied: float = OCCUPIED
+    free: float = FREE
     mode: str = "trinary"
 
 

@@ -11,7 +11,8 @@ from hal.clock import Clock
 from hal.i2c import BusOpener
 
 SILENT_BLOCKS: Final = 3.0
-"""Blocks that may fail to come before the converter is said to be silent; the cycle shows it within two more."""
+"""Blocks that may fail to come before the converter is said to be silent; the cycle shows it within two more. None is
+counted as shorter than it was asked for: an adapter that does only short ones hands them over many at a time."""
 
 
 class AdcMaker(Protocol):
@@ -50,7 +51,7 @@ class BlockWatch:
 
     def __init__(self, status: AdcStatus, profile: Profile) -> None:
         self.status = status
-        self.seconds = profile.epoch_s
+        self.seconds = self._asked_s = profile.epoch_s
         self._latest: float | None = None
 
     def on_block(self, block: RawSamples) -> None:
@@ -60,4 +61,4 @@ class BlockWatch:
 
     def ok(self, t_mono: float) -> bool:
         """Whether blocks are coming."""
-        return self._latest is not None and t_mono - self._latest <= SILENT_BLOCKS * self.seconds
+        return self._latest is not None and t_mono - self._latest <= SILENT_BLOCKS * max(self.seconds, self._asked_s)

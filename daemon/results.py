@@ -15,13 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from daemon import mapimage
+from daemon.mapserver import FREE, OCCUPIED
 from daemon.png import encode_png
 from estimator.grid import Grid
 from estimator.records import Array
-
-OCCUPIED: Final = 0.65
-FREE: Final = 0.196
-"""map_server's trinary thresholds; 205 reads as 0.19608, just above FREE, so that unknown stays unknown."""
 
 RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
 """Metres per cell of an exported map."""

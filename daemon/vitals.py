@@ -15,6 +15,7 @@ from daemon.health import Vitals
 def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
     """The vitals of this moment; ``failed``: names of parts that are down, ``lateness``: of the loop, seconds."""
     parts, status, t_mono = cycle.parts, cycle.parts.status, cycle.parts.clock.now()
+    lag = None if cycle.result is None else cycle.result.lag
     return Vitals(
         t_mono=t_mono,
         link=status.link,
@@ -29,6 +30,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         disagree=cycle.watch.disagree,
         late=cycle.watch.late,
         misfit=cycle.watch.misfit,
+        lag=0.0 if lag is None else lag.lag_s,
         readings=cycle.watch.readings,
         readings_missed=cycle.watch.missed,
         readings_old=cycle.watch.old,

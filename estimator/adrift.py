@@ -184,7 +184,7 @@ def by_light_alone(state: State) -> bool:
     if seek.alive or not seek.looks or tie.way - seek.way_begin < ALONE_M or not told(state):
         return False
     since = atlas.since
-    atlas.adrift, atlas.since, atlas.bridge, atlas.seek = None, 0, None, Seek(terrain=seek.terrain)
+    atlas.adrift, atlas.since, atlas.bridge, atlas.seek = None, 0, None, Seek()
     rehang(state, since)
     return True
 
@@ -313,7 +313,7 @@ def land(state: State, one: Hypothesis, alone: bool) -> None:
     since, first = atlas.since, atlas.adrift
     if first is not None:
         atlas.watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain, since=since, alone=alone)
-    atlas.adrift, atlas.since, atlas.seek = None, 0, Seek(terrain=atlas.seek.terrain)
+    atlas.adrift, atlas.since, atlas.seek = None, 0, Seek()
     for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
         if it.key in atlas.submaps:
             R = se2.rotation(-atlas.submaps[it.key].T_map_submap[2])

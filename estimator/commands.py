@@ -63,6 +63,7 @@ def forget(state: State) -> None:
     state.atlas = state.atlas.renewed()
     if state.live is not None:
         state.live.clear()
+    state.lag.forget()
     state.P_anchor, state.fused.P = NOTHING.copy(), NOTHING.copy()
     state.anchor, state.T_odom_anchor, state.failures = 0, state.fused.T_odom_base, 0
     state.T_map_start = se2.compose(state.T_map_odom, state.fused.T_odom_base)

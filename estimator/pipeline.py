@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, adrift, closing, lateness, livemap, matchers, matching, motion, protection, se2
+from estimator import absolute, adrift, closing, lateness, livemap, matchers, matching, motion, protection, se2, timelag
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
@@ -84,6 +84,7 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
     walk(state)
     match = match_scan(state, scan, points, limits, why)
     fuse(state, match)
+    timelag.on_match(state.lag, scan, match)
     lap("match")
     if not (limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match)):
         return match, -1
@@ -119,6 +120,7 @@ def predict(state: State, record: Record) -> None:
     match record:
         case Odometry():
             motion.on_odometry(state.fused, record, noise)
+            timelag.on_odometry(state.lag, record)
         case Imu():
             motion.on_imu(state.fused, record, noise)
         case Scan() | SampleBlock() | LightEpoch():
@@ -210,6 +212,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
         places=adrift.places(state),
+        lag=state.lag.told,
         jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
         anew=state.anew,
         protection=protection.bound(state, P),

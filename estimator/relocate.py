@@ -75,10 +75,9 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terrain:
-    """All that is settled, in the map's frame; ``elements``: those of each piece."""
+    """All that is settled, to be searched; ``field`` in the map's frame."""
 
     pieces: tuple[Piece, ...]
-    elements: tuple[Array, ...]
     field: Field
 
 
@@ -172,11 +171,10 @@ def terrain_of(pieces: tuple[Piece, ...], before: Terrain | None) -> Terrain:
         pairs = zip(before.pieces, pieces, strict=True)
         if all(a.settled is b.settled and np.array_equal(a.T_map_submap, b.T_map_submap) for a, b in pairs):
             return before
-    elements = tuple(placed(piece) for piece in pieces)
-    points = np.vstack([some[:, :2] for some in elements])
+    points = np.vstack([placed(piece)[:, :2] for piece in pieces])
     width, height = np.ptp(points, axis=0) + 2.0
     cell = max(CELL_M, math.sqrt(float(width * height) / CELLS))
-    return Terrain(pieces, elements, field_of(points, cell, BLUR * cell, 1.0))
+    return Terrain(pieces, field_of(points, cell, BLUR * cell, 1.0))
 
 
 def placed(piece: Piece) -> Array:
@@ -260,7 +258,7 @@ def nearest(terrain: Terrain, T: Array) -> list[int]:
 
 def local_of(terrain: Terrain, near: Sequence[int], T: Array) -> LocalMap:
     """The pieces as one map to match against, in the map's frame."""
-    return localmap.index(np.vstack([terrain.elements[k] for k in near]), T[:2], 1, None)
+    return localmap.index(np.vstack([placed(terrain.pieces[k]) for k in near]), T[:2], 1, None)
 
 
 def worst(terrain: Terrain, near: Sequence[int], local: LocalMap, T: Array, view: View) -> tuple[float, float]:

@@ -195,6 +195,17 @@ class Protection:
     wheels: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """By how much scans are stamped later than the wheels' readings (`estimator/timelag.py`); one sigma. Both in s.
+
+    Negative: the wheels are late.
+    """
+
+    lag_s: float
+    sigma_s: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StepResult:
     """The estimate after one `step`.
@@ -218,6 +229,7 @@ class StepResult:
         protection: bound on the error of T_map_base; None: none can be given.
         places: None where the place in the map is known; else how many places of it fit all that was seen: 0 none yet,
             1 one that is being confirmed.
+        lag: between the stamps of scans and wheels, None where none is beyond doubt.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
 
@@ -239,4 +251,5 @@ class StepResult:
     anew: int = 0
     protection: Protection | None = None
     places: int | None = None
+    lag: Lag | None = None
     jobs: tuple[Job, ...] = ()

@@ -22,6 +22,7 @@ from estimator.motion import Motion, MotionNoise
 from estimator.records import Array, Scan
 from estimator.result import MatchResult
 from estimator.scanpoints import ScanPoints
+from estimator.timelag import TimeLag
 
 if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.absolute import Absolute
@@ -92,6 +93,7 @@ class State:
         t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
         t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
         anew: how often the local map was begun anew because nothing fitted the old one.
+        lag: between the stamps of scans and wheels.
         journal: is told of every match before it is fused, None: nobody asks.
     """
 
@@ -127,6 +129,7 @@ class State:
     T_odom_scan: Array = field(default_factory=se2.identity)
     t_newest_scan: float = -math.inf
     bearing_rad: Array | None = None
+    lag: TimeLag = field(default_factory=TimeLag)
     journal: Journal | None = None
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import threading
 from typing import Final
 
@@ -15,13 +14,13 @@ import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from daemon import cli
-from daemon.config import Config
 from daemon.endpoints import parse_endpoint
 from hal.serving import work_until_told
 from taps import rostypes
-from taps.frames import Hello, NotTheStream
-from taps.ros import TOPICS, Out, Translator
-from taps.stream import Lost, Stream, path_of
+from taps.follow import follow
+from taps.frames import NotTheStream
+from taps.ros import TOPICS, Out
+from taps.stream import Stream, path_of
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -95,21 +94,3 @@ class Bridge(ServerListener):
     def close(self) -> None:
         """Stop serving."""
         self._server.stop()
-
-
-async def follow(stream: Stream, settings: Config, bridge: Bridge) -> None:
-    """Pass on all that is told, until cancelled.
-
-    Raises:
-        NotTheStream: the other end is no daemon of this version.
-    """
-    translator = Translator(settings.lidar.mount)
-    async with contextlib.aclosing(stream.frames()) as frames:
-        async for frame in frames:
-            if isinstance(frame, Lost):
-                cli.say(f"{frame.text}; waiting")
-            elif isinstance(frame, Hello):
-                translator = Translator(settings.lidar.mount)
-            else:
-                for out in translator.take(frame):
-                    bridge.send(out)

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from daemon.config import Mount
 from daemon.publish.snapshot import State
-from daemon.results import FREE, OCCUPIED
 from taps import rostypes as ros
 from taps.frames import Faults, Frame, Lights, Loop, MapTiles, Pose, Raw, Scan, StateChange, Statistics, Triple
+from taps.tiles import Tiles, trinary
 
 MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
 
@@ -26,8 +25,6 @@ STEP_S: Final = 0.5
 """The computer's calendar may be put right by less without the stamps jumping."""
 AGAIN_S: Final = 5.0
 """What stands still is said again so often, for those who came later."""
-UNKNOWN: Final = np.zeros((1, 1), np.float32)
-"""A map of which nothing is known; one without any cell is more than some programs can read."""
 SLOWEST_HZ: Final = 1.0
 """Of diagnostics."""
 
@@ -93,8 +90,8 @@ class Translator:
         self._faults: Faults | None = None
         self._statistics: Statistics | None = None
         self._lights: Lights | None = None
-        self._tiles: dict[tuple[int, int], npt.NDArray[np.float32]] = {}
-        self._resolution, self._fresh, self._drawn = 0.05, False, -math.inf
+        self._tiles = Tiles()
+        self._drawn = -math.inf
         self._now = 0.0
 
     def take(self, frame: Frame) -> Iterator[Out]:
@@ -117,16 +114,14 @@ class Translator:
             case Statistics():
                 self._statistics = frame
             case MapTiles():
-                self._take_tiles(frame)
+                self._tiles.take(frame)
 
     def grid(self, t_mono: float, origin: tuple[float, float], resolution: float, log_odds: Any) -> Iterator[Out]:
         """The map as a whole: (rows, columns) log-odds, rows from below, 0 not known."""
         t = self._at(t_mono)
         if t is None or log_odds.size == 0:
             return
-        cells = np.full(log_odds.shape, -1, np.int8)
-        cells[log_odds > math.log(OCCUPIED / (1.0 - OCCUPIED))] = 100
-        cells[log_odds < math.log(FREE / (1.0 - FREE))] = 0
+        cells = trinary(log_odds)
         info = ros.make(
             "nav_msgs/msg/MapMetaData",
             map_load_time=ros.time(t),
@@ -292,32 +287,12 @@ class Translator:
                 data=np.frombuffer(frame.data, np.uint8),
             )
 
-    def _take_tiles(self, frame: MapTiles) -> None:
-        """Keep what the map shows, as log-odds; it is drawn with the next pose."""
-        for column, row, packed in frame.tiles:
-            cells = frame.cells(packed)
-            if cells.any():
-                self._tiles[column, row] = np.float32(frame.unit) * cells
-            else:
-                self._tiles.pop((column, row), None)
-        self._resolution, self._fresh = frame.resolution, not frame.more
-
     def _map(self) -> Iterator[Out]:
         """The map, when it has changed and some time has gone by."""
-        if not self._fresh or 0.0 <= self._now - self._drawn < AGAIN_S:
-            return
-        self._fresh, self._drawn = False, self._now
-        if not self._tiles:  # after RESET: whoever comes late must not be given the map that was
-            yield from self.grid(self._now, (0.0, 0.0), self._resolution, UNKNOWN)
-            return
-        columns, rows = zip(*self._tiles, strict=True)
-        left, below, side = min(columns), min(rows), len(next(iter(self._tiles.values())))
-        whole = np.zeros(((max(rows) - below + 1) * side, (max(columns) - left + 1) * side), np.float32)
-        for (column, row), cells in self._tiles.items():
-            at_row, at_column = (row - below) * side, (column - left) * side
-            whole[at_row : at_row + side, at_column : at_column + side] = cells
-        corner = (left * side * self._resolution, below * side * self._resolution)
-        yield from self.grid(self._now, corner, self._resolution, whole)
+        if self._tiles.fresh and not 0.0 <= self._now - self._drawn < AGAIN_S:
+            self._drawn = self._now
+            corner, whole = self._tiles.whole()
+            yield from self.grid(self._now, corner, self._tiles.resolution, whole)
 
     def _statuses(self, frame: Pose) -> list[Any]:
         level = OK if frame.state in WELL else WARN if frame.state in POOR else ERROR

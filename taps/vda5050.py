@@ -17,7 +17,8 @@ LOCALISED = (State.TRACKING, State.MAPPING, State.DEGRADED)
 def position(latest: Pose, held: Pose | None = None) -> dict[str, object] | None:
     """The object of version 3; None while no pose has ever been told.
 
-    ``held``: the last one with a pose, for while ``latest`` has none: ``localized`` is false then.
+    ``held``: the last one with a pose, for while ``latest`` has none: ``localized`` is false then. The standard leaves
+    it to the vehicle what ``localizationScore`` is: here, the share of axes (x, y, heading) that are observed.
     """
     known = latest if latest.pose is not None else held
     if known is None or known.pose is None:
@@ -30,15 +31,18 @@ def position(latest: Pose, held: Pose | None = None) -> dict[str, object] | None
         "theta": round(math.remainder(yaw, 2.0 * math.pi), 5),
         "mapId": f"{known.map_id:08x}",
         "localized": localised,
+        "localizationScore": round(sum(latest.known) / len(latest.known), 2) if localised else 0.0,
     }
     if localised and latest.trust.horizontal_m is not None:
         told["deviationRange"] = round(latest.trust.horizontal_m, 4)
     return told
 
 
-def position_v2(latest: Pose, held: Pose | None = None) -> dict[str, object] | None:
-    """The object of version 2."""
+def position_v2(latest: Pose, held: Pose | None = None, description: str = "") -> dict[str, object] | None:
+    """The object of version 2; ``description``: of the map, as far as there is one."""
     told = position(latest, held)
     if told is not None:
         told["positionInitialized"] = told.pop("localized")
+        if description:
+            told["mapDescription"] = description
     return told

@@ -36,7 +36,7 @@ def test_the_installer_takes_every_room() -> None:
 def test_locks_have_everything_that_is_named() -> None:
     """Each lock file against the extras that it is made of (`make lock`)."""
     extras = PROJECT["project"]["optional-dependencies"]
-    dev = ["test", "plot", "mcap", "foxglove", "view"]
+    dev = ["test", "plot", "mcap", "foxglove", "view", "zenoh"]
     for lock, named in {"core": [], "dev": dev, "bench": [*dev, "bench"]}.items():
         kept = {row.partition("==")[0] for row in (ROOT / f"requirements/{lock}.lock").read_text().splitlines()}
         wanted = [*PROJECT["project"]["dependencies"], *(one for extra in named for one in extras[extra])]

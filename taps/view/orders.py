@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 
 from daemon.publish.holding import COMMAND_ADDRESS, CommandCode, Outcome
 
-ANSWER_ADDRESS: Final = COMMAND_ADDRESS + 8
+MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
 TRIES: Final = 4
 TRY_S: Final = 0.3
 ASK_AGAIN_S: Final = 0.1
@@ -84,6 +84,22 @@ class Wire(asyncio.DatagramProtocol):
             raise OrderRefused(f"the daemon takes no orders (Modbus exception {told[1]}): set `modbus.write = true`")
         return told
 
+    async def next_number(self) -> int:
+        """A number that starts a command."""
+        before = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 1))
+        return int.from_bytes(before[2:4], "big") % 0xFFFF + 1
+
+    async def outcome(self, number: int) -> tuple[bool, bool, Outcome]:
+        """Whether the request in force is still ours, whether it has ended, and how."""
+        told = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 10))
+        request = int.from_bytes(told[2:4], "big")
+        acknowledged, result = struct.unpack(">HH", told[2 + 16 : 2 + 20])
+        try:
+            outcome = Outcome(result)
+        except ValueError:
+            outcome = Outcome.UNKNOWN
+        return request == number, acknowledged == number and outcome is not Outcome.RUNNING, outcome
+
     def close(self) -> None:
         """Close the socket."""
         if self._transport is not None:
@@ -120,8 +136,7 @@ class Orders:
 
     async def _give(self, viewer: int, name: str, pose: tuple[float, float, float]) -> None:
         wire = await self._ready()
-        before = await wire.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 1))
-        number = int.from_bytes(before[2:4], "big") % 0xFFFF + 1
+        number = await wire.next_number()
         x, y, yaw = round(pose[0] * 1e4), round(pose[1] * 1e4), round(pose[2] * 1e6)
         words = struct.pack(">HHiii", number, NAMES[name], x, y, yaw)
         await wire.ask(struct.pack(">BHHB", 16, COMMAND_ADDRESS, 8, 16) + words)
@@ -143,11 +158,7 @@ class Orders:
 
     async def _ready(self) -> Wire:
         if self._wire is None:
-            try:
-                loop = asyncio.get_running_loop()
-                _, self._wire = await loop.create_datagram_endpoint(Wire, remote_addr=self._where)
-            except OSError as error:
-                raise OrderRefused(f"{self._where[0]}:{self._where[1]}: {error.strerror or error}") from None
+            self._wire = await _wired(*self._where)
         return self._wire
 
     async def _follow(self, wire: Wire, number: int, told: dict[str, object]) -> None:
@@ -156,7 +167,7 @@ class Orders:
         end = asyncio.get_running_loop().time() + LONGEST_S
         while asyncio.get_running_loop().time() < end:
             try:
-                mine, ended, result = await self._asked(wire, number)
+                mine, ended, result = await wire.outcome(number)
             except OrderRefused as error:
                 outcome = str(error)
                 break
@@ -169,16 +180,38 @@ class Orders:
             await asyncio.sleep(ASK_AGAIN_S)
         self._tell({**told, "outcome": outcome})
 
-    async def _asked(self, wire: Wire, number: int) -> tuple[bool, bool, Outcome]:
-        """Whether the request in force is still ours, whether it has ended, and how."""
-        told = await wire.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 10))
-        request = int.from_bytes(told[2:4], "big")
-        acknowledged, result = struct.unpack(">HH", told[2 + 16 : 2 + 20])
-        try:
-            outcome = Outcome(result)
-        except ValueError:
-            outcome = Outcome.UNKNOWN
-        return request == number, acknowledged == number and outcome is not Outcome.RUNNING, outcome
+
+async def _wired(host: str, port: int) -> Wire:
+    try:
+        _, wire = await asyncio.get_running_loop().create_datagram_endpoint(Wire, remote_addr=(host, port))
+    except OSError as error:
+        raise OrderRefused(f"{host}:{port}: {error.strerror or error}") from None
+    return wire
+
+
+async def switch_map(host: str, port: int, map_id: int) -> str:
+    """Have the daemon go on in another stored map; how that ended, in a word.
+
+    Raises:
+        OrderRefused: it cannot be ordered.
+    """
+    wire = await _wired(host, port)
+    try:
+        number = await wire.next_number()
+        await wire.ask(struct.pack(">BHHBI", 16, MAP_ADDRESS, 2, 4, map_id))
+        await wire.ask(struct.pack(">BHHBHH", 16, COMMAND_ADDRESS, 2, 4, number, CommandCode.SWITCH_MAP))
+        end = asyncio.get_running_loop().time() + LONGEST_S
+        while asyncio.get_running_loop().time() < end:
+            mine, ended, result = await wire.outcome(number)
+            if not mine:
+                return "replaced"
+            if ended:
+                return result.name.lower()
+            await asyncio.sleep(ASK_AGAIN_S)
+        return "no end seen"
+    finally:
+        wire.close()
+        await asyncio.sleep(0)  # the loop closes the socket a turn later
 
 
 def _pose_of(asked: Mapping[str, Any]) -> tuple[float, float, float]:

@@ -39,6 +39,8 @@ def test_all_is_well() -> None:
         ({"odometry": True, "odometry_jumps": 1}, Fault.ODOMETRY_JUMPS),
         ({"odometry": True, "disagree": True}, Fault.ODOMETRY_DISAGREES),
         ({"late": 30}, Fault.LIDAR_LATE),
+        ({"lag": 0.3}, Fault.LIDAR_LATE),
+        ({"odometry": True, "lag": -0.2}, Fault.ODOMETRY_GAPS),
         ({"misfit": True}, Fault.LIDAR_MISFIT),
         ({"odometry": True, "readings": 100, "readings_missed": 20}, Fault.ODOMETRY_GAPS),
         ({"odometry": True, "readings": 100, "readings_old": 20}, Fault.ODOMETRY_GAPS),
@@ -133,6 +135,23 @@ def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: py
         "fault 105: more than 5 % of the lidar's frames are damaged",
         "over: fault 105: more than 5 % of the lidar's frames are damaged",
     ]
+
+
+def test_a_lag_between_laser_and_wheels_is_said_once_each_way_with_its_seconds(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    for beat in range(20):
+        patient.now = replace(patient.now, lag=0.312 if 5 <= beat < 12 and beat != 8 else 0.0)
+        heart.beat(0.0)
+    assert [message.split(": ")[0] for message in caplog.messages] == ["fault 107", "over"]
+    assert caplog.messages[0].endswith("scans are +0.31 s late against the wheels")
+    early = replace(WELL, odometry=True, lag=-0.2)
+    assert describe(Fault.ODOMETRY_GAPS, early).endswith("scans are -0.20 s late against the wheels")
+    assert "against the wheels" not in describe(Fault.LIDAR_MISFIT, early)
+    assert assess(replace(early, lag=0.3, silent=True), BEFORE) == (Fault.LIDAR_SILENT,), "no scans come late"
 
 
 def test_a_stall_is_said_once_and_over_when_none_has_come_for_a_while(caplog: pytest.LogCaptureFixture) -> None:

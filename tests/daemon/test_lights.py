@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,9 +17,11 @@ from daemon.config import Config, LidarConfig, LightsConfig, ModbusConfig, Photo
 from daemon.endpoints import NO_DEVICE
 from daemon.lights import Lights, SurveyError, load_lights
 from daemon.main import Daemon, World
+from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import LightPicture, Snapshot
 from daemon.worker import CycleWorker
 from estimator.cdma_profile import PROFILE_A, PROFILE_B
+from hal.adc import AdcStatus
 from hal.clock import LoopClock, run_virtual
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX_UG01
@@ -27,7 +29,7 @@ from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
 from tests.daemon.driven import during
-from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged
+from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged, raw_block
 
 LIDAR = "/dev/ttyACM0"
 BLOCK_S = PROFILE_A.epoch_s
@@ -175,6 +177,17 @@ def test_a_converter_that_falls_silent_is_shown_within_five_blocks(lidar: bool) 
         await bench.until(lambda snapshot: bool(snapshot.adc_ok) and decoded(snapshot), 10.0)
 
     run_daemon(scenario, lidar=lidar)
+
+
+def test_blocks_of_a_millisecond_may_come_late_together() -> None:
+    """An adapter that reads 60 bytes at a time, on a computer that hands them over when it comes to it."""
+    watch = BlockWatch(AdcStatus(), PROFILE_A)
+    assert not watch.ok(10.0)
+    watch.on_block(replace(raw_block(0), words=np.zeros(30, np.uint16)))
+    t_last = raw_block(0).t1
+    assert watch.seconds < 2e-3
+    assert watch.ok(t_last + 2.5 * BLOCK_S)
+    assert not watch.ok(t_last + 3.5 * BLOCK_S)
 
 
 def test_a_lidar_that_goes_leaves_the_pace_to_the_lights_and_takes_it_back(caplog: pytest.LogCaptureFixture) -> None:

@@ -105,3 +105,32 @@ other, second, third = made(), realtime.line_up(), realtime.line_up()
 print(nothing, first >= 1, second, third, one(), other(), os.sched_getparam(0).sched_priority)
 """
     assert said_by(code) == "0 True 1 0 True True 40"
+
+
+HELD = """
+import ctypes, sys
+from daemon import realtime
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
+
+def large():
+    block = libc.malloc(20_000_000)
+    ctypes.memset(block, 1, 20_000_000)
+    return block
+
+{call}
+libc.free(large())  # from which glibc learns
+before = resident()
+block = large()
+small = libc.malloc(100_000)  # outlives it
+libc.free(block)
+print(resident() - before)
+"""
+
+
+def test_what_a_large_job_has_needed_is_given_back() -> None:
+    assert float(said_by(HELD.format(call=""))) > 15.0, "glibc has become wiser: the call can go"
+    assert float(said_by(HELD.format(call="realtime.give_back()"))) < 1.0

@@ -57,6 +57,7 @@ def test_a_robot_that_was_moved_is_not_where_it_was(floor: Floor, moved: tuple[f
     assert None not in said, "not found yet, and not called found: it has to drive"
     robot.along(way(((1.85, 1.6), (1.85, 6.0), (4.0, 6.0)), 0.06))
     assert robot.state.atlas.adrift is None
+    assert robot.state.atlas.seek.terrain is None, "what it was looked for in: the whole map a second time"
     assert robot.off()[0] < 0.1
 
 

@@ -6,8 +6,10 @@ A body is a coroutine; :meth:`End.play` runs it where its device is.
 from __future__ import annotations
 
 import asyncio
+import errno
 import math
 import socket
+import termios
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -102,10 +104,12 @@ class Person:
         await asyncio.to_thread(self.tell, request, order)
 
     def tell(self, request: str, order: str) -> None:
-        """The same, blocking."""
+        """The same, blocking; keys pressed before the question are no answer. Raises `OSError` if nobody is left."""
         with Path("/dev/tty").open("r+b", buffering=0) as terminal:
+            termios.tcflush(terminal, termios.TCIFLUSH)
             terminal.write(f"\n>>> {request}, then press Enter: ".encode())
-            terminal.readline()
+            if not terminal.readline():
+                raise OSError(errno.EIO, f"{request}: nobody answers at the terminal")
 
 
 def operator_for(text: str) -> Operator | None:

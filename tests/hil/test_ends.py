@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import select
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,14 +23,44 @@ ON_DEVICES = 8
 """Tests of the lidar that need no minutes, and the probe."""
 
 
-def suite(tmp_path: Path, *options: str, only: str = "not system") -> tuple[int, str, Any]:
-    """Run it as a person does: exit code, output, results by name."""
+def words_of(tmp_path: Path, *options: str, only: str = "not system") -> list[str]:
+    """The command."""
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/hil", "-m", only]
-    ignored = ["--ignore=tests/hil/test_ends.py", "--hil-report", str(tmp_path / "report")]
-    done = subprocess.run([*words, *ignored, *options], cwd=ROOT, capture_output=True, text=True, timeout=250)
+    return [*words, "--ignore=tests/hil/test_ends.py", "--hil-report", str(tmp_path / "report"), *options]
+
+
+def results_of(tmp_path: Path) -> dict[str, Any]:
+    """What came of it, by name."""
     file = tmp_path / "report" / "results.json"
-    told = json.loads(file.read_text())["results"] if file.exists() else []
-    return done.returncode, done.stdout + done.stderr, {one["name"]: one for one in told}
+    return {one["name"]: one for one in json.loads(file.read_text())["results"]} if file.exists() else {}
+
+
+def suite(tmp_path: Path, *options: str) -> tuple[int, str, dict[str, Any]]:
+    """Run it as a person does: exit code, output, results by name."""
+    done = subprocess.run(words_of(tmp_path, *options), cwd=ROOT, capture_output=True, text=True, timeout=250)
+    return done.returncode, done.stdout + done.stderr, results_of(tmp_path)
+
+
+@contextmanager
+def at_a_terminal(words: list[str]) -> Generator[tuple[subprocess.Popen[bytes], Callable[[str], str], int]]:
+    """A program in a session of its own, its terminal a pty: what it shows up to some words, and the keyboard."""
+    screen, line = os.openpty()
+    with subprocess.Popen(["setsid", "--ctty", *words], cwd=ROOT, stdin=line, stdout=subprocess.PIPE) as child:
+        os.close(line)
+
+        def shows(wanted: str, patience_s: float = 60.0) -> str:
+            said, end = "", time.monotonic() + patience_s
+            while wanted not in said:
+                if not select.select([screen], [], [], max(end - time.monotonic(), 0.0))[0]:
+                    raise TimeoutError(f"{wanted!r} is not shown: {said!r}")
+                said += os.read(screen, 4096).decode()
+            return said
+
+        try:
+            yield child, shows, screen
+        finally:
+            child.kill()
+            os.close(screen)
 
 
 @pytest.mark.system
@@ -56,6 +91,50 @@ def test_the_same_bodies_pass_on_a_remote_bus(tmp_path: Path) -> None:
         assert {figure["name"] for figure in results["test_photodiode.py::test_in_the_dark"]["figures"]}
 
 
+@pytest.mark.system
+def test_a_person_at_the_terminal_is_asked_and_presses_enter(tmp_path: Path) -> None:
+    """Somebody with no other hands than the fake's control socket, who does what is asked when it is asked."""
+    orders = {"pull the lidar's cable": "order hangup where=lidar", "plug it in again": "clear hangup lidar"}
+    with served_lidar(tmp_path) as lidar:
+        asked = ["--lidar", lidar.device, "--operator", "terminal", "-k", "lidar and unplugged"]
+        assert lidar.operator is not None
+        with at_a_terminal(words_of(tmp_path, *asked)) as (child, shows, keyboard):
+            for request, order in orders.items():
+                assert request in shows("then press Enter: ")
+                time.sleep(0.5)  # it takes a person a moment
+                lidar.operator.tell(request, order)
+                os.write(keyboard, b"\n")
+            said = child.communicate(timeout=120.0)[0].decode()
+    assert child.returncode == 0, said
+    (result,) = results_of(tmp_path).values()
+    assert result["passed"]
+    assert {one["name"] for one in result["figures"]} >= {"scans again after"}
+
+
+def test_a_key_that_was_pressed_too_often_is_no_answer_to_the_next_question() -> None:
+    ask = "from tests.hil.ends import Person; [Person().tell(text, '') for text in ('pull', 'plug')]"
+    with at_a_terminal([sys.executable, "-c", ask]) as (child, shows, keyboard):
+        assert "pull" in shows("press Enter: ")
+        os.write(keyboard, b"\n\n\n")
+        assert "plug" in shows("press Enter: ")
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(0.5)
+        os.write(keyboard, b"\n")
+        assert child.wait(10.0) == 0
+
+
+def test_a_terminal_that_is_closed_is_no_answer() -> None:
+    ask = "from tests.hil.ends import Person; Person().tell('pull', '')"
+    with at_a_terminal([sys.executable, "-c", f"try:\n {ask}\nexcept OSError as e: print(e)"]) as (
+        child,
+        shows,
+        keyboard,
+    ):
+        shows("press Enter: ")
+        os.write(keyboard, b"\x04")  # Ctrl-D
+        assert b"nobody answers at the terminal" in child.communicate(timeout=10.0)[0]
+
+
 def test_what_cannot_be_is_said_or_skipped_with_its_reason(tmp_path: Path) -> None:
     """A device that is not there, and a bench with nobody and nothing at hand."""
     devices = ["--lidar", str(tmp_path / "nothing"), "--adc", f"unix:{tmp_path}/none@0x4d"]
@@ -68,6 +147,25 @@ def test_what_cannot_be_is_said_or_skipped_with_its_reason(tmp_path: Path) -> No
     assert len(skipped) == 3
     assert skipped["test_photodiode.py::test_light_levels"].startswith("needs light on unix:")
     assert "--operator terminal" in skipped["test_lidar.py::test_is_unplugged_and_plugged_in_again"]
+
+
+def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Path) -> None:
+    code, said, _ = suite(tmp_path, "-k", "light_levels")
+    assert code == 0, said
+    file = tmp_path / "old.json"
+    old = json.loads((tmp_path / "report" / "results.json").read_text())
+    file.write_text(json.dumps(old))
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(file))
+    assert code == 0, said
+    (swing,) = [one for one in old["results"][0]["figures"] if one["name"] == "swing of the signal"]
+    swing["value"] *= 3.0
+    file.write_text(json.dumps(old))
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(file))
+    assert code == 1
+    assert "worse than before: test_photodiode.py::test_light_levels: swing of the signal" in said
+    assert "swing of the signal" in (tmp_path / "report" / "report.html").read_text()
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / "none.json"))
+    assert (code, "name the results.json" in said) == (4, True)
 
 
 @pytest.mark.parametrize("name", ["/dev/i2c-1", "@0x4d", "/dev/i2c-1@4d,", "/dev/i2c-1@"])

@@ -49,10 +49,16 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
     with pytest.raises(SystemExit):
         main(["nowhere"])
     blessed = golden.load("room")
-    moved = replace(blessed, poses=blessed.poses + np.array((2e-6, 0.0, 0.0)))
-    monkeypatch.setattr(golden, "load", lambda name: moved)
-    assert main(["room"]) == 1
-    assert "MOVED" in capsys.readouterr().out
+    for where, off_m in ((golden.environment(), 1e-5), ("another processor", 1.1e-3)):  # wherever this runs
+        facts = {**blessed.facts, "environment": where}
+        moved = replace(blessed, facts=facts, poses=blessed.poses + np.array((off_m, 0.0, 0.0)))
+        monkeypatch.setattr(golden, "load", lambda name, moved=moved: moved)
+        assert main(["room"]) == 1
+        assert "MOVED" in capsys.readouterr().out
+    near = replace(moved, poses=blessed.poses + np.array((0.9e-3, 0.0, 0.0)))
+    monkeypatch.setattr(golden, "load", lambda name: near)
+    assert main(["room"]) == 0
+    assert "another processor, or other versions: 0.0009" in capsys.readouterr().out
 
 
 def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,9 +81,13 @@ def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pyte
     assert golden.judged(blessed, trajectory, [], 10).same
     assert not golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same, "another loop"
+    away = golden.judged(blessed, Trajectory(np.arange(25.0), moved), [], 10)
+    assert not away.same
+    assert "same machine: moved by 0.000002 m" in away.said
     monkeypatch.setattr(golden, "environment", lambda: "another processor")
     assert golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
-    far = poses + np.array((0.0, 1.1e-3, 0.0))
+    near, far = (poses + np.array((0.0, off, 0.0)) for off in (0.9e-3, 1.1e-3))
+    assert golden.judged(blessed, Trajectory(np.arange(25.0), near), [], 10).same
     assert not golden.judged(blessed, Trajectory(np.arange(25.0), far), [], 10).same
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same
     assert golden.largest_difference(blessed, Trajectory(np.arange(24.0), poses[:24]), 10) == float("inf")

@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,10 +43,12 @@ SNAPSHOT = Snapshot(
 )
 
 
-def turn(server: StreamServer, number: int) -> None:
+def turn(server: StreamServer, number: int, place: tuple[float, float, float] | None = SNAPSHOT.pose) -> None:
     """What one cycle tells."""
     t = 1.0 + 0.025 * number
-    moving = replace(SNAPSHOT, seq=number, t_mono=t, t_sent=t + 0.01, t_utc=1.7e9 + t + 0.01, loop_counter=number // 20)
+    moving = replace(
+        SNAPSHOT, seq=number, pose=place, t_mono=t, t_sent=t + 0.01, t_utc=1.7e9 + t + 0.01, loop_counter=number // 20
+    )
     assert SNAPSHOT.light is not None
     server.publish(replace(moving, light=replace(SNAPSHOT.light, t_mono=t)))
     server.on_scan(raw_scan(number))
@@ -64,8 +67,14 @@ def with_map(server: StreamServer) -> None:
 
 
 @contextmanager
-def served(path: Path, each: Callable[[StreamServer, int], None] = turn) -> Iterator[StreamServer]:
-    """A robot that drives at 40 Hz, as long as the context lasts."""
+def served(
+    path: Path,
+    each: Callable[[StreamServer, int], None] = turn,
+    place: tuple[float, float, float] | None = None,
+) -> Iterator[StreamServer]:
+    """A robot that drives at 40 Hz, as long as the context lasts; ``place``: where it says it is."""
+    if place is not None:
+        each = partial(turn, place=place)
     server = StreamServer(path, "agv", lambda reason: (f"meaning {reason}", "remedy"))
     with_map(server)
     stop, ready = threading.Event(), threading.Event()

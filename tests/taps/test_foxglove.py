@@ -16,7 +16,8 @@ import aiohttp
 
 from daemon.config import Config
 from taps import foxglove_live, rostypes
-from taps.foxglove_live import Bridge, follow
+from taps.follow import follow
+from taps.foxglove_live import Bridge
 from taps.ros import TOPICS
 from taps.stream import Stream
 from tests.taps.serving import served

@@ -99,6 +99,7 @@ def test_position_and_what_is_no_request(tmp_path: Path) -> None:
             made = json.loads(told.partition(b"\r\n\r\n")[2])[name]
             assert made == {
                 "x": 1.0, "y": 2.0, "theta": 3.0, "mapId": "0000abcd", key: True, "deviationRange": 0.1,
+                "localizationScore": 1.0,
             }  # fmt: skip
         for request, status in (
             (b"GET /none HTTP/1.1\r\n\r\n", b"404"),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 import pytest
 
 from tools.bench.__main__ import main
+from tools.bench.recording import processor_s
 
 
 def test_a_benchmark_without_its_data_says_what_it_needs(
@@ -21,3 +24,12 @@ def test_a_benchmark_without_its_data_says_what_it_needs(
     monkeypatch.setenv("LUMILOOP_DATA", str(tmp_path))
     assert main() == 1
     assert f"No such file or directory: '{tmp_path}/posegraphs/m3500.g2o.gz'" in capsys.readouterr().out
+
+
+def test_processor_time_is_that_of_the_whole_process() -> None:
+    until = time.process_time() + 0.1
+    before = processor_s(os.getpid())
+    while time.process_time() < until:
+        pass
+    assert 0.07 < processor_s(os.getpid()) - before < 0.5
+    assert abs(processor_s(os.getpid()) - time.process_time()) < 0.1

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import socket
 import struct
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from daemon.publish import registers
+from tools.bench.modbus import example
 from tools.bench.vm import bench, image, places, world
+from tools.bench.vm.__main__ import tried
 from tools.bench.vm.guest import agent
-from tools.bench.vm.machine import Ports, _words
+from tools.bench.vm.machine import Machine, Order, Ports, _words
 from tools.bench.vm.scenarios import PARTS, SCENARIOS, WRITTEN
 from tools.bench.world import agreement
 from tools.bench.world.room import room
@@ -28,7 +35,7 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) == len(set(SCENARIOS)) == len(WRITTEN)
     assert len(SCENARIOS) >= 25
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
-    assert [part.__name__.rpartition("_")[2] for part in PARTS] == ["system", "devices", "process"]
+    assert [part.__name__.rpartition("_")[2] for part in PARTS] == ["system", "devices", "photodiode", "process"]
 
 
 def test_what_is_missing_is_said_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,6 +65,22 @@ def test_a_folder_left_by_a_killed_process_is_removed(tmp_path: Path, monkeypatc
         assert folder == tmp_path / f"some-{os.getpid()}"
         (folder / "file").touch()
     assert list(tmp_path.iterdir()) == [running]
+
+
+def test_what_the_bench_starts_ends_with_it_however_it_ends() -> None:
+    """QEMU and the world, when the bench is killed."""
+    words = [*places.LEASH, "sleep", "60"]
+    code = f"import subprocess, time; print(subprocess.Popen({words}).pid, flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = Path("/proc", parent.stdout.readline().strip())
+        end = time.monotonic() + 10.0
+        while child.joinpath("comm").read_text() != "sleep\n":
+            assert time.monotonic() < end
+        parent.kill()
+    while child.exists() and "Z" not in child.joinpath("stat").read_text().rpartition(")")[2]:
+        assert time.monotonic() < end, "it goes on"
+        time.sleep(0.02)
 
 
 def test_the_image_depends_on_what_is_in_it_and_on_nothing_else() -> None:
@@ -109,6 +132,46 @@ def test_the_disk_is_never_written_to_and_only_loopback_is_listened_on(tmp_path:
     assert all(":127.0.0.1:" in forward for forward in forwards)
 
 
+class Agent(Machine):
+    """A machine whose agent gives one answer to everything."""
+
+    def __init__(self, answer: bytes, folder: Path) -> None:
+        super().__init__(subprocess.Popen(["true"]), folder, Ports(1, 2, 3))
+        self._agent, self.far = socket.socketpair()
+        self._lines = self._agent.makefile("rb")
+        self.far.sendall(answer)
+
+    def close(self) -> None:
+        self._drop()
+        self.far.close()
+        self.process.wait()
+
+
+def test_an_insidethat_is_started_anew_fails_its_order_and_not_the_bench(tmp_path: Path) -> None:
+    inside = Agent(b'{"up": true}\n', tmp_path)
+    with pytest.raises(Order, match="started anew while"):
+        inside.run("true")
+    inside.close()
+    inside = Agent(b'{"code": 0, "out": ""}\n', tmp_path)
+    inside.reboot()
+    asked = json.loads(inside.far.recv(4096))["run"]
+    begun = time.monotonic()
+    done = agent.obey({"run": [*asked[:2], asked[2].replace("systemctl reboot", "sleep 5")]})
+    assert done == {"code": 0, "out": ""}
+    assert time.monotonic() - begun < 0.4, "it is answered before it is carried out"
+    inside.close()
+
+
+def test_a_scenario_that_builds_on_one_that_failed_fails_itself() -> None:
+    def needs_more(bench: object) -> str:
+        """It needs what has not been seen."""
+        raise KeyError("drive")
+
+    result = tried(needs_more, object())  # type: ignore[arg-type]  # it looks at nothing of it
+    assert not result.passed
+    assert result.said == "what it builds on has not been seen: KeyError('drive')"
+
+
 def test_a_transaction_of_the_adapter_is_understood() -> None:
     data = struct.pack("=Ii4H4H", 7, 2, 0x48, 0, 3, 0, 0x4D, agent.READ, 512, 0) + b"\x01\x83\x05"
     assert agent.transaction(data) == (7, [(0x48, b"\x01\x83\x05", 0), (0x4D, b"", 512)])
@@ -150,12 +213,45 @@ def test_a_pose_is_compared_where_the_map_begins() -> None:
     assert (x, y, yaw) == pytest.approx((1.0, 0.0, math.pi / 2))
 
 
+def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> None:
+    clock = bench.OtherClock()
+    apart, age = 500.0, 0.02
+    for k, delay in enumerate((0.003, 0.060, 0.001, 0.200)):
+        t = 10.0 + k
+        here = clock.here(t, t + age, t + age + apart + delay)
+        assert here == pytest.approx(t + apart + (0.003, 0.003, 0.001, 0.001)[k])
+    assert clock.here(1.0, 1.02, 700.02) == pytest.approx(700.0), "switched on anew"
+
+
+def test_a_pose_datagram_is_read_as_the_daemon_writes_it() -> None:
+    one = replace(example(7), t_mono=12.5, t_sent=12.53)
+    read = bench.heard(registers.encode_datagram(one), 100.03, bench.OtherClock())
+    assert read.t_pose == pytest.approx(100.0, abs=2e-4)
+    assert one.pose is not None
+    assert read.pose == pytest.approx(one.pose, abs=1e-4)
+    assert (read.t_came, read.state) == (100.03, one.state)
+
+
 def test_the_truth_is_interpolated() -> None:
     ears = bench.Ears()
     ears.truth.extend([(1.0, (0.0, 0.0, 3.1)), (2.0, (1.0, 2.0, -3.1))])
     pose = ears.true_pose(1.5)
     assert pose == pytest.approx((0.5, 1.0, math.pi), abs=1e-9)
     assert ears.true_pose(0.5) is None
+
+
+@pytest.mark.system
+@pytest.mark.timeout(600)
+def test_six_scenarios_where_there_is_an_image_of_these_sources(tmp_path: Path) -> None:
+    """Boots, is found, starts, is restricted, keeps real time; making the image takes too long here."""
+    made = image.Image(image.cache() / f"image-{image.image_key()}")
+    if reason := places.missing(build=False) or (made.lacks() and "no image of these sources: make bench-vm makes it"):
+        pytest.skip(reason)
+    assert [one.__name__ for one in SCENARIOS].index("takes_real_time") == 5
+    command = [sys.executable, "-m", "tools.bench.vm", "takes_real_time", "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "6 of 6 passed" in done.stdout
 
 
 @pytest.mark.system

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 import tty
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -25,7 +27,7 @@ from tests.daemon.lightroom import CODES, Lit
 from tests.daemon.test_lights import Bench, run_daemon
 from tools.bench.report import Seen
 from tools.bench.world import agreement, room
-from tools.bench.world.__main__ import main
+from tools.bench.world.__main__ import main, twins
 from tools.bench.world.dac import CLOCKS, Player, encoded
 from tools.bench.world.judge import Played, Read, errors_of, judged, pictures
 from tools.bench.world.local import robot
@@ -43,7 +45,7 @@ LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
 
 
 @pytest.mark.parametrize("path", sorted(BUILT_IN.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
+def test_scenarios_that_come_with_the_benchare_whole(path: Path) -> None:
     made = load(path)
     assert made.title != path.stem
     assert all(one.until <= made.drive.seconds and one.from_ < made.drive.seconds for one in made.expect)
@@ -112,6 +114,29 @@ def test_a_robot_computer_that_does_not_answer_is_told_so(tmp_path: Path, capsys
     assert main([str(file), "--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}"]) == 2
     assert "nobody answers at 127.0.0.1 port 9" in capsys.readouterr().out
     assert not (tmp_path / "l").exists()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_bench_that_is_ended_leaves_no_daemon(number: int, tmp_path: Path) -> None:
+    """In the middle of waiting for a pose."""
+    command = [sys.executable, "-m", "tools.bench.world", "lap", "--local", "--out", str(tmp_path / "out")]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment) as bench:
+        assert bench.stdout is not None
+        assert "waiting for a pose" in bench.stdout.readline()
+        (log,) = tmp_path.glob("lumiloop-world-*/daemon.log")
+        (child,) = Path(f"/proc/{bench.pid}/task/{bench.pid}/children").read_text().split()
+        bench.send_signal(number)
+        said = bench.communicate(timeout=60.0)[0]
+    end = time.monotonic() + 10.0
+    while Path("/proc", child).exists() and "Z" not in Path("/proc", child, "stat").read_text().rpartition(")")[2]:
+        assert time.monotonic() < end, "the daemon goes on"
+        time.sleep(0.02)
+    if number != signal.SIGKILL:
+        assert bench.returncode == 2
+        assert "ended before its end" in said
+        assert not log.parent.exists()
 
 
 # the judge
@@ -188,6 +213,39 @@ def test_two_runs_are_compared_at_equal_ways() -> None:
     assert agreement.differences(agreement.trace(one), agreement.trace(shifted))[1].max() > 0.01  # poses 31 ms too late
     told, _ = agreement.figures(agreement.trace(one), agreement.trace(other), "x")
     assert told[-1].value == pytest.approx(4.0, abs=1e-3)
+
+
+def test_under_surveyed_lamps_the_map_lies_in_the_survey_once_light_has_told() -> None:
+    """Until then where the robot said it was while it stood; a pose that is off is off in either frame."""
+
+    def told(off_m: float, again: float = math.inf) -> Played:
+        run = replace(played(), lamps=frozenset({7}))
+        site = [(*xy, yaw) for *xy, yaw in way(np.array([max(one.t_pose, 0.0) for one in run.reads])).tolist()]
+        poses = [
+            (x + off_m, y, yaw) if 4.0 < one.t < again else one.pose
+            for one, (x, y, yaw) in zip(run.reads, site, strict=True)
+        ]
+        return replace(run, reads=[replace(one, pose=pose) for one, pose in zip(run.reads, poses, strict=True)])
+
+    assert errors_of(told(0.0)).metres.max() < 1e-9
+    assert np.abs(errors_of(told(0.0)).off[:, 2]).max() < 1e-9
+    assert errors_of(told(0.3)).metres.max() == pytest.approx(0.3)
+    assert errors_of(told(0.0, again=6.0)).metres.max() > 1.0, "a map that goes back to where it lay is no place"
+    assert errors_of(replace(told(0.0), lamps=frozenset())).metres.max() > 1.0
+
+
+def test_two_runs_are_compared_until_a_fault_strikes() -> None:
+    """What a fault does depends on the scan that it strikes; before it both say the same."""
+    moved = played(lambda t: 0.5 if t > 3.1 else 0.0)
+    assert agreement.alike_s(moved.scenario) == 3.0
+    assert agreement.differences(agreement.trace(played()), agreement.trace(moved))[1].max() < 1e-9
+    whole = replace(SCENARIO, faults=())
+    apart = agreement.differences(
+        agreement.trace(replace(played(), scenario=whole)), agreement.trace(replace(moved, scenario=whole))
+    )
+    assert apart[1].max() == pytest.approx(0.5, abs=1e-6)
+    early = replace(moved, scenario=replace(SCENARIO, faults=({"when": 1.0},)))
+    assert "before it has driven" in twins(early.scenario, early).skipped
 
 
 def test_the_benchs_room_and_lidar_stand_beside_the_others() -> None:

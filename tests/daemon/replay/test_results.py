@@ -13,8 +13,9 @@ import yaml
 from PIL import Image
 
 from daemon.mapimage import draw
+from daemon.mapserver import FREE, OCCUPIED
 from daemon.png import encode_png
-from daemon.results import FREE, OCCUPIED, Folder, OutputRefused, Trajectory, greys, map_files, map_yaml, pgm, tum
+from daemon.results import Folder, OutputRefused, Trajectory, greys, map_files, map_yaml, pgm, tum
 from estimator.grid import Grid
 
 LOGITS = np.array([[4.0, 0.0, -4.0], [-1.4, -1.42, 0.61], [0.63, 10.0, -10.0]], dtype=np.float32)

@@ -37,6 +37,8 @@ def tried(scenario: Scenario, bench: Bench) -> Result:
     try:
         told, passed = scenario(bench), True
         seen = told if isinstance(told, Seen) else Seen(told)
+    except LookupError as error:
+        seen, passed = Seen(f"what it builds on has not been seen: {error!r}"), False
     except (Order, OSError, ValueError, StopIteration) as error:
         seen, passed = Seen(f"{error}" or repr(error)), False
     seconds = time.monotonic() - begun
@@ -86,7 +88,6 @@ def main() -> int:
         for one in SCENARIOS:
             say(f"{one.__name__}: {(one.__doc__ or '').splitlines()[0]}")
         return 0
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     begun = time.monotonic()
     try:
         if options.against is not None:
@@ -97,6 +98,9 @@ def main() -> int:
         results = run(made, chosen(options.scenario), options.out)
     except (CannotBench, CannotCompare) as reason:
         say(f"the virtual bench cannot run: {reason}")
+        return CANNOT
+    except KeyboardInterrupt:
+        say("ended before its end; nothing of it is left running")
         return CANNOT
     seconds = f"{time.monotonic() - begun:.0f}"
     told = facts(image=made.folder.name, configuration=CONFIGURATION.read_text(), **{"seconds in all": seconds})
@@ -109,4 +113,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())

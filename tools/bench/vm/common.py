@@ -54,9 +54,9 @@ def same_process(bench: Bench, pid: int) -> None:
     need(bench.main_pid() == pid, f"process {pid} has become {bench.main_pid()}:\n{bench.log(20)}")
 
 
-def back(bench: Bench, pid: int) -> str:
+def back(bench: Bench, pid: int, states: tuple[str, ...] = ("TRACKING",)) -> str:
     """Usable again without a person, the same process, and right."""
-    seconds = bench.placed(TRACKING_S)
+    seconds = bench.placed(TRACKING_S, states)
     same_process(bench, pid)
     found = right(bench, bench.collect(3.0))
-    return f"TRACKING after {seconds:.1f} s, {1e3 * max(found):.0f} mm from the truth"
+    return f"{' or '.join(states)} after {seconds:.1f} s, {1e3 * max(found):.0f} mm from the truth"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tools.bench.vm.image import Image
-from tools.bench.vm.places import CannotBench
+from tools.bench.vm.places import LEASH, CannotBench
 
 BOOT_S, QUIT_S = 400.0, 10.0
 MODBUS, ODOMETRY = 1502, 5601
@@ -108,6 +108,8 @@ class Machine:
             answer: dict[str, Any] = json.loads(self._lines.readline())
         except (TimeoutError, ValueError) as error:
             raise Order(f"no answer to {order} within {patience:.0f} s") from error
+        if "code" not in answer:
+            raise Order(f"the agent inside was started anew while it was to do {order}")
         return answer
 
     def run(self, *words: str, check: bool = True, seconds: float = 60.0) -> str:
@@ -136,8 +138,8 @@ class Machine:
         self._drop()
 
     def reboot(self) -> None:
-        """As a person would ask for it."""
-        self.run("systemctl", "reboot", check=False)
+        """As a person would ask for it; what is asked is answered first, for the agent is among what is ended."""
+        self.run("sh", "-c", "(sleep 0.5; systemctl reboot) > /dev/null 2>&1 &")
         self._drop()
 
     def check(self) -> None:
@@ -194,7 +196,11 @@ def _connected(path: Path) -> socket.socket:
 
 
 def _words(image: Image, folder: Path, ports: Ports) -> list[str]:
-    """QEMU's command line. ``snapshot=on``: what is written stays until it ends, and never reaches the image."""
+    """QEMU's command line. ``snapshot=on``: what is written stays until it ends, and never reaches the image.
+
+    Everything is emulated, on a computer with KVM too: where virtual machines are nested, /dev/kvm may open and then
+    run nothing.
+    """
     forwards = f"hostfwd=tcp:127.0.0.1:{ports.modbus}-:{MODBUS},hostfwd=udp:127.0.0.1:{ports.modbus}-:{MODBUS}"
     return [
         "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-machine", "q35",
@@ -227,7 +233,7 @@ def started(image: Image, folder: Path, ports: Ports) -> Iterator[Machine]:
         said = stack.enter_context((folder / "qemu").open("wb"))
         environment = {**os.environ, "TMPDIR": str(folder)}
         process = subprocess.Popen(
-            _words(image, folder, ports), stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
+            [*LEASH, *_words(image, folder, ports)], stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
         )
         machine = Machine(process, folder, ports)
         stack.callback(machine.stop)

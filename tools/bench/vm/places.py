@@ -16,9 +16,14 @@ TOOLS = {
     "mkfs.ext4": "e2fsprogs",
     "dpkg-deb": "dpkg",
     "chroot": "coreutils",
+    "setpriv": "util-linux",
 }
 BUILDING = frozenset({"mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot"})
 """Those that only making an image takes; running one takes QEMU alone."""
+
+
+LEASH = ("setpriv", "--pdeathsig", "KILL")
+"""Before the words of a program: it ends with the one that started it, however that ends."""
 
 
 class CannotBench(Exception):

@@ -6,9 +6,9 @@ some twenty times slower than the machine around it, so they are reported and bo
 
 from __future__ import annotations
 
-from tools.bench.vm import trying_devices, trying_process, trying_system
+from tools.bench.vm import trying_devices, trying_photodiode, trying_process, trying_system
 from tools.bench.vm.common import WRITTEN, Scenario
 
-PARTS = (trying_system, trying_devices, trying_process)
+PARTS = (trying_system, trying_devices, trying_photodiode, trying_process)
 SCENARIOS: list[Scenario] = [one for part in PARTS for one in WRITTEN if one.__module__ == part.__name__]
 """All of them, in order."""

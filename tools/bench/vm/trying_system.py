@@ -11,8 +11,9 @@ import numpy as np
 
 from tools.bench.plots import Plot, Series, histogram
 from tools.bench.report import Figure, Seen
-from tools.bench.vm.bench import PLACED, UNIT, Bench, Heard, inverse_then
+from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
 from tools.bench.vm.common import TRACKING_S, map_id, need, right, scenario
+from tools.bench.vm.machine import Order
 
 FIFO: Final = 1
 RESTING_M: Final = 0.05
@@ -182,8 +183,18 @@ def agrees_with_outside(bench: Bench) -> Seen:
     return Seen(f"{len(placed)} poses", figures, plots)
 
 
+@scenario
+def saves_its_map(bench: Bench) -> str:
+    """Command SAVE_MAP over Modbus."""
+    bench.placed(TRACKING_S)
+    need(bench.command(SAVE_MAP) == DONE, bench.log(10))
+    need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
+    return bench.machine.run("sh", "-c", "ls /var/lib/lumiloop/maps").replace("\n", " ")
+
+
 def _way(bench: Bench, heard: list[Heard]) -> Plot:
-    assert bench.start is not None
+    if bench.start is None:
+        raise Order("where it began is not known")
     begun = heard[0].t_pose if heard else 0.0
     true = [inverse_then(bench.start, pose) for t, pose in list(bench.ears.truth) if t >= begun]
     said = [one.pose for one in heard if one.pose is not None]

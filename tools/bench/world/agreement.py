@@ -35,7 +35,7 @@ class Trace:
 
 def trace(played: Played) -> Trace:
     """Of a run."""
-    seconds = np.arange(0.0, played.scenario.drive.seconds, FINE_S)
+    seconds = np.arange(0.0, alike_s(played.scenario), FINE_S)
     return _trace(errors_of(played), seconds, played.truth(seconds))
 
 
@@ -53,9 +53,14 @@ def _trace(found: Errors, seconds: Array, truth: Array) -> Trace:
     return Trace(np.interp(found.t[inside], seconds, driven), found.off[inside, :2])
 
 
+def alike_s(scenario: Scenario) -> float:
+    """Seconds until the first fault: what it does depends on the scan that it strikes, so two runs may differ then."""
+    return min([scenario.drive.seconds, *(float(fault.get("when", 0.0)) for fault in scenario.faults)])
+
+
 def reference(scenario: Scenario) -> Trace:
-    """The same scenario with the daemon in this process and in virtual time."""
-    return reference_of(scenario.scene(held=False), scenario.drive.seconds, scenario.world.odometry)
+    """The same scenario with the daemon in this process and in virtual time, until the first fault."""
+    return reference_of(scenario.scene(held=False), alike_s(scenario), scenario.world.odometry)
 
 
 def reference_of(scene: SimulatedScene, seconds: float, odometry: bool = True) -> Trace:

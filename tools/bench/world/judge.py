@@ -76,15 +76,28 @@ class Errors:
         """(n,)."""
         return np.asarray(np.hypot(self.off[:, 0], self.off[:, 1]))
 
+    @property
+    def truth(self) -> Array:
+        """(n, 2) true places in the robot's map, m."""
+        return np.asarray(self.pose[:, :2] - self.off[:, :2])
+
 
 def errors_of(played: Played) -> Errors:
-    """Of every read that has a pose; the map lies where the robot said it was while it stood."""
+    """Of every read that has a pose; the map lies where the robot said it was while it stood.
+
+    Under surveyed lamps it lies so until light has told where the survey lies, and there from then on. Nothing that is
+    read says when that was, so it is taken to be once, with the first pose that is nearer to the truth that way.
+    """
     kept = [one for one in played.reads if one.pose is not None and one.fresh]
     t = np.array([one.t_pose for one in kept])
     pose = np.array([one.pose for one in kept], dtype=np.float64).reshape(-1, 3)
     start = played.truth(np.zeros(1))[0]
     told = np.mean(np.array(played.standing, dtype=np.float64).reshape(-1, 3), axis=0)
-    truth = seen_from(start, told, played.truth(t)) if len(t) else np.zeros((0, 3))
+    site = played.truth(t) if len(t) else np.zeros((0, 3))
+    truth = seen_from(start, told, site)
+    if played.lamps:
+        nearer = np.hypot(*(pose - site)[:, :2].T) < np.hypot(*(pose - truth)[:, :2].T)
+        truth = np.where(np.logical_or.accumulate(nearer)[:, None], site, truth)
     off = pose - truth
     off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     return Errors(t, off, pose, np.array([one.sigma_m for one in kept]))
@@ -206,9 +219,6 @@ JUDGES: Final[dict[str, Callable[[Expectation, Played, list[Read]], Verdict]]] =
 def pictures(played: Played) -> tuple[Plot, ...]:
     """Way, error, states, ages; when faults began and ended."""
     found = errors_of(played)
-    seconds = np.arange(0.0, played.scenario.drive.seconds, 0.1)
-    start, told = played.truth(np.zeros(1))[0], np.mean(np.array(played.standing).reshape(-1, 3), axis=0)
-    way = seen_from(start, told, played.truth(seconds))
     struck = [float(fault.get("when", 0.0)) for fault in played.scenario.faults]
     struck += [
         float(fault.get("when", 0.0)) + float(fault["for"]) for fault in played.scenario.faults if "for" in fault
@@ -220,7 +230,7 @@ def pictures(played: Played) -> tuple[Plot, ...]:
     return (
         Plot(
             "trajectory", "x m", "y m",
-            (_line("truth", way[:, 0], way[:, 1]), _line("published", found.pose[:, 0], found.pose[:, 1])), square=True,
+            (_line("truth", *found.truth.T), _line("published", found.pose[:, 0], found.pose[:, 1])), square=True,
         ),
         Plot(
             "error", "s", "mm",

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tools.bench.report import ROOT
+from tools.bench.vm.places import LEASH
 from tools.bench.world.scenario import Scenario
 from tools.bench.world.stage import Ends
 from tools.sim.serve_light import write_plan
@@ -33,7 +34,7 @@ def robot(scenario: Scenario, serial: str = "") -> Generator[Ends]:
             write_plan(scene.light, folder / "lamps.toml")
             values |= {"photodiode.bus": f'"{light}"', "lights.survey": f'"{folder / "lamps.toml"}"'}
         sets = [word for key, value in values.items() for word in ("--set", f"{key}={value}")]
-        command = [sys.executable, "-m", "daemon", "run", "--lidar", serial or str(folder / "lidar"), *sets]
+        command = [*LEASH, sys.executable, "-m", "daemon", "run", "--lidar", serial or str(folder / "lidar"), *sets]
         log = folder / "daemon.log"
         environment = {**os.environ, "XDG_STATE_HOME": str(folder / "state")}
         with log.open("wb") as said, subprocess.Popen(command, cwd=ROOT, stderr=said, env=environment) as child:

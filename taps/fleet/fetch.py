@@ -1,0 +1,155 @@
+"""`lumiloop fleet fetch`: a robot takes the survey and the map that its fleet shares, once or whenever there are newer.
+
+What is asked of the running daemon is asked by Modbus, as any client may (command SWITCH_MAP), and only with --switch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from daemon import cli
+from daemon.publish.client import NoAnswer, address_of
+from hal.serving import work_until_told
+from taps.fleet import messages
+from taps.fleet.messages import SHARED, Unreadable
+from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, chosen, place, sha256_of
+from taps.fleet.share import key_of
+from taps.view.orders import OrderRefused, switch_map
+from taps.zenohlink import BadEndpoint, answers, joined, watched
+
+CONTENT_S: Final = 60.0
+"""A map may take so long to come."""
+TRIES: Final = 3
+PAUSE_S: Final = 1.0
+AGAIN_S: Final = 300.0
+"""So often it is looked for newer ones, whatever has been heard."""
+RETRY_S: Final = 15.0
+"""And so soon after something has not come."""
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    fetcher = Fetcher(args)
+    try:
+        asyncio.run(work_until_told(fetcher.run()) if args.follow else fetcher.run())
+    except BadEndpoint as error:
+        return cli.fail(str(error), cli.USAGE)
+    except NoAnswer as error:
+        return cli.fail(f"--switch: {error}", cli.USAGE)
+    return cli.FAILED if fetcher.failed else cli.OK
+
+
+class Fetcher:
+    """Fetches what is asked for.
+
+    Attributes:
+        failed: whether something that was wanted did not come in the latest round.
+    """
+
+    def __init__(self, args: argparse.Namespace, records: Records | None = None) -> None:
+        self.failed = False
+        self._args, self._records = args, records or Records()
+        self._kinds = [kind for kind in KINDS if kind in args.what] or list(KINDS)
+        self._said: dict[str, str] = {}
+
+    async def run(self) -> None:
+        """Fetch once; or follow until cancelled.
+
+        Raises:
+            BadEndpoint: no such router can be. NoAnswer: the configuration has no Modbus to switch maps by.
+        """
+        args = self._args
+        modbus = address_of(None, args.settings) if args.switch else None
+        async with joined(args.router, args.zenoh) as session:
+            if not args.follow:
+                await self._round(session, modbus)
+                return
+            news = asyncio.Event()
+            loop = asyncio.get_running_loop()
+            session.liveliness().declare_subscriber(
+                f"{SHARED}/alive/*", lambda sample: loop.call_soon_threadsafe(news.set), history=True
+            )
+            watching = asyncio.create_task(watched(session, args.router, lambda there: news.set()))
+            try:
+                while True:
+                    news.clear()
+                    await self._round(session, modbus)
+                    try:
+                        async with asyncio.timeout(RETRY_S if self.failed else AGAIN_S):
+                            await news.wait()
+                    except TimeoutError:
+                        continue
+            finally:
+                watching.cancel()
+
+    async def _round(self, session: zenoh.Session, modbus: tuple[str, int] | None) -> None:
+        self.failed = False
+        for kind in self._kinds:
+            try:
+                said = await self._fetch(session, kind, modbus)
+            except Refused as error:
+                said, self.failed = str(error), True
+            if said != self._said.get(kind):
+                self._said[kind] = said
+                cli.say(said)
+
+    async def _fetch(self, session: zenoh.Session, kind: str, modbus: tuple[str, int] | None) -> str:
+        """What came of it.
+
+        Raises:
+            Refused: nothing came, or it is not taken.
+        """
+        held = self._records.held().get(kind)
+        offer = chosen(kind, await self._offers(session, kind), held)
+        if offer is None:
+            assert held is not None
+            return f"{kind} version {held.version} is here already"
+        survey: Path | None = self._args.survey
+        where, note = place(offer, await self._content(session, offer), self._args.settings, survey)
+        try:
+            self._records.note(offer)
+        except OSError as error:
+            raise Refused(f"{self._records.path}: {error.strerror}; {where} is in place all the same") from None
+        if kind == MAP and modbus is not None:
+            note = await switched(modbus, offer.map_id)
+        return f"{offer.said()} is in {where}; {note}"
+
+    async def _offers(self, session: zenoh.Session, kind: str) -> list[Offer]:
+        """What is shared; who shares may just be coming back, as after a router's restart."""
+        offers: list[Offer] = []
+        for left in reversed(range(TRIES)):
+            for _, content, _ in await answers(session, key_of(kind)):
+                try:
+                    offers.append(messages.read(content, Offer))
+                except Unreadable as error:
+                    cli.say(f"what is offered as {kind} is not one: {error}")
+            if offers or not left:
+                break
+            await asyncio.sleep(PAUSE_S)
+        return offers
+
+    async def _content(self, session: zenoh.Session, offer: Offer) -> bytes:
+        for _ in range(TRIES):
+            found = await answers(session, key_of(offer.kind, offer.sha256), CONTENT_S)
+            for _, content, _ in found:
+                if sha256_of(content) == offer.sha256:
+                    return content
+            if found:
+                return found[0][1]  # which is refused, with what is wrong with it
+        raise Refused(f"{offer.said()}: is announced, and does not come; is the connection to who shares it broken?")
+
+
+async def switched(modbus: tuple[str, int], map_id: int) -> str:
+    """Ask the daemon to go on in the map; what came of it."""
+    try:
+        outcome = await switch_map(*modbus, map_id)
+    except OrderRefused as error:
+        return f"the daemon could not be asked to go on in it: {error}"
+    if outcome == "done":
+        return "the daemon goes on in it"
+    return f"the daemon was asked to go on in it: {outcome}; its log says why"

@@ -1,0 +1,255 @@
+"""What a fleet shares, put to its place on a robot: checked before, never half written, never an older one.
+
+Nothing here knows Zenoh: offers and bytes in, files out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+from msgspec import Meta
+
+from daemon.config import Config
+from daemon.folders import maps_folder, state_folder
+from daemon.mapstore import keep
+from daemon.store import Store
+from daemon.store_file import BadMap
+from daemon.store_tables import read
+from daemon.surveyfile import SurveyError, dump, read_survey
+from daemon.wholefile import reason_of, write_whole
+from estimator.cdma_profile import PROFILES, Profile
+from estimator.lamps import Survey
+from taps.fleet.messages import SCHEMA, Held, printable
+
+SURVEY, MAP = "survey", "map"
+KINDS: Final = (SURVEY, MAP)
+MOST_BYTES: Final = 256 << 20
+RECORD: Final = "fleet.json"
+BEFORE: Final = ".before"
+"""Behind the name of a survey that was replaced."""
+
+
+class Refused(Exception):
+    """It is not taken; the text says why and what to do."""
+
+
+class Offer(msgspec.Struct, frozen=True, kw_only=True):
+    """What somebody shares, but for the content: key ``lumiloop/@shared/<kind>``.
+
+    ``version``: a larger one is newer. ``map_id``: of a map, else 0.
+    """
+
+    schema: int = SCHEMA
+    kind: str
+    name: str
+    version: Annotated[int, Meta(ge=0)]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    size: Annotated[int, Meta(ge=0, le=MOST_BYTES)]
+    map_id: Annotated[int, Meta(ge=0, lt=1 << 32)] = 0
+
+    def said(self) -> str:
+        """For people."""
+        return f"{self.kind} {printable(self.name)} version {self.version}"
+
+
+def sha256_of(content: bytes) -> str:
+    """In hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def offer_of(kind: str, path: Path, version: int | None) -> tuple[Offer, bytes]:
+    """A file that is to be shared; without a version, the seconds at which the file was changed last.
+
+    Raises:
+        Refused: it cannot be read, or is none that a robot could use.
+    """
+    try:
+        content = path.read_bytes()
+        changed = int(path.stat().st_mtime)
+    except OSError as error:
+        raise Refused(f"{path}: cannot be read: {reason_of(error)}") from None
+    offer = Offer(
+        kind=kind,
+        name=path.name,
+        version=changed if version is None else version,
+        sha256=sha256_of(content),
+        size=len(content),
+        map_id=map_id_of(content, str(path)) if kind == MAP else 0,
+    )
+    if kind == SURVEY:
+        survey_in(content, str(path))
+    return offer, content
+
+
+def map_id_of(content: bytes, name: str) -> int:
+    """Identity of the map in a file.
+
+    Raises:
+        Refused: it is no map that could be used.
+    """
+    try:
+        return read(content).meta.map_id
+    except BadMap as error:
+        raise Refused(f"{name}: {error}") from None
+
+
+def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Survey:
+    """The survey in a file; ``profile``: air interface that its lamps have to have, None: any.
+
+    Raises:
+        Refused: it is none that could be used.
+    """
+    with tempfile.TemporaryDirectory(prefix="lumiloop-fleet-") as folder:
+        path = Path(folder) / "survey"
+        path.write_bytes(content)
+        try:
+            return read_survey(path, profile)
+        except SurveyError as error:
+            raise Refused(str(error).replace(str(path), name)) from None
+
+
+class Records:
+    """What this robot has taken, in a file of the state directory; read anew where it has changed."""
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.path = path or state_folder() / RECORD
+        self._read: tuple[int, dict[str, Held]] = -1, {}
+
+    def held(self) -> dict[str, Held]:
+        """By kind; empty where there is none, or the file cannot be read."""
+        try:
+            changed = self.path.stat().st_mtime_ns
+        except OSError:
+            return {}
+        if changed != self._read[0]:
+            found: dict[str, Held] = {}
+            with contextlib.suppress(OSError, msgspec.DecodeError, UnicodeDecodeError):
+                found = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Held])
+            self._read = changed, found
+        return self._read[1]
+
+    def note(self, offer: Offer) -> None:
+        """It has been taken; raises `OSError`."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        held = {**self.held(), offer.kind: Held(offer.version, offer.sha256, offer.name)}
+        write_whole(self.path, msgspec.json.format(msgspec.json.encode(held), indent=2) + b"\n")
+
+
+def chosen(kind: str, offers: list[Offer], held: Held | None) -> Offer | None:
+    """The newest of what is offered; None: it is here already.
+
+    Raises:
+        Refused: nothing is offered, or what is offered is older, or contradicts itself or what is here.
+    """
+    fitting = [offer for offer in offers if offer.kind == kind]
+    if not fitting:
+        raise Refused(f"nobody shares a {kind}: `lumiloop fleet share --{kind} FILE` does")
+    newest = max(fitting, key=lambda offer: offer.version)
+    contents = {offer.sha256 for offer in fitting if offer.version == newest.version}
+    if held is not None and held.version == newest.version:
+        contents.add(held.sha256)
+    if len(contents) > 1:
+        raise Refused(
+            f"{kind} version {newest.version} is there with {len(contents)} different contents; share the right one "
+            f"with --version {newest.version + 1}"
+        )
+    if held is not None and held.version > newest.version:
+        raise Refused(
+            f"{newest.said()} is older than version {held.version}, which is here; to go back to it, share it with "
+            f"--version {held.version + 1}"
+        )
+    return None if held is not None and held.version == newest.version else newest
+
+
+def check(offer: Offer, content: bytes) -> None:
+    """Whether what came is what was offered.
+
+    Raises:
+        Refused: it is not.
+    """
+    if len(content) != offer.size or sha256_of(content) != offer.sha256:
+        raise Refused(
+            f"{offer.said()}: what came ({len(content)} bytes) is not what was announced ({offer.size} bytes, SHA-256 "
+            f"{offer.sha256[:12]}...); nothing is changed"
+        )
+
+
+def place(offer: Offer, content: bytes, settings: Config, survey: Path | None) -> tuple[Path, str]:
+    """Check what came and put it to its place; where that is, and what else a person should know.
+
+    Raises:
+        Refused: it cannot be used, or cannot be put there. Nothing is changed then.
+    """
+    check(offer, content)
+    if offer.kind == MAP:
+        map_id = map_id_of(content, offer.name)
+        if map_id != offer.map_id:
+            raise Refused(f"{offer.said()}: holds map {map_id:08x}, not {offer.map_id:08x} as announced")
+        return place_map(content, map_id, settings)
+    where = survey or (Path(settings.lights.survey) if settings.lights.survey else None)
+    if where is None:
+        raise Refused("where should the survey go? set `lights.survey`, or name a file with --survey FILE")
+    profile = PROFILES[settings.photodiode.profile]
+    return place_survey(survey_in(content, offer.name, profile), where)
+
+
+def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]:
+    """As the newest generation in the folder of maps, where the next start takes it."""
+    if not settings.map.kept:
+        raise Refused("maps are not kept: `map.folder` is none")
+    store = Store(maps_folder(settings.map.folder), mend=False)
+    try:
+        return keep(settings, content, map_id), "the next start goes on in it"
+    except BadMap as error:
+        raise Refused(f"{store.folder}: {error}") from None
+    except OSError as error:
+        if not isinstance(error.__cause__, BlockingIOError):
+            raise Refused(str(error)) from None
+    return _beside_daemon(store, content, map_id)
+
+
+def _beside_daemon(store: Store, content: bytes, map_id: int) -> tuple[Path, str]:
+    """A daemon keeps its maps there, in files that are named after the map: of another map they are nobody's but ours.
+
+    Raises:
+        Refused: the daemon may be about to write that map itself.
+    """
+    try:
+        generations = store.generations()
+        if any(one.map_id == map_id for one in generations):
+            raise Refused(
+                f"{store.folder}: a running daemon keeps map {map_id:08x} there itself; stop it, and try again"
+            )
+        number = 1 + max((one.number for one in generations), default=0)
+        path = store.folder / f"map-{map_id:08x}-{number:08d}.lumimap"
+        write_whole(path, content)
+    except OSError as error:
+        raise Refused(f"{store.folder}: {reason_of(error)}") from None
+    return path, "the daemon that runs goes on in its own map: --switch asks it to change"
+
+
+def place_survey(shared: Survey, where: Path) -> tuple[Path, str]:
+    """The shared lamps with the receiver that this robot has; what was there before stays beside.
+
+    Raises:
+        Refused: it cannot be written, or what is there cannot be read.
+    """
+    words = "its receiver is the shared file's: look at [receiver]"
+    try:
+        if where.exists():
+            own = read_survey(where)
+            shared = replace(shared, receiver=own.receiver)
+            words = f"[receiver] is this robot's own as before; the old file is {where.name}{BEFORE}"
+            write_whole(where.with_name(where.name + BEFORE), where.read_bytes())
+        write_whole(where, dump(shared, ("Lamps as shared in the fleet.",)).encode())
+    except SurveyError as error:
+        raise Refused(f"{error}; mend it, or move it away") from None
+    except OSError as error:
+        raise Refused(f"{where}: cannot be written: {reason_of(error)}") from None
+    return where, f"the daemon takes it at its next start; {words}"

@@ -1,0 +1,75 @@
+"""`lumiloop fleet share` and `lumiloop fleet router`: a survey and a map for all robots; and what they meet at."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import socket
+
+import zenoh
+
+from daemon import cli
+from hal.serving import until_told, work_until_told
+from taps.fleet import messages
+from taps.fleet.messages import SHARED, encode
+from taps.fleet.placing import MAP, SURVEY, Offer, Refused, offer_of
+from taps.zenohlink import BadEndpoint, config, joined, watched, words
+
+
+def main(args: argparse.Namespace) -> int:
+    """Share until stopped; returns the exit code."""
+    asked = [(kind, path) for kind, path in ((SURVEY, args.survey), (MAP, args.map)) if path is not None]
+    if not asked:
+        return cli.fail("say what to share: --survey FILE, --map FILE", cli.USAGE)
+    try:
+        offers = [offer_of(kind, path, args.version) for kind, path in asked]
+        asyncio.run(work_until_told(share(args, offers)))
+    except Refused as error:
+        return cli.fail(str(error))
+    except BadEndpoint as error:
+        return cli.fail(str(error), cli.USAGE)
+    return cli.OK
+
+
+async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> None:
+    """Offer these until cancelled.
+
+    Raises:
+        BadEndpoint: no such router can be.
+    """
+    told: dict[str, bytes] = {}
+    for offer, content in offers:
+        told[key_of(offer.kind)] = encode(offer)
+        told[key_of(offer.kind, offer.sha256)] = content
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for key, content in told.items():
+                if query.key_expr.intersects(key):
+                    query.reply(key, content)
+
+    async with joined(args.router, args.zenoh) as session:
+        session.declare_queryable(f"{SHARED}/**", answer)
+        instance = messages.instance_of(str(session.info.zid()), socket.gethostname(), messages.now_ms())
+        session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots ask when they see it
+        for offer, _ in offers:
+            cli.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
+        await watched(session, args.router, lambda there: None)
+
+
+def key_of(kind: str, sha256: str = "") -> str:
+    """Where an offer is told, or its content."""
+    return f"{SHARED}/{kind}/{sha256}" if sha256 else f"{SHARED}/{kind}"
+
+
+def router(args: argparse.Namespace) -> int:
+    """Be a router until stopped; returns the exit code."""
+    try:
+        with zenoh.open(config("router", args.listen, args.zenoh)):
+            cli.say(f"router at {args.listen}")
+            asyncio.run(until_told())
+    except BadEndpoint as error:
+        return cli.fail(str(error), cli.USAGE)
+    except zenoh.ZError as error:
+        return cli.fail(f"cannot listen on {args.listen}: {words(error)}; free it, or name another with --listen")
+    return cli.OK

@@ -1,0 +1,129 @@
+"""`lumiloop fleet`: all robots on one map, in the terminal, as JSON, or as a picture."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import shutil
+import sys
+import time
+from typing import Final
+
+import msgspec
+import zenoh
+
+from daemon import cli
+from daemon.png import encode_png
+from daemon.wholefile import reason_of, write_whole
+from hal.serving import work_until_told
+from taps.fleet import drawing, messages
+from taps.fleet.roster import Roster
+from taps.zenohlink import BadEndpoint, answers, joined, parts, watched
+
+ONCE_S: Final = 2.0
+"""Who tells at all has told by then."""
+CLEAR: Final = "\x1b[H\x1b[2J"
+EVERY: Final = f"{messages.ROOT}/*/*"
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    roster = Roster()
+    try:
+        asyncio.run(work_until_told(show(args, roster), seconds=0.0) if args.watch else show(args, roster))
+    except BadEndpoint as error:
+        return cli.fail(str(error), cli.USAGE)
+    except OSError as error:
+        return cli.fail(f"{args.picture}: {reason_of(error)}; name another file")
+    return cli.OK if roster.members else cli.fail(f"no robot tells anything by way of {args.router}")
+
+
+async def show(args: argparse.Namespace, roster: Roster) -> None:
+    """Listen, and show what is known: once, or every second until cancelled.
+
+    Raises:
+        BadEndpoint: no such router can be. OSError: the picture cannot be written.
+    """
+    async with joined(args.router, args.zenoh) as session:
+        listener = Listener(session, roster)
+        watching = asyncio.create_task(watched(session, args.router, listener.on_router))
+        try:
+            await asyncio.sleep(ONCE_S)
+            while True:
+                text = told(args, roster, listener.there)
+                sys.stdout.write((CLEAR if args.watch and sys.stdout.isatty() and not args.json else "") + text)
+                sys.stdout.flush()
+                if not args.watch:
+                    return
+                await asyncio.sleep(1.0)
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
+
+
+class Listener:
+    """Keeps a roster of what is told.
+
+    Attributes:
+        there: whether the router is.
+    """
+
+    def __init__(self, session: zenoh.Session, roster: Roster) -> None:
+        self.there = True
+        self._session, self._roster = session, roster
+        self._loop = asyncio.get_running_loop()
+        self._asking: set[asyncio.Task[None]] = set()
+        # callbacks are the session's threads': the roster is touched in the loop's alone
+        session.declare_subscriber(
+            EVERY, lambda sample: self._call(self._roster.take, *parts(sample), time.monotonic())
+        )
+        for kind in ("alive", "waiting"):
+            session.liveliness().declare_subscriber(f"{messages.ROOT}/*/{kind}/*", self._token, history=True)
+
+    def on_router(self, there: bool) -> None:
+        """The router goes, or is back."""
+        self.there = there
+        if not there:
+            self._roster.without_router()
+
+    def _call(self, function: object, *args: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody looks any more
+            self._loop.call_soon_threadsafe(function, *args)  # type: ignore[arg-type]  # both are ours
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        self._call(self._on_token, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+    def _on_token(self, key: str, there: bool) -> None:
+        if robot := self._roster.token(key, there):
+            task = asyncio.create_task(self._ask(robot))
+            self._asking.add(task)
+            task.add_done_callback(self._asking.discard)
+
+    async def _ask(self, robot: str) -> None:
+        """What it has told before we came."""
+        for found in await answers(self._session, messages.key(robot, "*")):
+            self._roster.take(*found, time.monotonic())
+
+
+def told(args: argparse.Namespace, roster: Roster, there: bool) -> str:
+    """What is known, for people or programs; the picture is written."""
+    members, chart, now = roster.sorted(), roster.chart(), time.monotonic()
+    if args.json:
+        robots = {
+            one.name: {"alive": bool(one.speakers), "age_s": now - one.t_heard, "pose": one.pose, "state": one.state}
+            for one in members
+        }
+        return msgspec.json.encode({"router": there, "robots": robots, "problems": roster.problems()}).decode() + "\n"
+    lines = drawing.table(members, now)
+    if chart is not None:
+        size = shutil.get_terminal_size((100, 50))
+        lines = [*drawing.plan(chart, members, size.columns, max(10, size.lines - len(lines) - 6)), "", *lines]
+        if args.picture is not None:
+            pixels, said = drawing.picture(chart, members)
+            write_whole(args.picture, encode_png(pixels))
+            lines.append(f"{args.picture}: {', '.join(said) or 'no robot is in that map'}")
+    elif args.picture is not None:
+        lines.append(f"{args.picture}: not written, no robot has told a map yet")
+    lines += [] if there else [f"the router at {args.router} has gone: this is what was told last"]
+    return "\n".join([*lines, *roster.problems()]) + "\n"

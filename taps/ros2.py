@@ -1,0 +1,109 @@
+"""`lumiloop ros2`: a running daemon as a node of ROS 2, which need not be installed here: rmw_zenoh's convention.
+
+The messages are those of the MCAP files. What stands still (map, mount, state) is kept for who comes late, as
+transient local does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import time
+from typing import Final
+
+import zenoh
+
+from daemon import cli
+from hal.serving import work_until_told
+from taps import rmw, rostypes
+from taps.follow import follow
+from taps.frames import NotTheStream
+from taps.ros import TOPICS, Out
+from taps.stream import Stream, path_of
+from taps.zenohlink import BadEndpoint, joined, listed, watched, withdraw
+
+WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
+NAME: Final = "lumiloop"
+HEARTBEAT_S: Final = 0.5
+"""Who has missed the last message of a topic that is kept finds out by then, as of rmw_zenoh's own publishers."""
+
+
+class NameTaken(Exception):
+    """Another node has this name; the text says what to do."""
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    try:
+        namespace = rmw.namespace_of(args.namespace)
+        stream = Stream(args.stream or path_of(args.settings.name), WANTED)
+        asyncio.run(work_until_told(serve(args, namespace, stream)))
+    except ValueError as error:
+        return cli.fail(f"--namespace: {error}", cli.USAGE)
+    except BadEndpoint as error:
+        return cli.fail(str(error), cli.USAGE)
+    except (NotTheStream, NameTaken) as error:
+        return cli.fail(str(error))
+    return cli.OK
+
+
+async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> None:
+    """Join the router and pass on all that is told, until cancelled.
+
+    Raises:
+        BadEndpoint: no such router can be. NameTaken: there is such a node. NotTheStream: there is no such daemon.
+    """
+    async with joined(args.router, args.zenoh) as session:
+        node = rmw.Node(args.domain, str(session.info.zid()), NAME, namespace)
+        if await listed(session, node.others()):
+            raise NameTaken(
+                f"domain {node.domain} has a node {namespace}/{NAME} already: two robots on the same topics would "
+                "spoil both; give each a --namespace of its own, or stop the other one"
+            )
+        talker = Talker(session, node, args.humble)
+        watching = asyncio.create_task(watched(session, args.router, lambda there: None))
+        try:
+            cli.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
+            await follow(stream, args.settings, talker)
+        finally:
+            watching.cancel()
+            talker.close()
+
+
+class Talker:
+    """A node with a publisher for each topic."""
+
+    def __init__(self, session: zenoh.Session, node: rmw.Node, humble: bool = False) -> None:
+        """``humble``: ROS 2 Humble, whose types have no hash."""
+        self._tokens = [session.liveliness().declare_token(node.token())]
+        self._publishers: dict[str, tuple[zenoh.ext.AdvancedPublisher, bytes]] = {}
+        self._sent: dict[str, int] = {}
+        for number, (topic, about) in enumerate(TOPICS.items(), 1):
+            if topic == "/lumiloop/raw":
+                continue
+            hashed = rmw.UNSUPPORTED if humble else rostypes.STORE.hash_rihs01(about.kind)
+            token = node.publisher(number, topic, about.kind, hashed, about.latched)
+            publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                node.key(topic, about.kind, hashed),
+                congestion_control=zenoh.CongestionControl.DROP,
+                cache=zenoh.ext.CacheConfig(1) if about.latched else None,
+                publisher_detection=about.latched,
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S)
+                if about.latched
+                else None,
+            )
+            self._publishers[topic] = publisher, rmw.gid_of(token)
+            self._tokens.append(session.liveliness().declare_token(token))
+
+    def send(self, out: Out) -> None:
+        """One message."""
+        if (found := self._publishers.get(out.topic)) is None:
+            return
+        publisher, gid = found
+        number = self._sent[out.topic] = self._sent.get(out.topic, 0) + 1
+        publisher.put(out.data, attachment=rmw.attachment(number, time.time_ns(), gid))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        withdraw(*self._tokens, *(publisher for publisher, _ in self._publishers.values()))

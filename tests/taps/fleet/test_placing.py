@@ -1,0 +1,200 @@
+"""What a fleet shares, on a robot's disk: newer replaces older, nothing else, and never half."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from daemon.config import Config, LightsConfig, MapConfig, PhotodiodeConfig
+from daemon.store import Store
+from daemon.surveyfile import dump, read_survey
+from estimator.cdma_profile import PROFILES
+from estimator.lamps import Lamp, Receiver, Survey
+from taps.fleet.messages import Held
+from taps.fleet.placing import MAP, RECORD, SURVEY, Offer, Records, Refused, check, chosen, offer_of, place
+from tests.daemon import mapmaker
+from tests.daemon.mapmaker import Shape
+
+LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(4))
+SHARED = Survey(LAMPS, Receiver(x=0.5))
+
+
+@pytest.fixture
+def survey(tmp_path: Path) -> Path:
+    path = tmp_path / "shared.toml"
+    path.write_text(dump(SHARED))
+    return path
+
+
+@pytest.fixture
+def shared_map(tmp_path: Path) -> Path:
+    path = tmp_path / "hall.lumimap"
+    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    return path
+
+
+def settings(folder: Path) -> Config:
+    return Config(map=MapConfig(folder=str(folder / "maps")), lights=LightsConfig(survey=str(folder / "lights.toml")))
+
+
+def test_a_survey_keeps_the_robots_own_receiver_and_the_file_before(tmp_path: Path, survey: Path) -> None:
+    offer, content = offer_of(SURVEY, survey, 3)
+    own = tmp_path / "lights.toml"
+    where, note = place(offer, content, settings(tmp_path), None)
+    assert where == own
+    assert "its receiver is the shared file's" in note
+    own.write_text(dump(Survey(LAMPS[:1], Receiver(x=-0.25))))
+    _, note = place(offer, content, settings(tmp_path), None)
+    assert "this robot's own" in note
+    placed = read_survey(own)
+    assert placed.lamps == LAMPS
+    assert placed.receiver.x == -0.25
+    assert read_survey(tmp_path / "lights.toml.before").lamps == LAMPS[:1]
+    assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml", "lights.toml.before"}
+
+
+def test_a_survey_is_read_for_the_air_interface_that_this_robot_has(tmp_path: Path) -> None:
+    """Where it says no depth, the profile's counts; codes that the profile does not have are refused."""
+    path = tmp_path / "shared.toml"
+    path.write_text("lamp = [{ lamp_id = 1, code = 3, x = 0.0, y = 0.0, z = 3.0 }]")
+    offer, content = offer_of(SURVEY, path, 1)
+    given = msgspec.structs.replace(settings(tmp_path), photodiode=PhotodiodeConfig(profile="B"))
+    assert PROFILES["B"].depth != PROFILES["A"].depth
+    place(offer, content, given, None)
+    assert read_survey(tmp_path / "lights.toml").depth == PROFILES["B"].depth
+    path.write_text("lamp = [{ lamp_id = 1, code = 500, x = 0.0, y = 0.0, z = 3.0 }]")
+    with pytest.raises(Refused, match="code 500 is none of profile"):
+        place(*offer_of(SURVEY, path, 2), settings(tmp_path), None)
+
+
+def test_a_survey_needs_a_place(tmp_path: Path, survey: Path) -> None:
+    offer, content = offer_of(SURVEY, survey, 3)
+    with pytest.raises(Refused, match=r"set `lights\.survey`, or name a file with --survey FILE"):
+        place(offer, content, Config(), None)
+    assert place(offer, content, Config(), tmp_path / "elsewhere.toml")[0].exists()
+
+
+def test_a_disk_that_is_full_leaves_the_survey_as_it_was(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offer, content = offer_of(SURVEY, survey, 3)
+    own = tmp_path / "lights.toml"
+    own.write_text(dump(Survey(LAMPS[:1])))
+    before = own.read_bytes()
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(Refused, match="No space left"):
+        place(offer, content, settings(tmp_path), None)
+    assert own.read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml"}
+
+
+def test_a_map_is_what_the_next_start_takes(tmp_path: Path, shared_map: Path) -> None:
+    given = settings(tmp_path)
+    maps = Path(given.map.folder)
+    maps.mkdir()
+    (maps / "map-00001234-00000004.lumimap").write_bytes(mapmaker.content(Shape()))
+    offer, content = offer_of(MAP, shared_map, 1)
+    assert offer.map_id == 0x77
+    where, _ = place(offer, content, given, None)
+    assert where.name == "map-00000077-00000005.lumimap"
+    start = Store(maps).load()
+    assert start is not None
+    assert start.stored.meta.map_id == 0x77
+
+
+def test_beside_a_running_daemon_another_map_is_put_and_its_own_is_not_touched(
+    tmp_path: Path, shared_map: Path
+) -> None:
+    given = settings(tmp_path)
+    daemon = Store(Path(given.map.folder))
+    daemon.save(mapmaker.content(Shape()), 0x1234)  # which takes the folder
+    offer, content = offer_of(MAP, shared_map, 1)
+    try:
+        where, note = place(offer, content, given, None)
+        assert where.name == "map-00000077-00000002.lumimap"
+        assert "--switch" in note
+        assert daemon.load_map(0x77).stored.meta.map_id == 0x77
+        daemon.save(mapmaker.content(Shape(submaps=5)), 0x1234)
+        assert where.exists()
+        with pytest.raises(Refused, match="a running daemon keeps map 00000077 there itself; stop it"):
+            place(offer, content, given, None)
+    finally:
+        daemon.close()
+
+
+@pytest.mark.parametrize("kind", [SURVEY, MAP])
+def test_what_is_damaged_on_the_way_is_refused_and_nothing_changes(
+    tmp_path: Path, survey: Path, shared_map: Path, kind: str
+) -> None:
+    offer, content = offer_of(kind, survey if kind == SURVEY else shared_map, 1)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for spoilt in (content[:-1], content + b"\0", b"", content[:50] + b"\xff" + content[51:]):
+        with pytest.raises(Refused, match=f"{kind} .* version 1: what came .* is not what was announced"):
+            place(offer, spoilt, settings(tmp_path), None)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_what_is_no_survey_or_another_map_than_announced_is_refused(tmp_path: Path, shared_map: Path) -> None:
+    bad = tmp_path / "bad.toml"
+    bad.write_text("lamp = [{ lamp_id = 1, kode = 3 }]")
+    with pytest.raises(Refused, match=r"bad\.toml.*unknown key `kode`; did you mean `code`\?"):
+        offer_of(SURVEY, bad, 1)
+    with pytest.raises(Refused, match="not a map file"):
+        offer_of(MAP, bad, 1)
+    with pytest.raises(Refused, match="cannot be read: No such file"):
+        offer_of(MAP, tmp_path / "none", 1)
+    offer, content = offer_of(MAP, shared_map, 1)
+    with pytest.raises(Refused, match="holds map 00000077, not 00000001 as announced"):
+        place(msgspec.structs.replace(offer, map_id=1), content, settings(tmp_path), None)
+    assert not (tmp_path / "maps").exists()
+
+
+OFFER = Offer(kind=SURVEY, name="lights.toml", version=7, sha256="aa", size=1)
+
+
+@pytest.mark.parametrize(
+    ("offers", "held", "words"),
+    [
+        ([], None, "nobody shares a survey"),
+        ([msgspec.structs.replace(OFFER, kind=MAP)], None, "nobody shares a survey"),
+        ([OFFER], Held(8, "bb"), "version 7 is older than version 8, which is here; .*--version 9"),
+        ([OFFER], Held(7, "bb"), "version 7 is there with 2 different contents; .*--version 8"),
+        ([OFFER, msgspec.structs.replace(OFFER, sha256="cc")], None, "version 7 is there with 2 different contents"),
+    ],
+)
+def test_what_is_older_or_contradicts_itself_is_refused(offers: list[Offer], held: Held | None, words: str) -> None:
+    with pytest.raises(Refused, match=words):
+        chosen(SURVEY, offers, held)
+
+
+def test_the_newest_is_taken_once() -> None:
+    older = msgspec.structs.replace(OFFER, version=6, sha256="bb")
+    assert chosen(SURVEY, [older, OFFER], None) == OFFER
+    assert chosen(SURVEY, [older, OFFER, OFFER], Held(6, "bb")) == OFFER
+    assert chosen(SURVEY, [older, OFFER], Held(7, "aa")) is None
+
+
+def test_what_was_taken_is_noted_and_a_spoilt_note_is_none(tmp_path: Path) -> None:
+    records = Records(tmp_path / "state" / RECORD)
+    assert records.held() == {}
+    records.note(OFFER)
+    records.note(msgspec.structs.replace(OFFER, kind=MAP, version=2))
+    again = Records(records.path)
+    assert again.held() == {SURVEY: Held(7, "aa", "lights.toml"), MAP: Held(2, "aa", "lights.toml")}
+    records.path.write_bytes(b'{"survey": 7}')
+    os.utime(records.path, ns=(1, 1))
+    assert again.held() == {}
+
+
+def test_a_version_is_when_the_file_was_changed(survey: Path) -> None:
+    os.utime(survey, (1_700_000_000, 1_700_000_000))
+    offer, content = offer_of(SURVEY, survey, None)
+    assert offer.version == 1_700_000_000
+    check(offer, content)

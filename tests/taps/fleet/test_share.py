@@ -1,0 +1,151 @@
+"""A survey and a map for all robots, over a real router: newer ones are followed, damaged and older ones refused."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
+import zenoh
+
+from daemon.config import Config, LightsConfig
+from daemon.surveyfile import dump, read_survey
+from estimator.lamps import Lamp, Survey
+from taps.fleet import messages
+from taps.fleet.fetch import Fetcher
+from taps.fleet.placing import MAP, SURVEY, Records, offer_of
+from taps.fleet.share import key_of, share
+from taps.zenohlink import config
+from tests.daemon import mapmaker
+from tests.daemon.mapmaker import Shape
+from tests.taps.routers import Heard, Router, beside, router, told_to, until
+
+LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(4))
+
+
+def sharing(made: Router, **what: Path | int) -> Any:
+    version = what.pop("version")
+    assert isinstance(version, int)
+    offers = [offer_of(kind, path, version) for kind, path in what.items() if isinstance(path, Path)]
+    return share(told_to(made), offers)
+
+
+def fetcher(made: Router, folder: Path, **more: Any) -> Fetcher:
+    given = {"what": [SURVEY], "survey": None, "switch": False, "follow": False, **more}
+    settings = Config(lights=LightsConfig(survey=str(folder / "lights.toml")))
+    return Fetcher(told_to(made, settings=settings, **given), Records(folder / "fleet.json"))
+
+
+@pytest.fixture
+def survey(tmp_path: Path) -> Path:
+    path = tmp_path / "shared.toml"
+    path.write_text(dump(Survey(LAMPS)))
+    return path
+
+
+def test_robots_follow_what_is_shared_and_refuse_what_is_older(
+    tmp_path: Path, survey: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who shares may come later than who fetches, and go; the newest stays."""
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    heard = Heard(capsys)
+
+    def lamps() -> tuple[Lamp, ...]:
+        return read_survey(folder / "lights.toml").lamps
+
+    def change() -> None:
+        survey.write_text(dump(Survey(LAMPS[:2])))
+
+    async def body(made: Router) -> None:
+        async def until_said(words: str) -> None:
+            await until(lambda: heard(words))
+
+        await until_said("nobody shares a survey")
+        await beside(until_said("survey shared.toml version 7 is in"), sharing(made, survey=survey, version=7))
+        assert lamps() == LAMPS
+        change()
+        await beside(until_said("version 6 is older than version 7"), sharing(made, survey=survey, version=6))
+        await beside(until_said("version 7 is there with 2 different"), sharing(made, survey=survey, version=7))
+        assert lamps() == LAMPS
+        await beside(until_said("survey shared.toml version 8 is in"), sharing(made, survey=survey, version=8))
+        assert lamps() == LAMPS[:2]
+
+    with router() as made:
+        asyncio.run(beside(body(made), fetcher(made, folder, follow=True).run()))
+
+
+def test_what_comes_damaged_is_refused(tmp_path: Path, survey: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    offer, content = offer_of(SURVEY, survey, 7)
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for key, told in ((key_of(SURVEY), messages.encode(offer)), (key_of(SURVEY, offer.sha256), content[:-9])):
+                if query.key_expr.intersects(key):
+                    query.reply(key, told)
+
+    with router() as made, zenoh.open(config("client", made.address)) as session:
+        session.declare_queryable("lumiloop/@shared/**", answer)
+        one = fetcher(made, tmp_path)
+        asyncio.run(one.run())
+    assert one.failed
+    assert "is not what was announced" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"shared.toml"}
+
+
+def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "hall.lumimap"
+    path.write_bytes(mapmaker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
+    assert path.stat().st_size > 1_000_000
+    asked: list[tuple[str, int, int]] = []
+
+    async def switch(host: str, port: int, map_id: int) -> str:
+        asked.append((host, port, map_id))
+        return "done"
+
+    monkeypatch.setattr("taps.fleet.fetch.switch_map", switch)
+    with router() as made:
+        for place, wished in (("a", False), ("b", True)):
+            monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / place))
+            one = fetcher(made, tmp_path / place, what=[MAP], switch=wished)
+            asyncio.run(beside(one.run(), sharing(made, map=path, version=1)))
+            assert not one.failed, capsys.readouterr().err
+            (found,) = (tmp_path / place / "lumiloop" / "maps").glob("*.lumimap")
+            assert found.read_bytes() == path.read_bytes()
+            assert asked == ([("127.0.0.1", 1502, 0x77)] if wished else [])
+    assert "the daemon goes on in it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "offer",
+    [
+        b"\xff",
+        b'{"kind": "survey", "name": "x", "version": 9, "sha256": "**", "size": 3}',
+        b'{"kind": "survey", "name": "x", "version": 9, "sha256": "%s", "size": 1000000000}' % (64 * b"0"),
+    ],
+)
+def test_who_offers_what_is_no_offer_does_not_keep_others_from_being_heard(
+    tmp_path: Path, survey: Path, offer: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key_of(SURVEY), offer)
+
+    with router() as made, zenoh.open(config("client", made.address)) as session:
+        session.declare_queryable(key_of(SURVEY), answer)
+        one = fetcher(made, tmp_path)
+
+        async def patiently() -> None:
+            await asyncio.sleep(1.0)
+            await one.run()
+
+        asyncio.run(beside(patiently(), sharing(made, survey=survey, version=7)))
+    said = capsys.readouterr().err
+    assert "what is offered as survey is not one" in said
+    assert "version 7 is in" in said
+    assert not one.failed

@@ -1,0 +1,92 @@
+"""Scenarios: the photodiode's converter is configured, comes, goes and errs, on a real bus.
+
+The emulated bus gives its answers when its processor comes to it, so the daemon finds it paced wrongly for lamps, and
+blocks late or lost, and says so (faults 156, 157, 163, 165, which come and go with what else the computer has to do):
+what is tried is the way of the samples, and of the faults that only the bus can tell, not the light.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Final
+
+from tools.bench.vm.bench import PLACED, UNIT, Bench
+from tools.bench.vm.common import TRACKING_S, back, map_id, need, same_process, scenario
+from tools.bench.vm.machine import OUTSIDE
+
+PHOTODIODE: Final = '[photodiode]\nbus = "adapter:bench"\nconverter = "mcp3221@0x4d"\n'
+NACK, STUCK = 153, 155
+ENOUGH: Final = 20
+"""Blocks, of 30 samples at the least."""
+GONE: Final = (151, 152, NACK, STUCK)
+"""Faults that say why there are no samples, whatever the computer has to do besides."""
+
+
+@scenario
+def stops_and_starts(bench: Bench) -> str:
+    """`systemctl stop` ends it cleanly; a photodiode is configured; `start` finds the map again."""
+    begun = time.monotonic()
+    bench.machine.run("systemctl", "stop", UNIT)
+    seconds = time.monotonic() - begun
+    seen = bench.machine.show(UNIT, "Result", "ExecMainStatus")
+    need(seen == {"Result": "success", "ExecMainStatus": "0"}, f"{seen}\n{bench.log(20)}")
+    bench.machine.order(10.0, i2c=bench.there["bus"].replace("127.0.0.1", OUTSIDE))
+    bench.configure(PHOTODIODE)
+    bench.machine.run("systemctl", "start", UNIT, seconds=300)
+    said = back(bench, bench.main_pid(), PLACED)
+    need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
+    return f"stopped in {seconds:.1f} s; {said}"
+
+
+@scenario
+def reads_the_converter(bench: Bench) -> str:
+    """A photodiode on a real /dev/i2c-N: found by its adapter's name, opened by its group, read in blocks."""
+    nodes = bench.machine.run("sh", "-c", "stat -c '%n %G %a' /dev/i2c-*").strip()
+    need("i2c 660" in nodes, nodes)
+    bench.until("samples", 60.0, lambda: struct.unpack(">H", bench.registers(53, 1))[0] != 0xFFFF)
+    _sound(bench)
+    return f"{nodes}; {_blocks(bench)} blocks"
+
+
+def _present(bench: Bench, codes: tuple[int, ...]) -> list[int]:
+    """Which of the faults have come and not gone."""
+    seen = {code: bench.faults(code) for code in codes}
+    return [code for code, (came, gone) in seen.items() if came > gone]
+
+
+def _sound(bench: Bench) -> None:
+    """Wait until samples come."""
+    bench.until(f"none of {GONE}", 40.0, lambda: not _present(bench, GONE))
+    before = _blocks(bench)
+    bench.until("blocks of samples", 20.0, lambda: (_blocks(bench) - before) % 2**32 >= ENOUGH)
+    bench.placed(TRACKING_S, PLACED)
+
+
+def _blocks(bench: Bench) -> int:
+    """Received since the start; it wraps."""
+    return int(struct.unpack(">I", bench.registers(218, 2))[0])
+
+
+def _ordered(bench: Bench, order: str, code: int) -> str:
+    """A fault of the converter comes, is named rightly, and goes; the laser goes on."""
+    _sound(bench)
+    pid, begun = bench.main_pid(), time.monotonic()
+    bench.orders(order)
+    bench.until(f"fault {code}", 30.0, lambda: _present(bench, (code,)))
+    seconds = time.monotonic() - begun
+    _sound(bench)
+    same_process(bench, pid)
+    return f"fault {code} after {seconds:.1f} s, over after {time.monotonic() - begun:.1f} s; the laser went on"
+
+
+@scenario
+def is_not_acknowledged(bench: Bench) -> str:
+    """The converter acknowledges nothing for eight seconds (ENXIO of the kernel's)."""
+    return _ordered(bench, "order off where=adc for=8", NACK)
+
+
+@scenario
+def hangs(bench: Bench) -> str:
+    """SDA is held low for eight seconds: every transfer times out in the kernel."""
+    return _ordered(bench, "order hang where=adc for=8", STUCK)
