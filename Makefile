@@ -78,8 +78,8 @@ soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anyt
 arm: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (qemu-user-static, mmdebstrap)
 	$(RUN) -m tools.bench.aarch64 $(ARGS)
 
-experiments: venv  ## what positions from light reach, in simulated rooms and on recordings (LUMILOOP_DATA)
-	$(RUN) -m tools.experiments lights $(ARGS)
+experiments: venv  ## every figure and table of the paper and ours into docs/results (recordings: LUMILOOP_DATA)
+	$(RUN) -m tools.experiments $(ARGS)
 
 docs: venv  ## regenerate the documents that come from code
 	$(RUN) -m daemon.publish.document docs

@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 import sys
+from enum import Enum, auto
 from pathlib import Path
 from typing import Final
 
@@ -38,8 +39,8 @@ def main(args: argparse.Namespace) -> int:
     if settings.photodiode.fitted:
         remarks.append(_look_at_bus(settings.photodiode.bus))
     if settings.map.kept:
-        usable, remark = look_at_maps(settings)
-        if settings.map.localise and not usable:
+        found, remark = look_at_maps(settings)
+        if settings.map.localise and found is not Maps.READY:
             return cli.fail(f"{remark}; `map.localise` in {args.config} asks for a map: `run` would be refused")
         remarks.append(remark)
     sys.stdout.write("".join(f"{line}\n" for line in (f"{args.config}: good", *remarks)))
@@ -59,20 +60,32 @@ def implausible(mount: Mount) -> list[str]:
     return said
 
 
-def look_at_maps(settings: Config) -> tuple[bool, str]:
-    """Whether there is a map to begin with, and one line about the folder; nothing in it is touched.
+class Maps(Enum):
+    """What a folder of maps is good for."""
 
-    What cannot be used is said, each file by itself, by the store's own log. A folder is often another user's.
+    READY = auto()
+    EMPTY = auto()
+    FROZEN = auto()
+    BROKEN = auto()
+
+
+def look_at_maps(settings: Config) -> tuple[Maps, str]:
+    """What the folder of maps is good for, and one line about it; nothing in it is touched.
+
+    READY: there is a map to begin with. EMPTY: there is none yet, and maps can be kept. FROZEN: there is one, and what
+    is learned cannot be kept, as it should be. BROKEN: there is none that can be used, or none can be kept. What cannot
+    be used is said, each file by itself, by the store's own log. A folder is often another user's.
     """
     folder = maps_folder(settings.map.folder)
     if not os.access(folder, os.F_OK):
         if not can_be_made(folder):
-            return False, f"{folder}: cannot be made by this user, maps cannot be kept; name another in `map.folder`"
-        return False, f"{folder}: not there yet, maps will be kept in it"
+            text = f"{folder}: cannot be made by this user, maps cannot be kept; name another in `map.folder`"
+            return Maps.BROKEN, text
+        return Maps.EMPTY, f"{folder}: not there yet, maps will be kept in it"
     if not folder.is_dir():
-        return False, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"
+        return Maps.BROKEN, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"
     if not os.access(folder, os.R_OK | os.X_OK):
-        return False, f"{folder}: maps in it cannot be read by this user"
+        return Maps.BROKEN, f"{folder}: maps in it cannot be read by this user"
     from daemon.lights import load_lights  # with them comes the arithmetic, which no other remark needs
     from daemon.store import Store, judge_for
 
@@ -81,10 +94,13 @@ def look_at_maps(settings: Config) -> tuple[bool, str]:
     unwritten = not settings.map.localise and not os.access(folder, os.W_OK)
     more = "; nothing can be kept in it by this user" if unwritten else ""
     if start is None:
-        return False, f"{folder}: {'no map in it can be used' if store.refused else 'no map in it yet'}{more}"
+        broken = store.refused or unwritten
+        text = f"{folder}: {'no map in it can be used' if store.refused else 'no map in it yet'}{more}"
+        return Maps.BROKEN if broken else Maps.EMPTY, text
     meta, count = start.stored.meta, len(start.stored.tables["submap.key"])
     named = f" ({meta.name})" if meta.name else ""
-    return True, f"{folder}: map {meta.map_id:08x}{named} of {count} submaps is good{more}"
+    text = f"{folder}: map {meta.map_id:08x}{named} of {count} submaps is good{more}"
+    return Maps.FROZEN if unwritten else Maps.READY, text
 
 
 def _look_at_bus(name: str) -> str:

@@ -73,14 +73,14 @@ def start_log() -> None:
     """Log to the journal where stderr is the journal's own stream, else to stderr with the time of day."""
     handler: logging.Handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter(TERMINAL_FORMAT))
-    if _to_journal():
+    if to_journal():
         handler.setFormatter(_PriorityFormat("%(message)s"))
         handler = JournalHandler(JOURNAL, handler)
         handler.setFormatter(logging.Formatter("%(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
-def _to_journal() -> bool:
+def to_journal() -> bool:
     """Whether stderr is the journal's own stream and not redirected (systemd.exec(5), JOURNAL_STREAM)."""
     try:
         at = os.fstat(sys.stderr.fileno())

@@ -14,6 +14,7 @@ PYTHON=${PYTHON:-/usr/bin/python3}
 SOURCE=$(cd "$(dirname "$0")/.." && pwd)
 ROOT=${DESTDIR}${PREFIX}
 UNITS=/usr/lib/systemd/system
+UNIT_FILES="lumiloop.service lumiloop-warmup.service lumiloop-lamps.service lumiloop-lamps.timer"
 MARK=.lumiloop
 
 say() { echo "lumiloop: $*"; }
@@ -60,7 +61,7 @@ environment() {
 }
 
 files() {
-    for unit in lumiloop.service lumiloop-warmup.service; do
+    for unit in $UNIT_FILES; do
         install -d "$DESTDIR$UNITS"
         sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/$unit" > "$DESTDIR$UNITS/$unit"
         chmod 644 "$DESTDIR$UNITS/$unit"
@@ -111,10 +112,11 @@ case "${1:-}" in
     uninstall)
         ours
         if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
-            systemctl disable --now lumiloop.service lumiloop-warmup.service 2> /dev/null || true
+            systemctl disable --now $UNIT_FILES 2> /dev/null || true
         fi
         rm -rf "$ROOT" "$DESTDIR/usr/share/doc/lumiloop"
-        rm -f "$DESTDIR/usr/bin/lumiloop" "$DESTDIR$UNITS/lumiloop.service" "$DESTDIR$UNITS/lumiloop-warmup.service" \
+        for unit in $UNIT_FILES; do rm -f "$DESTDIR$UNITS/$unit"; done
+        rm -f "$DESTDIR/usr/bin/lumiloop" \
             "$DESTDIR/usr/lib/udev/rules.d/60-lumiloop.rules" "$DESTDIR/usr/lib/systemd/catalog/lumiloop.catalog" \
             "$DESTDIR/usr/lib/sysusers.d/lumiloop.conf"
         if [ "${PURGE:-0}" = 1 ]; then

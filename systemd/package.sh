@@ -57,7 +57,7 @@ cat > "$TREE/DEBIAN/prerm" << 'EOF'
 #!/bin/sh
 set -e
 if [ -d /run/systemd/system ] && [ "$1" = remove ]; then
-    systemctl disable --now lumiloop.service lumiloop-warmup.service || true
+    systemctl disable --now lumiloop.service lumiloop-warmup.service lumiloop-lamps.timer lumiloop-lamps.service || true
 fi
 EOF
 cat > "$TREE/DEBIAN/postrm" << 'EOF'

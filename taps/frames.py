@@ -160,7 +160,7 @@ class Scan(msgspec.Struct, frozen=True, kw_only=True):
     period: float = 0.0
 
     def ranges_m(self) -> npt.NDArray[np.float32]:
-        """Distance of each beam; not a number where there is none."""
+        """Distance of each beam; infinite: no echo from within reach; not a number: the device could not tell."""
         return np.frombuffer(self.ranges[: len(self.ranges) // 4 * 4], "<f4")
 
 

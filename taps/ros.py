@@ -39,7 +39,7 @@ class Topic:
 
 
 TOPICS: Final = {
-    "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan; the stamp is the first beam's"),
+    "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan after REP-117; the stamp is the first beam's"),
     "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while there is one"),
     "/odom": Topic("nav_msgs/msg/Odometry", "the pose in odom, smooth, with the velocity"),
     "/tf": Topic("tf2_msgs/msg/TFMessage", "map > odom > base_link"),

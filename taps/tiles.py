@@ -13,7 +13,8 @@ from daemon.maptiles import RESOLUTION_M
 from taps.frames import MapTiles
 
 LogOdds = npt.NDArray[np.float32]
-NOTHING: Final = np.zeros((0, 0), np.float32)
+NOTHING: Final = np.zeros((1, 1), np.float32)
+"""One cell, not known: after RESET the map that was must not stand, and none at all is more than some can read."""
 WALL, FREE, UNSEEN = 100, 0, -1
 """Cells of a map as others have it: ROS's OccupancyGrid."""
 
@@ -32,8 +33,8 @@ class Tiles:
 
     @property
     def fresh(self) -> bool:
-        """Whether there is something new to be drawn."""
-        return self._changed and bool(self._tiles)
+        """Whether it is to be drawn anew; also where nothing is left of it."""
+        return self._changed
 
     def take(self, frame: MapTiles) -> None:
         """Some tiles, as log-odds.
@@ -50,7 +51,7 @@ class Tiles:
         self.resolution, self.map_id, self._changed = frame.resolution, frame.map_id, not frame.more
 
     def whole(self) -> tuple[tuple[float, float], LogOdds]:
-        """Lower left corner (m) and log-odds (rows, columns), rows from below, 0 not known; (0, 0) of nothing."""
+        """Lower left corner (m) and log-odds (rows, columns), rows from below, 0 not known; one cell of nothing."""
         self._changed = False
         if not self._tiles:
             return (0.0, 0.0), NOTHING

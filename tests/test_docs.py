@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from daemon.cli import main
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def anchors(page: Path) -> set[str]:
@@ -45,3 +47,42 @@ def test_named_commands_exist(page: Path, capsys: pytest.CaptureFixture[str]) ->
     known = capsys.readouterr().out
     for command in set(re.findall(r"(?:`|bin/|^ {4,})lumiloop ([a-z]+)\b", page.read_text(), re.MULTILINE)):
         assert re.search(rf"^\s+{command}\b", known, re.MULTILINE), f"{page.name} names `lumiloop {command}`"
+
+
+def test_every_equation_of_the_paper_leads_to_functions_that_exist() -> None:
+    page = (ROOT / "docs" / "theory.md").read_text()
+    rows = re.findall(r"^\| (Eq\. \d+|[^|]+?) \| .*$", page, re.MULTILINE)
+    assert [f"Eq. {number}" for number in range(1, 16)] == [row for row in rows if row.startswith("Eq.")]
+    named = re.findall(r"\[`(\w+)\.(\w+)`\]\(\.\./(estimator/\w+\.py)\)", page)
+    assert len(named) == page.count("](../")
+    for module, name, file in named:
+        assert file == f"estimator/{module}.py"
+        assert re.search(rf"^(def|class) {name}\b", (ROOT / file).read_text(), re.MULTILINE), f"{module}.{name}"
+
+
+def programs() -> dict[str, list[tuple[str, list[str]]]]:
+    """Of each module that the documents start with ``python -m`` or ``make``: where, and with which options."""
+    found: dict[str, list[tuple[str, list[str]]]] = {}
+    for page in PAGES:
+        text = page.read_text().replace("\\\n", "")
+        told = re.findall(r"python -m ((?:tools|hal|tests)[\w.]*)([^\n`#]*)", text)
+        for target, words in re.findall(r"make (experiments|bench|demo|soak|fuzz)\b(?: ARGS=(\"[^\"]*\"|\S+))?", text):
+            told.append((MADE[target], words.strip('"`')))
+        for module, words in told:
+            options = re.findall(r"(?<![\w-])--[a-z][a-z-]*", words)
+            found.setdefault(module.rstrip("."), []).append((page.name, options))
+    return found
+
+
+MADE = {"experiments": "tools.experiments", "bench": "tools.bench", "demo": "tools.demo", "soak": "tools.soak",
+        "fuzz": "tests.fuzz"}  # fmt: skip
+
+
+@pytest.mark.parametrize("module", sorted(programs()))
+def test_programs_of_the_documents_know_the_options_named(module: str) -> None:
+    """Each is started for its help, with what is installed for the tests."""
+    done = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for page, options in programs()[module]:
+        for option in options:
+            assert re.search(rf"{option}\b", done.stdout), f"{page}: {module} {option}"

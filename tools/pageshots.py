@@ -17,18 +17,27 @@ from tools.browser import BrowserError, chromium, robot, tab, view
 
 SEEN: Final = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose && lumiloop.world.lampsPlaced"
 DESKTOP, PHONE = (1280, 860), (390, 844)
+WELL: Final = 'lumiloop.world.pose.state_name === "TRACKING"'
+"""A picture of a robot on a computer that was too slow just then shows nobody what to expect."""
+PATIENCE_S: Final = 120.0
 SETTLE_S: Final = 3.0
 
 
 async def photograph(browser: str, address: str, out: Path, seconds: float) -> None:
-    """Both pictures, after so many seconds of driving."""
+    """Both pictures, after so many seconds of driving, of a robot that is TRACKING.
+
+    Raises:
+        BrowserError: it is not, for two minutes.
+    """
     async with tab(browser, address, DESKTOP) as page:
         await page.until(SEEN, 60.0)
         await asyncio.sleep(seconds)
+        await page.until(WELL, PATIENCE_S)
         await page.picture(out / "view.png")
     async with tab(browser, address, PHONE, phone=True, dark=False) as page:
         await page.until(SEEN, 60.0)
         await asyncio.sleep(SETTLE_S)
+        await page.until(WELL, PATIENCE_S)
         await page.picture(out / "view-phone.png")
 
 
@@ -38,6 +47,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=40.0, help="of driving before (default %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="default: %(default)s")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="lumiloop-page-") as name:
         folder = Path(name)
         try:

@@ -84,8 +84,8 @@ def scan_message(scan: RawScan) -> dict[str, object]:
     """A scan in SI units: bearings in rad from the lidar's front axis, counter-clockwise, evenly spaced."""
     geometry = scan.geometry
     bearing = geometry.bearings(scan.first_step, scan.stride, 2)
-    valid = scan.code == VALID
-    ranges = np.where(valid, scan.ranges * geometry.range_unit_m, np.nan).astype("<f4")
+    none = np.where(scan.code > geometry.dmax, np.inf, np.nan)  # no echo within reach, and what is no distance
+    ranges = np.where(scan.code == VALID, scan.ranges * geometry.range_unit_m, none).astype("<f4")
     return {
         "seq": scan.seq,
         "t_mono": scan.t_mono,

@@ -10,7 +10,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
-from daemon.check import implausible, look_at_maps
+from daemon.check import Maps, implausible, look_at_maps
 from daemon.config import Config
 from daemon.endpoints import ANYBODY, AUTO, parse_endpoint, subscription_port
 from daemon.folders import can_be_made, maps_folder, runtime_folder, state_folder
@@ -257,12 +257,12 @@ def maps(case: Case) -> Iterator[Finding]:
         yield remark("maps", "are not kept: `map.folder` is none")
         return
     try:
-        usable, text = look_at_maps(settings)
+        found, text = look_at_maps(settings)
     except SurveyError:
         return  # said by the check of the survey
-    if "cannot be" in text or "by this user" in text or "can be used" in text:
+    if found in (Maps.BROKEN, Maps.FROZEN):
         yield fix("maps", text, "make the folder yours, or name another in map.folder")
-    elif settings.map.localise and not usable:
+    elif settings.map.localise and found is not Maps.READY:
         yield fix("maps", f"{text}; map.localise asks for one", "map first, or set map.localise = false")
     else:
         yield good("maps", text)

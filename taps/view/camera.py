@@ -107,7 +107,11 @@ def shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out:
 
 
 def make(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
-    """Make the film. ``given``: as of `daemon.replay.Given`. What goes wrong is said at its end."""
+    """Make the film. ``given``: as of `daemon.replay.Given`. What goes wrong with the recording is said at its end.
+
+    Raises:
+        OSError: the film cannot be written; it lasts as far as it came.
+    """
     asyncio.run(_shoot(log, settings, Given(*given), out))
 
 

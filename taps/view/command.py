@@ -15,13 +15,14 @@ import time
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from aiohttp import web
 
 from daemon import cli
 from daemon.config import Config
 from daemon.lights import SurveyError
+from daemon.logs import to_journal
 from daemon.publish.client import NoAnswer, address_of
 from hal.serving import stopping
 from taps.stream import Stream, path_of
@@ -29,9 +30,6 @@ from taps.view.film import Film
 from taps.view.guard import Guard, TokenRefused, token_for
 from taps.view.server import TOPICS, View
 from taps.view.words import Scene, scene_of
-
-if TYPE_CHECKING:
-    from multiprocessing.process import BaseProcess
 
 PORT: Final = 8090
 NICENESS: Final = 5
@@ -44,6 +42,8 @@ def main(args: argparse.Namespace) -> int:
         os.nice(NICENESS)
     try:
         token = token_for(args.bind, args.write, args.token)
+        if token and args.token is None and to_journal():
+            raise CannotServe("nobody could read a fresh token but in the log: name a file with one, --token FILE")
         return _show(args, Guard(args.bind, token, args.write))
     except (TokenRefused, SurveyError, NoAnswer, CannotServe) as error:
         return cli.fail(str(error))
@@ -83,9 +83,9 @@ def _film(args: argparse.Namespace) -> Iterator[Film]:
             target=_shoot, args=(args.log, args.settings, given, file), name="film", daemon=True
         )
         maker.start()
-        film = Film(args.log, file)
+        film = Film(args.log, file, maker.is_alive)
         try:
-            _wait(film, maker)
+            _wait(film)
             yield film
         finally:
             maker.terminate()
@@ -102,17 +102,16 @@ def _shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out
     except warmup.CannotLoad as error:
         cli.fail(str(error))
         return
-    import_module("taps.view.camera").shoot(log, settings, given, out)
+    try:
+        import_module("taps.view.camera").shoot(log, settings, given, out)
+    except OSError as error:
+        cli.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
 
 
-def _wait(film: Film, maker: BaseProcess) -> None:
+def _wait(film: Film) -> None:
     """Until the recording is known to be one."""
     cli.say("replaying the recording; it can be watched meanwhile")
     while film.scene is None and not film.done:
-        if not maker.is_alive():
-            film.look()
-            if film.scene is None and not film.done:
-                raise CannotServe("the replay has ended at once; try `lumiloop replay` on it")
         time.sleep(0.05)
         film.look()
     if film.error:
@@ -138,7 +137,7 @@ async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
     try:
         site = web.TCPSite(runner, guard.bind, port)
         await site.start()
-        cli.say(f"{what}: {address(guard, _port_of(runner))}")
+        cli.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
         await stop.wait()
     finally:
         await runner.cleanup()
@@ -149,11 +148,15 @@ def _port_of(runner: web.AppRunner) -> int:
     return int(runner.addresses[0][1])
 
 
-def address(guard: Guard, port: int) -> str:
-    """What a person opens; the token stands behind the #, which browsers tell no server."""
+def address(guard: Guard, port: int, whole: bool = True) -> str:
+    """What a person opens; the token stands behind the #, which browsers tell no server.
+
+    Not ``whole``: it goes to a log, which others read, and says that there is a token.
+    """
     host = guard.bind
     if host in ("0.0.0.0", "::", ""):
         host = socket.gethostname()
     if ":" in host:
         host = f"[{host}]"
-    return f"http://{host}:{port}/" + (f"#token={guard.token}" if guard.token else "")
+    token = guard.token if whole else "..."
+    return f"http://{host}:{port}/" + (f"#token={token}" if guard.token else "")

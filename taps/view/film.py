@@ -9,6 +9,7 @@ import os
 import struct
 from array import array
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,6 +21,7 @@ from taps.view.viewers import Tile
 KINDS: Final = ("pose", "lights", "scan", "statistics", "loop", "state", "faults", "row", "map", "scene", "end")
 HEAD: Final = struct.Struct("<dBI")
 """Before each piece: its time, its kind, its length."""
+DIED: Final = "the replay has died before its end (no memory, or no room in the folder of temporary files?)"
 
 _tile: Final = msgspec.msgpack.Decoder(tuple[int, int, bytes, dict[str, float]]).decode
 
@@ -45,10 +47,15 @@ class Film:
         t_first, t_last: instants that can be shown; equal before there are any. done: it is whole.
         error: why it has ended before the recording did, empty otherwise.
         scene: what a page is told of the robot that was recorded, None until it is known.
+
+    Args:
+        source: the recording. file: the film's. making: whether somebody is at it still; a maker that has died, for
+            lack of memory or room on the disk perhaps, has not written how it ended.
     """
 
-    def __init__(self, source: Path, file: Path) -> None:
+    def __init__(self, source: Path, file: Path, making: Callable[[], bool] = lambda: True) -> None:
         self.source = source
+        self._making = making
         self.reels: dict[str, Reel] = {kind: Reel() for kind in KINDS}
         self.tiles: dict[Tile, Reel] = {}
         self.about: dict[str, object] = {}
@@ -64,6 +71,12 @@ class Film:
 
     def look(self) -> None:
         """Take in what has been added since."""
+        making = self._making()  # asked before: what it wrote last is there by then
+        self._take_in()
+        if not making and not self.done:
+            self.done, self.error = True, DIED
+
+    def _take_in(self) -> None:
         while not self.done:
             head = os.pread(self._file, HEAD.size, self._read)
             if len(head) < HEAD.size:

@@ -8,7 +8,8 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from importlib import resources
 from pathlib import Path
 from socket import SO_SNDBUF, SOL_SOCKET
@@ -37,6 +38,9 @@ SUFFIXES: Final = {
     ".webmanifest": "application/manifest+json",
 }
 VIEWERS: Final = 32
+STRANGERS: Final = 16
+"""Who have not yet said who they are; where more come, the first of them goes. They take no viewer's place."""
+FULL: Final = f"{VIEWERS} browsers are watching; close one."
 PACE_S: Final = 0.04
 """Least time between two messages to a browser."""
 KEPT_BYTES: Final = 64 << 10
@@ -78,6 +82,7 @@ class View:
         self._count = 0
         self._guesses = asyncio.Semaphore(GUESSES)
         self._sockets: set[web.WebSocketResponse] = set()
+        self._strangers: deque[web.WebSocketResponse] = deque()
 
     def app(self) -> web.Application:
         """What aiohttp serves."""
@@ -117,11 +122,10 @@ class View:
         if not self._guard.origin_ok(request.headers.get("Origin"), request.headers.get("Host", "")):
             raise web.HTTPForbidden(text="Only the page of this server may open this.\n")
         if len(self._sockets) >= VIEWERS:
-            raise web.HTTPServiceUnavailable(text=f"{VIEWERS} browsers are watching; close one.\n")
+            raise web.HTTPServiceUnavailable(text=f"{FULL}\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_WORDS, compress=False)
         await socket.prepare(request)
         _little_kept(request)
-        self._sockets.add(socket)
         try:
             if (viewer := await self._greeted(socket)) is not None:
                 await self._serve(socket, viewer)
@@ -130,7 +134,18 @@ class View:
         return socket
 
     async def _greeted(self, socket: web.WebSocketResponse) -> Viewer | None:
-        """A viewer, after its first words; None: it was refused, and told why."""
+        """A viewer, which has a place now; None: it was refused, and told why."""
+        if len(self._strangers) >= STRANGERS:
+            await _refuse(self._strangers.popleft(), "words", "Others came before it said who it is.")
+        self._strangers.append(socket)
+        try:
+            return await self._known(socket)
+        finally:
+            with contextlib.suppress(ValueError):  # it has gone for others
+                self._strangers.remove(socket)
+
+    async def _known(self, socket: web.WebSocketResponse) -> Viewer | None:
+        """A viewer, after its first words."""
         words = await _words(socket, HELLO_S)
         token = None if words is None else words.get("token")
         if words is None:
@@ -142,6 +157,10 @@ class View:
         if not self._guard.may_look(token):
             await _refuse(socket, "token", "This page is shown to those who have its token.")
             return None
+        if len(self._sockets) >= VIEWERS:
+            await _refuse(socket, "full", FULL)
+            return None
+        self._sockets.add(socket)
         self._count += 1
         viewer = Viewer(self._count, self._guard.may_order(token) and self._film is None)
         recording = None if self._film is None else self._film.source
@@ -154,9 +173,9 @@ class View:
         player = None if self._film is None else Player(self._film, viewer)
         if player is None:
             self.hub.welcome(viewer)
-        tasks = [asyncio.create_task(_send(socket, viewer))]
+        tasks = [asyncio.create_task(_or_part(socket, _send(socket, viewer)))]
         if player is not None:
-            tasks.append(asyncio.create_task(player.run()))
+            tasks.append(asyncio.create_task(_or_part(socket, player.run())))
         try:
             while (words := await _words(socket)) is not None:
                 if player is not None and "play" in words:
@@ -210,7 +229,7 @@ class View:
 
     async def _part(self, app: web.Application) -> None:
         """The server stops: pages are told, and look whether another one comes."""
-        for socket in list(self._sockets):
+        for socket in [*self._sockets, *self._strangers]:
             with contextlib.suppress(ConnectionError, RuntimeError):
                 await socket.close(code=WSCloseCode.GOING_AWAY, message=b"the view stops")
 
@@ -235,6 +254,18 @@ def _little_kept(request: web.Request) -> None:
         sock: Socket | None = transport.get_extra_info("socket")
         if sock is not None:
             sock.setsockopt(SOL_SOCKET, SO_SNDBUF, KEPT_BYTES)
+
+
+async def _or_part(socket: web.WebSocketResponse, work: Coroutine[Any, Any, None]) -> None:
+    """Work for a browser; where it fails the connection ends, and the page comes again by itself."""
+    try:
+        await work
+    except ConnectionError:
+        log.debug("a browser has gone", exc_info=True)
+    except Exception:  # a defect of ours
+        log.exception("a browser could not be told what it should see")
+        with contextlib.suppress(ConnectionError, RuntimeError):
+            await socket.close(code=WSCloseCode.INTERNAL_ERROR, message=b"the log of `lumiloop view` says why")
 
 
 async def _send(socket: web.WebSocketResponse, viewer: Viewer) -> None:

@@ -15,6 +15,7 @@ from daemon.cli import USAGE
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "lumiloop.service"
+UNITS = sorted(path.name for path in (*SYSTEMD.glob("*.service"), *SYSTEMD.glob("*.timer")))
 MOST_EXPOSED = 2.0
 
 needs_analyze = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
@@ -26,9 +27,9 @@ def settings(path: Path) -> list[tuple[str, str]]:
 
 
 @needs_analyze
-@pytest.mark.parametrize("name", ["lumiloop.service", "lumiloop-warmup.service"])
+@pytest.mark.parametrize("name", UNITS)
 def test_the_service_manager_accepts_it(name: str, tmp_path: Path) -> None:
-    for path in SYSTEMD.glob("*.service"):
+    for path in map(SYSTEMD.joinpath, UNITS):
         text = path.read_text().replace("/opt/lumiloop/bin/lumiloop", "/bin/true")
         (tmp_path / path.name).write_text(text)
     done = subprocess.run(
@@ -81,6 +82,32 @@ def test_both_units_share_user_and_cache() -> None:
     daemon, warmup = (dict(settings(SYSTEMD / name)) for name in ("lumiloop.service", "lumiloop-warmup.service"))
     for name in ("DynamicUser", "User", "CacheDirectory", "StateDirectory"):
         assert daemon[name] == warmup[name]
+
+
+def test_lamps_are_looked_at_where_the_daemon_has_its_maps_and_its_stream() -> None:
+    """Its folder of maps, by the same user; and its socket, in a folder that must outlast this unit."""
+    daemon, lamps = (dict(settings(SYSTEMD / name)) for name in ("lumiloop.service", "lumiloop-lamps.service"))
+    for name in ("DynamicUser", "User", "StateDirectory", "ConfigurationDirectory", "UMask"):
+        assert daemon[name] == lamps[name]
+    assert lamps["Environment"] == f"RUNTIME_DIRECTORY=/run/{daemon['RuntimeDirectory']}"
+    assert "RuntimeDirectory" not in lamps
+    assert lamps["ExecStart"].endswith("lumiloop lamps --config /etc/lumiloop/lumiloop.toml")
+    assert dict(settings(SYSTEMD / "lumiloop-lamps.timer"))["OnCalendar"] == "daily"
+
+
+def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
+    script = (SYSTEMD / "install.sh").read_text()
+    (told,) = re.findall(r'^UNIT_FILES="(.*)"$', script, re.MULTILINE)
+    assert sorted(told.split()) == UNITS
+    for name in told.split():
+        unit = tmp_path / "usr/lib/systemd/system" / name
+        unit.parent.mkdir(parents=True, exist_ok=True)
+        unit.touch()
+    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
+    subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
+    assert not list(unit.parent.iterdir())
+    (stopped,) = re.findall(r"disable --now (.*) \|\|", (SYSTEMD / "package.sh").read_text())
+    assert sorted(stopped.split()) == UNITS
 
 
 def test_it_is_started_again_for_ever_but_not_with_a_configuration_that_is_wrong() -> None:

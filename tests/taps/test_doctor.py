@@ -251,6 +251,19 @@ def test_a_folder_that_cannot_be_made_is_not_a_full_disk(file: Path, capsys: pyt
     assert "where /proc" not in said
 
 
+def test_maps_are_judged_by_what_they_are_and_not_by_their_names(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "rooms that cannot be entered"
+    folder.mkdir()
+    file.write_text(f'{CONFIG}map.folder = "{folder}"\n')
+    assert asked(file, Computer()) == cli.OK
+    assert re.search(r"good +maps +.*no map in it yet", capsys.readouterr().out)
+    (folder / "00000001-1.lumimap").write_bytes(b"no map")
+    assert asked(file, Computer()) == cli.FAILED
+    assert re.search(r"FIX +maps +.*no map in it can be used", capsys.readouterr().out)
+
+
 def test_a_running_daemon_is_listened_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taps.doctor.host.LISTEN_S", 1.0)
     with served(tmp_path / "s"):

@@ -51,3 +51,9 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
     assert "replace it with --force" in said
     assert "is the daemon running?" in said
     assert "No such file" in said
+
+
+def test_a_disk_that_is_full_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with served(tmp_path / "s"):
+        assert record(tmp_path / "s", Path("/dev/full"), "--force") == cli.FAILED
+    assert "/dev/full: No space left on device; free space" in capsys.readouterr().err

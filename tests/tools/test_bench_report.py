@@ -59,13 +59,27 @@ def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("worse", "value", "lost"),
-    [("more", 12.6, True), ("more", 12.4, False), ("less", 7.4, True), ("less", 99.0, False), ("", 99.0, False)],
+    [
+        ("more", 12.6, True),
+        ("more", 12.4, False),
+        ("less", 7.4, True),
+        ("less", 99.0, False),
+        ("", 99.0, False),
+        ("more", math.nan, True),
+        ("less", math.nan, True),
+        ("", math.nan, False),
+    ],
 )
 def test_a_figure_is_worse_in_its_own_direction(worse: str, value: float, lost: bool, tmp_path: Path) -> None:
     before = read(kept(tmp_path, GOOD))
     now = replace(GOOD, figures=(replace(NOISE, value=value, worse=worse),))
     assert bool(regressions([now], before)) is lost
     assert f"({10:.4g} then)" in page([now], ABOUT, [], before)
+
+
+def test_what_was_not_measured_then_is_not_worse_now() -> None:
+    assert not replace(NOISE, value=10.0).lost(math.nan)
+    assert not replace(NOISE, value=math.nan).lost(math.nan)
 
 
 def test_room_allows_what_is_small(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import os
 import platform
 import subprocess
@@ -48,7 +49,9 @@ class Figure:
         return f"{self.name}: {self.value:.4g} {self.unit}".rstrip()
 
     def lost(self, old: float) -> bool:
-        """Whether it is worse than it was then."""
+        """Whether it is worse than it was then; what could not be measured any more is."""
+        if math.isnan(self.value):
+            return bool(self.worse) and not math.isnan(old)
         allowed = self.share * abs(old) + self.room
         return {"more": self.value > old + allowed, "less": self.value < old - allowed, "": False}[self.worse]
 

@@ -1,34 +1,37 @@
-"""``python -m tools.experiments lights``: run the experiments of a group, print their tables, keep data and pictures.
+"""``python -m tools.experiments``: every figure and table of the paper and of this project, made anew.
 
-Each leaves ``<out>/<name>.json`` (figures, tables, seeds, run time) and its pictures as PNG. Experiments on recorded
-data need LUMILOOP_DATA (docs/data.md) and are skipped without it, with the reason. Exit status: 0 all ran or were
-skipped, 1 one could not run. A missed target is printed and does not change the status.
+Each experiment leaves ``<out>/<name>.json`` (figures, tables, seeds, run time), its pictures as PNG and a page; beside
+them ``README.md`` says what there is. A run that was interrupted goes on where it was: what this code has made already
+is not made again (``--again`` does). Experiments on recorded data need LUMILOOP_DATA (docs/data.md) and are skipped
+without it, with the reason. Exit status: 0 all ran or were skipped, 1 one could not run. A missed target is printed and
+does not change the status.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import importlib.util
+import json
+import os
 import sys
 import time
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from tools.experiments.report import Report, Skipped, Work, save
+from tools.experiments import pages
+from tools.experiments.report import COMMAND, Report, Skipped, Work, code, save
 from tools.figures import table
 
-GROUPS: Final = {
-    "lights": (
-        "fig4", "fig5", "fig5_loops", "fig6", "corridor", "islands", "claim", "adaptive", "room", "tones", "static",
-        "walks", "survey", "beamquality", "relocate", "relocate_real",
-    ),
+EXPERIMENTS: Final = {
+    "table1": "Table 1", "fig4": "Fig. 4", "fig5": "Fig. 5", "fig5_loops": "Fig. 5, loops closed", "fig6": "Fig. 6",
+    "claim": "its claim of cost", "adaptive": "its future work", "beamquality": "Eq. 8 and 9",
+    "room": "", "corridor": "", "islands": "", "tones": "", "static": "", "walks": "", "survey": "",
+    "relocate": "", "relocate_real": "", "integrity": "",
 }  # fmt: skip
-
-
-def available(group: str) -> list[str]:
-    """Experiments of a group that exist in this tree, in order."""
-    return [name for name in GROUPS[group] if importlib.util.find_spec(f"tools.experiments.{name}")]
+"""Of what in the paper each is; nothing: ours alone."""
+RESULTS: Final = Path("docs/results")
+QUICK: Final = Path("out/experiments/quick")
+SOURCES: Final = ("estimator/*.py", "hal/**/*.py", "daemon/**/*.py", "tools/sim/*.py", "tools/experiments/*.py")
 
 
 def show(report: Report) -> None:
@@ -41,14 +44,27 @@ def show(report: Report) -> None:
         print(f"note: {note}")
 
 
+def kept(path: Path) -> dict[str, Any]:
+    """What a result says of itself; empty: there is none that can be read."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def run_one(name: str, options: argparse.Namespace) -> bool:
     """Run one experiment and keep what it found; returns whether it ran or had a reason not to."""
     print(f"\n== {name}", flush=True)
+    what = {"quick": options.quick, "trials": options.trials, "code": code(*SOURCES)}
+    before = kept(options.out / f"{name}.json")
+    if not options.again and before.items() >= what.items():
+        print(f"made by this code already: {options.out / name}.json; --again makes it anew")
+        return True
     begun = time.monotonic()
     try:
-        report = importlib.import_module(f"tools.experiments.{name}").run(
-            options.quick, Work(options.jobs, sys.stderr.isatty(), options.trials)
-        )
+        module = importlib.import_module(f"tools.experiments.{name}")
+        report = module.run(options.quick, Work(options.jobs, sys.stderr.isatty(), options.trials))
     except Skipped as reason:
         print(f"skipped: {reason}")
         return True
@@ -57,32 +73,44 @@ def run_one(name: str, options: argparse.Namespace) -> bool:
         return False
     seconds = time.monotonic() - begun
     show(report)
-    command = f"python -m tools.experiments {options.group} --only {name}" + " --quick" * options.quick
-    facts = {"experiment": name, "command": command, "quick": options.quick, "seconds": round(seconds, 2)}
+    words = " --quick" * options.quick + f" --trials {options.trials}" * bool(options.trials)
+    facts = {
+        "experiment": name, "paper": EXPERIMENTS.get(name, ""), "title": (module.__doc__ or name).splitlines()[0],
+        "command": f"{COMMAND} {name}{words}",
+        "seconds": round(seconds, 2), "jobs": options.jobs, **what,
+    }  # fmt: skip
     paths = save(name, report, facts, options.out)
+    pages.write(options.out, list(EXPERIMENTS))
     print(f"{seconds:.1f} s; written: {', '.join(str(path) for path in paths)}")
     return True
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Options; a name that is not an experiment of the group ends the program with the list of those that are."""
+    """Options; a name that is not an experiment ends the program with the list of those that are."""
     parser = argparse.ArgumentParser(
         prog="python -m tools.experiments", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("group", choices=sorted(GROUPS))
     parser.add_argument("--only", action="append", metavar="NAME", help="run just this one (may be repeated)")
     parser.add_argument("--quick", action="store_true", help="a small part of each, in seconds; figures are rough")
-    parser.add_argument("--jobs", type=int, default=1, help="processes to spread trials over (default: 1)")
+    parser.add_argument("--again", action="store_true", help="make anew what this code has made already")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
     parser.add_argument("--trials", type=int, default=0, help="of experiments that repeat something at random")
-    parser.add_argument("--out", type=Path, default=Path("out/experiments"))
+    parser.add_argument("--out", type=Path, help=f"folder (default: {RESULTS}; with --quick {QUICK})")
     options = parser.parse_args(arguments)
-    names = available(options.group)
-    unknown = set(options.only or ()) - set(names)
+    unknown = set(options.only or ()) - set(EXPERIMENTS)
     if unknown:
-        parser.error(f"no such experiment: {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+        parser.error(f"no such experiment: {', '.join(sorted(unknown))}; there are {', '.join(EXPERIMENTS)}")
     if options.jobs < 1:
         parser.error(f"--jobs {options.jobs}: at least one process is needed")
-    options.names = options.only or names
+    options.names = options.only or list(EXPERIMENTS)
+    options.out = options.out or (QUICK if options.quick else RESULTS)
+    whole = [
+        name for name in options.names if options.quick and kept(options.out / f"{name}.json").get("quick") is False
+    ]
+    if whole:
+        parser.error(
+            f"{options.out} holds whole runs of {', '.join(whole)}; name another --out for a quick part of them"
+        )
     return options
 
 

@@ -6,7 +6,7 @@ and lamps by chance. Two questions: *As driven*, which loops does the daemon clo
 and every heading; there the laser alone takes the room's mirror images for the same place. Its curve is the baseline:
 our own laser-only branch and bound (Cartographer's way of searching, not Cartographer itself).
 
-Trials are kept as they are done: a run that was interrupted goes on where it was.
+Trials are kept as they are done, under a digest of the code: a run that was interrupted goes on where it was.
 """
 
 from __future__ import annotations
@@ -32,11 +32,17 @@ from tools.experiments.fig6_curves import (
 )
 from tools.experiments.fig6_trial import COVERED, LASER, LIT, Drive, stored
 from tools.experiments.fig6_truth import STRICT
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
+from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work, code
 from tools.figures import Figure, bounded
 
 SEEDS: Final = tuple(range(1, 52))
-KEPT: Final = Path("out/experiments/fig6-drives")
+KEPT: Final = Path("out/experiments")
+SOURCES: Final = (
+    "estimator/*.py",
+    "tools/sim/*.py",
+    "tools/experiments/fig6_tr*.py",
+    "tools/experiments/loop_drives.py",
+)
 LENGTH_M: Final = 80.0
 WAYS: Final = (LIT, LASER, COVERED)
 LASER_STEPS: Final = 4
@@ -48,7 +54,8 @@ LIGHT_STEPS: Final = 5
 def run(quick: bool, work: Work) -> Report:
     """All drives; with ``quick`` one short one, which is not kept."""
     seeds, length = (SEEDS[:1], 40.0) if quick else (SEEDS, LENGTH_M)
-    drives = work.map(stored, [(seed, length, None if quick else KEPT) for seed in seeds], "fig6")
+    folder = None if quick else KEPT / f"fig6-{code(*SOURCES)}"
+    drives = work.map(stored, [(seed, length, folder) for seed in seeds], "fig6")
     tables = (driven(drives), number_of_conditions(drives), thresholds(drives))
     picture = Picture("fig6", partial(draw, drives), (9.0, 4.2))
     return Report(tuple(figures(drives)), tables, (picture,), tuple(seeds), NOTES)

@@ -1,4 +1,6 @@
-"""Integrity runs: ``python -m tools.experiments.integrity --count 10 --jobs 2``; resumable, one file a scenario.
+"""Integrity: is what the daemon says of random drives ever wrong? ``python -m tools.experiments.integrity --count 10``.
+
+Resumable, one file a scenario.
 
 Every scenario of :mod:`tools.experiments.integrity_scene` goes through the daemon's own cycle in virtual time; the
 published state is judged against the truth. Tracks are kept in ``<out>/<kind>-<seed>.npz`` and not made again; delete
@@ -17,11 +19,18 @@ from typing import Final
 
 import numpy as np
 
-from tools.experiments.integrity_report import report
-from tools.experiments.integrity_run import run
+from tools.experiments import integrity_run
+from tools.experiments.integrity_plot import stanford
+from tools.experiments.integrity_report import Summary, report
 from tools.experiments.integrity_scene import KINDS, draw
+from tools.experiments.report import COMMAND, Picture, Report, Table, Work, code
+from tools.experiments.report import draw as pictured
+from tools.figures import bounded
 
 OUT: Final = Path("out/integrity")
+SEEDS: Final = 60
+ALERT_M: Final = 1.0
+SOURCES: Final = ("estimator/*.py", "daemon/**/*.py", "tools/sim/*.py", "tools/experiments/integrity_*.py")
 
 
 def make(task: tuple[str, int, Path]) -> tuple[str, int, float]:
@@ -33,7 +42,7 @@ def make(task: tuple[str, int, Path]) -> tuple[str, int, float]:
         scene = draw(kind, seed)
     except RuntimeError:  # a room so full that nothing can drive in it
         return kind, seed, -1.0
-    track = run(scene)
+    track = integrity_run.run(scene)
     facts = {"lit": scene.lit, "wheels": scene.wheels, "clean": scene.clean, **scene.notes}
     path = out / f"{kind}-{seed}.npz"
     partial = path.with_suffix(".part")
@@ -44,6 +53,30 @@ def make(task: tuple[str, int, Path]) -> tuple[str, int, float]:
         )  # fmt: skip
     partial.replace(path)
     return kind, seed, time.process_time() - begun
+
+
+def run(quick: bool, work: Work) -> Report:
+    """Every kind with ``work.trials`` seeds (60); with ``quick`` one of the cheapest kind. Tracks are kept."""
+    out = OUT / code(*SOURCES)
+    out.mkdir(parents=True, exist_ok=True)
+    kinds, seeds = (list(KINDS)[:1], range(1)) if quick else (list(KINDS), range(work.trials or SEEDS))
+    work.map(make, missing(kinds, seeds, out), "integrity")
+    return told(report(out, kinds), seeds)
+
+
+def told(found: Summary, seeds: range) -> Report:
+    """What the tracks show, as an experiment's report."""
+    rows = [
+        (each.name, each.worst_m, each.worst_deg, each.wrong_s, 100.0 * each.tracking, each.beyond_bound, each.bounded)
+        for each in found.found
+        if each.wrong or each.beyond_bound
+    ]
+    head = ("", "worst, m", "worst, deg", "wrong, s", "TRACKING, %", "cycles beyond the bound", "of cycles")
+    figure = bounded(f"wrong states, of {len(found.found)} scenarios", found.wrong, "", "<= 0", f"{COMMAND} integrity")
+    picture = Picture("stanford", lambda canvas: stanford(found, canvas, ALERT_M), (6.4, 5.2))
+    notes = tuple(line.strip() for line in found.figures())
+    tables = (Table("Scenarios in which a state or a bound was wrong", head, tuple(rows)),) if rows else ()
+    return Report((figure,), tables, (picture,), tuple(seeds), notes)
 
 
 def missing(kinds: list[str], seeds: range, out: Path) -> list[tuple[str, int, Path]]:
@@ -64,7 +97,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=OUT, help="folder of the tracks")
     parser.add_argument("--report", action="store_true", help="run nothing, say what the kept tracks show")
     parser.add_argument("--plot", type=Path, help="PNG to draw error against bound into")
-    parser.add_argument("--alert", type=float, default=1.0, help="alert limit in the plot, m (default: 1)")
+    parser.add_argument("--alert", type=float, default=ALERT_M, help="alert limit in the plot, m (default: 1)")
     return parser.parse_args(arguments)
 
 
@@ -81,9 +114,9 @@ def main(arguments: list[str] | None = None) -> int:
     found = report(options.out, kinds)
     print(found.text())
     if options.plot is not None:
-        from tools.experiments.integrity_plot import stanford
-
-        stanford(found, options.plot, options.alert)
+        picture = Picture(options.plot.stem, lambda canvas: stanford(found, canvas, options.alert), (6.4, 5.2))
+        options.plot.parent.mkdir(parents=True, exist_ok=True)
+        pictured(Report(pictures=(picture,)), options.plot.parent)
     return int(found.wrong > 0)
 
 

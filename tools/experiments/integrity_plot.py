@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,12 +14,8 @@ MOST_M: Final = 20.0
 CELLS: Final = 90
 
 
-def stanford(found: Summary, path: Path, alert_m: float) -> None:
-    """Draw every cycle that had a bound: below the diagonal the bound held, above it misled."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+def stanford(found: Summary, canvas: Any, alert_m: float) -> None:
+    """Draw every cycle that had a bound: left of the diagonal the bound held, right of it it misled."""
     from matplotlib.colors import LogNorm
 
     error, bound = (np.concatenate([track[:, COLUMNS.index(name)] for track in found.cycles]) for name in
@@ -28,7 +23,7 @@ def stanford(found: Summary, path: Path, alert_m: float) -> None:
     said = np.isfinite(bound)
     error, bound = np.clip(error[said], LEAST_M, MOST_M), np.clip(bound[said], LEAST_M, MOST_M)
     edges = np.geomspace(LEAST_M, MOST_M, CELLS)
-    figure, axes = plt.subplots(figsize=(6.4, 5.2), dpi=110)
+    axes = canvas.subplots()
     counts, _, _ = np.histogram2d(error, bound, bins=(edges, edges))
     mesh = axes.pcolormesh(edges, edges, np.where(counts > 0, counts, np.nan).T, norm=LogNorm(), cmap="viridis")
     axes.plot((LEAST_M, MOST_M), (LEAST_M, MOST_M), "k-", lw=1.0)
@@ -41,8 +36,4 @@ def stanford(found: Summary, path: Path, alert_m: float) -> None:
     )
     axes.set(xscale="log", yscale="log", xlabel="horizontal error, m", ylabel="protection level, m")
     axes.set_title(f"{len(found.found)} scenarios", fontsize=9)
-    figure.colorbar(mesh, label="cycles")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    plt.close(figure)
+    canvas.colorbar(mesh, label="cycles", ax=axes)

@@ -75,7 +75,7 @@ class Summary:
 
     def text(self) -> str:
         """Tables for a person."""
-        return "\n".join([*self._kinds(), "", *self._figures(), *self._listed()])
+        return "\n".join([*self._kinds(), "", *self.figures(), *self._listed()])
 
     def _kinds(self) -> list[str]:
         lines = [
@@ -93,7 +93,8 @@ class Summary:
             )
         return lines
 
-    def _figures(self) -> list[str]:
+    def figures(self) -> list[str]:
+        """Single numbers, as sentences."""
         n = len(self.found)
         if not n:
             return ["no tracks"]

@@ -9,7 +9,6 @@ done with, so that a run that was broken off goes on where it was.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from estimator.mapimage import MapImage
 from tools.experiments.relocate_map import kept_map
 from tools.experiments.relocate_trial import Case, Outcome, trial
 from tools.experiments.relocate_world import Place, Site, lit_house, symmetric_room
-from tools.experiments.report import COMMAND, Cell, Report, Table, Work
+from tools.experiments.report import COMMAND, Cell, Report, Table, Work, code
 from tools.figures import Figure, bounded
 from tools.sim.ceiling import Effects
 
@@ -35,7 +34,6 @@ TRIALS: Final = 200
 QUICK: Final = 4
 FRAME_S: Final = 3.02
 """How long a lamp takes to tell what it is."""
-ROOT: Final = Path(__file__).parents[2]
 SOURCES: Final = ("estimator/*.py", "daemon/state.py", "daemon/evidence.py", "tools/experiments/relocate*.py")
 
 
@@ -86,14 +84,9 @@ def file_name(name: str) -> str:
     return name.replace(", ", "-").replace(" ", "-")
 
 
-@cache
 def digest() -> str:
     """Of the program that trials are made with."""
-    whole = hashlib.sha256()
-    for pattern in SOURCES:
-        for path in sorted(ROOT.glob(pattern)):
-            whole.update(path.read_bytes())
-    return whole.hexdigest()[:12]
+    return code(*SOURCES)
 
 
 def journal(name: str) -> Path:

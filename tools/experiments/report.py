@@ -7,6 +7,7 @@ a test can run it.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import multiprocessing
@@ -16,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -25,7 +27,10 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Cell = str | float | int
 
-COMMAND: Final = "python -m tools.experiments lights --only"
+COMMAND: Final = "python -m tools.experiments --only"
+ROOT: Final = Path(__file__).parents[2]
+BAR: Final = 30
+"""Characters of a progress bar."""
 
 
 class Skipped(RuntimeError):
@@ -111,15 +116,26 @@ class Work:
         done: list[Result] = []
         for result in results:
             done.append(result)
-            self._show(f"{label} {len(done)}/{total}", last=len(done) == total)
+            self._show(label, len(done), total)
         return done
 
-    def _show(self, text: str, last: bool) -> None:
+    def _show(self, label: str, done: int, total: int) -> None:
         now = time.monotonic()
-        if self.progress and (last or now - self._shown_at > 1.0):
+        if self.progress and (done == total or now - self._shown_at > 1.0):
             self._shown_at = now
-            sys.stderr.write(f"\r  {text.strip()}\x1b[K" + ("\n" if last else ""))
+            bar = ("#" * (BAR * done // total)).ljust(BAR, ".")
+            sys.stderr.write(f"\r  {bar} {done}/{total} {label}\x1b[K" + ("\n" if done == total else ""))
             sys.stderr.flush()
+
+
+@cache
+def code(*patterns: str) -> str:
+    """A digest of source files of this tree: what was made by other code is not taken for what this one would make."""
+    whole = hashlib.sha256()
+    for pattern in patterns:
+        for path in sorted(ROOT.glob(pattern)):
+            whole.update(path.read_bytes())
+    return whole.hexdigest()[:12]
 
 
 def _gentle() -> None:
@@ -128,14 +144,16 @@ def _gentle() -> None:
 
 
 def save(name: str, report: Report, facts: dict[str, object], folder: Path) -> list[Path]:
-    """Write ``<name>.json`` and the pictures; returns what was written.
+    """Write the pictures and, last of all, ``<name>.json``; returns what was written, the JSON first.
 
     ``facts`` (command, seconds, quick) go in front. Without matplotlib the pictures are left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    pictures = draw(report, folder)
     data: dict[str, object] = {
         **facts,
         "seeds": list(report.seeds),
+        "pictures": [path.name for path in pictures],
         "notes": list(report.notes),
         "figures": [asdict(f) | {"value": _plain(f.value)} for f in report.figures],
         "tables": [
@@ -143,8 +161,9 @@ def save(name: str, report: Report, facts: dict[str, object], folder: Path) -> l
         ],
     }
     path = folder / f"{name}.json"
-    path.write_text(json.dumps(data, indent=1) + "\n")
-    return [path, *draw(report, folder)]
+    path.with_suffix(".new").write_text(json.dumps(data, indent=1) + "\n")
+    path.with_suffix(".new").replace(path)
+    return [path, *pictures]
 
 
 def draw(report: Report, folder: Path) -> list[Path]:

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 from typing import Any, Final
 
 import numpy as np
 
 from tools.sim.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.buildings import Building, building
+from tools.sim.buildings import BUILDINGS, Building, building
 from tools.sim.people import Crowd
 from tools.sim.robot import Body, Drive
 from tools.sim.world import CIRCLE, MATERIAL_ID, Array
@@ -75,5 +75,14 @@ def main(name: str, path: str) -> None:
     figure.savefig(path, dpi=80)
 
 
+def asked(program: str, about: str) -> tuple[str, str]:
+    """Building and file of the command line; what is wrong with it ends the program with a sentence."""
+    parser = argparse.ArgumentParser(prog=f"python -m {program}", description=about.splitlines()[0])
+    parser.add_argument("building", choices=sorted(BUILDINGS))
+    parser.add_argument("picture", help="file to write, *.png")
+    options = parser.parse_args()
+    return options.building, options.picture
+
+
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    main(*asked("tools.sim.draw", __doc__))

@@ -6,7 +6,6 @@ lamp, how many are in plain view, and one lamp's strength over what its data she
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import Any, Final
 
@@ -16,7 +15,7 @@ from tools.sim.buildings import building
 from tools.sim.ceiling import IDEAL, Array, Ceiling, ceiling_of
 from tools.sim.ceiling_diffuse import within
 from tools.sim.ceiling_lamps import Zone
-from tools.sim.draw import draw_building
+from tools.sim.draw import asked, draw_building
 
 PIXELS: Final = 160
 """Along the longer side."""
@@ -106,4 +105,4 @@ def main(name: str, path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    main(*asked("tools.sim.draw_light", __doc__))

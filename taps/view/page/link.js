@@ -27,13 +27,14 @@ export class Link {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
+    this.refused = "";
     socket.onopen = () => this.say({ page: this.page, token: this.token });
     socket.onmessage = (event) => this.take(event.data);
     socket.onclose = () => {
       clearInterval(this.beat);
       this.socket = null;
       this.told.lost();
-      if (!this.refused) this.timer = setTimeout(() => this.open(), this.retry);
+      if (this.refused !== "token") this.timer = setTimeout(() => this.open(), this.retry);
       this.retry = Math.min(2 * this.retry, LAST_RETRY_MS);
     };
   }
@@ -62,7 +63,7 @@ export class Link {
     if (words.kind === "welcome") this.welcome(words);
     else if (words.kind === "pong") this.pong(words);
     else if (words.kind === "refused") {
-      this.refused = true;
+      this.refused = words.what;
       this.told.refused(words);
     }
   }

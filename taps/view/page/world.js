@@ -106,7 +106,7 @@ export class World {
     let count = 0;
     for (let i = 0; i < n; i++) {
       const range = ranges[i];
-      if (!(range > 0.02)) continue;
+      if (!(range > 0.02 && range < Infinity)) continue;
       const part = i / n, bearing = side * (first + i * step) + mount;
       const heading = a[2] + part * yaw, c = Math.cos(heading), s = Math.sin(heading);
       const x = mx + range * Math.cos(bearing), y = my + range * Math.sin(bearing);

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import msgspec
 import numpy as np
@@ -111,6 +111,9 @@ def test_a_client_gets_what_it_asked_for(tmp_path: Path) -> None:
         assert (state["data"]["meaning"], state["data"]["remedy"]) == ("meaning 3", "remedy")
         ranges = np.frombuffer(scan["data"]["ranges"], "<f4")
         assert np.array_equal(ranges, np.array([1.0, np.nan, 2.5], np.float32), equal_nan=True)
+        beyond = replace(raw_scan(), code=np.array([VALID, GEOMETRY.dmax + 1, 0], np.int32))
+        (near, *rest) = np.frombuffer(cast("bytes", scan_message(beyond)["ranges"]), "<f4")
+        assert np.array_equal((near, *rest), (1.0, np.inf, np.nan), equal_nan=True)
         assert scan["data"]["bearing_step"] == pytest.approx(np.pi / 180.0)
 
     run(tmp_path / "stream", body)

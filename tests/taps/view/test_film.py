@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from daemon.config import Config
+from taps.view import command
 from taps.view.camera import STEP_S, make
 from taps.view.film import HEAD, KINDS, Film
 from taps.view.player import Player
@@ -112,6 +113,28 @@ def test_a_film_that_is_still_being_made(film: Film, tmp_path: Path) -> None:
     film.look()
     assert (film.t_last, film.done, film.error) == (21.0, True, "the recording is torn")
     film.close()
+
+
+def test_a_film_whose_maker_has_died_says_so(film: Film, tmp_path: Path) -> None:
+    """Killed, or without room on the disk: it cannot write that it has ended, and looked as if it would go on."""
+    alive = True
+    watched = Film(Path("log"), tmp_path / "film", lambda: alive)
+    watched.look()
+    assert (watched.done, watched.t_last) == (False, 20.0)
+    with (tmp_path / "film").open("ab") as out:
+        out.write(HEAD.pack(21.0, KINDS.index("pose"), 500) + b"half of it")
+    alive = False
+    watched.look()
+    assert (watched.done, watched.t_last) == (True, 20.0)
+    assert "died before its end" in watched.error
+    watched.close()
+    film.close()
+
+
+def test_a_disk_that_is_full_is_named(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command._shoot(recording, Config(), (False, ()), Path("/dev/full"))
+    said = capsys.readouterr().err
+    assert "/dev/full: No space left on device; the recording is shown as far" in said
 
 
 def test_a_recording_that_ends_early_does_not_look_whole() -> None:

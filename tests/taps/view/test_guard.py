@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.cli import main
+from taps.view import command
 from taps.view.command import address
 from taps.view.guard import Guard, TokenRefused, is_loopback, token_for
 
@@ -77,6 +79,33 @@ def test_the_address_that_is_printed() -> None:
     assert address(Guard("127.0.0.1"), 8090) == "http://127.0.0.1:8090/"
     assert address(Guard("::1", TOKEN), 1) == f"http://[::1]:1/#token={TOKEN}"
     assert "0.0.0.0" not in address(Guard("0.0.0.0", TOKEN), 1)
+
+
+def test_the_journal_is_told_no_token(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(command, "to_journal", lambda: True)
+    monkeypatch.setattr(command, "stopping", stopped)
+    monkeypatch.setattr("daemon.cli.say", said.append)
+    assert main(["view", "--write", "--port", "0"]) == 1
+    assert "--token FILE" in capsys.readouterr().err
+    file = tmp_path / "token"
+    file.write_text(TOKEN)
+    file.chmod(0o600)
+    assert main(["view", "--write", "--port", "0", "--token", str(file)]) == 0
+    assert TOKEN not in said[0]
+    assert said[0].endswith("#token=...")
+    monkeypatch.setattr(command, "to_journal", lambda: False)
+    assert main(["view", "--write", "--port", "0", "--token", str(file)]) == 0
+    assert said[1].endswith(f"#token={TOKEN}")
+
+
+def stopped() -> asyncio.Event:
+    """Somebody has stopped it already."""
+    event = asyncio.Event()
+    event.set()
+    return event
 
 
 def test_what_cannot_be_shown_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

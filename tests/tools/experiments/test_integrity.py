@@ -9,10 +9,10 @@ import pytest
 
 from daemon.publish.snapshot import State
 from tools.experiments import integrity
-from tools.experiments.integrity_plot import stanford
 from tools.experiments.integrity_report import COLUMNS, Array, Summary, judged, longest, report
 from tools.experiments.integrity_run import run
 from tools.experiments.integrity_scene import KINDS, draw
+from tools.experiments.report import draw as draw_pictures
 
 AT = {name: number for number, name in enumerate(COLUMNS)}
 
@@ -105,5 +105,7 @@ def test_a_short_drive_tracks_and_is_kept(tmp_path: Path) -> None:
     assert integrity.missing(["clean_unlit"], range(2), tmp_path) == []
     found = report(tmp_path, ["clean_unlit"])
     assert "wrong: 0 of 2; that proves at most 150.00% (95 %)" in found.text()
-    stanford(found, tmp_path / "plot.png", 1.0)
-    assert (tmp_path / "plot.png").stat().st_size > 5000
+    told = integrity.told(found, range(2))
+    assert (told.figures[0].value, told.figures[0].ok) == (0.0, True)
+    (picture,) = draw_pictures(told, tmp_path)
+    assert picture.stat().st_size > 5000

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tools.experiments import __main__ as program
+from tools.experiments import table1
 from tools.experiments.report import Picture, Report, Skipped, Table, Work, draw, save
 from tools.figures import bounded
 
@@ -55,7 +56,9 @@ def test_no_processes_is_an_error() -> None:
 
 def test_progress(capsys: pytest.CaptureFixture[str]) -> None:
     Work(1, progress=True).map(square, range(3), "squares")
-    assert "squares 3/3" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert f"{'#' * 10}{'.' * 20} 1/3 squares" in shown
+    assert f"{'#' * 30} 3/3 squares" in shown
 
 
 def test_saved_data_is_complete_json(tmp_path: Path) -> None:
@@ -84,9 +87,9 @@ def pretend(monkeypatch: pytest.MonkeyPatch, **runs: Any) -> None:
     """Experiments with the given ``run``; the program finds just these."""
     modules = {}
     for name, run in runs.items():
-        modules[name] = ModuleType(name)
+        modules[name] = ModuleType(name, "What it is about.")
         modules[name].run = run  # type: ignore[attr-defined]  # a module is made up
-    monkeypatch.setattr(program, "available", lambda group: list(runs))
+    monkeypatch.setattr(program, "EXPERIMENTS", dict.fromkeys(runs, "Fig. 9"))
     monkeypatch.setattr(program.importlib, "import_module", lambda path: modules[path.rsplit(".", 1)[1]])
 
 
@@ -100,19 +103,72 @@ def test_program_runs_skips_and_reports(
         raise ZeroDivisionError("oops")
 
     pretend(monkeypatch, good=lambda quick, work: a_report(), skips=skips, breaks=breaks)
-    assert program.main(["lights", "--out", str(tmp_path), "--quick", "--only", "good", "--only", "skips"]) == 0
+    assert program.main(["--out", str(tmp_path), "--quick", "--only", "good", "--only", "skips"]) == 0
     out = capsys.readouterr().out
     assert "skipped: no data" in out
     assert "with care" in out
     data = json.loads((tmp_path / "good.json").read_text())
-    assert data["command"] == "python -m tools.experiments lights --only good --quick"
+    assert data["command"] == "python -m tools.experiments --only good --quick"
     assert data["quick"] is True
     assert math.isfinite(data["seconds"])
-    assert program.main(["lights", "--out", str(tmp_path)]) == 1
+    assert program.main(["--out", str(tmp_path)]) == 1
     assert "breaks could not run: ZeroDivisionError('oops')" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["lights", "--only", "nothing"], ["lights", "--jobs", "0"], ["sounds"]])
+def test_a_run_goes_on_where_it_was_interrupted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ran: list[str] = []
+
+    def good(quick: bool, work: Work) -> Report:
+        ran.append("good")
+        return a_report()
+
+    def interrupted(quick: bool, work: Work) -> Report:
+        ran.append("later")
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        return a_report()
+
+    pretend(monkeypatch, good=good, later=interrupted)
+    words = ["--out", str(tmp_path)]
+    with pytest.raises(KeyboardInterrupt):
+        program.main(words)
+    assert program.main(words) == 0
+    assert ran == ["good", "later", "later"]
+    assert program.main([*words, "--only", "good", "--again"]) == 0
+    assert program.main([*words, "--only", "good", "--trials", "3"]) == 0
+    monkeypatch.setattr(program, "code", lambda *sources: "other code")
+    assert program.main([*words, "--only", "good"]) == 0
+    assert ran[3:] == ["good"] * 3
+
+
+def test_a_quick_part_does_not_replace_a_whole_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pretend(monkeypatch, good=lambda quick, work: a_report())
+    words = ["--out", str(tmp_path)]
+    assert program.main([*words, "--quick"]) == 0
+    assert program.main(words) == 0
+    with pytest.raises(SystemExit):
+        program.main([*words, "--quick"])
+    assert "holds whole runs of good" in capsys.readouterr().err
+    assert json.loads((tmp_path / "good.json").read_text())["quick"] is False
+    assert program.parse([]).out == program.RESULTS
+    assert program.parse(["--quick"]).out == program.QUICK
+
+
+def test_the_pages_say_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pretend(monkeypatch, good=lambda quick, work: a_report(), none=lambda quick, work: Report())
+    assert program.main(["--out", str(tmp_path), "--jobs", "1"]) == 0
+    index = (tmp_path / "README.md").read_text()
+    assert "| [good](good.md) | Fig. 9 | What it is about. | 1 of 1 |" in index
+    assert "| [none](none.md) | Fig. 9 | What it is about. | - |" in index
+    page = (tmp_path / "good.md").read_text()
+    for part in ("--only good`", "seeds 1, 2", "(line.png)", "## by links", "| three | 1.235 |", "| all | - |",
+                 "| error | 2.5 | cm | <= 5 | ok |", "with care"):  # fmt: skip
+        assert part in page, part
+
+
+@pytest.mark.parametrize("words", [["--only", "nothing"], ["--jobs", "0"], ["sounds"]])
 def test_wrong_words_end_the_program(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         program.main(words)
@@ -120,6 +176,13 @@ def test_wrong_words_end_the_program(words: list[str], capsys: pytest.CaptureFix
     assert words[-1] in capsys.readouterr().err
 
 
-def test_only_what_exists_is_offered() -> None:
-    for name in program.available("lights"):
-        assert (Path(program.__file__).parent / f"{name}.py").is_file()
+def test_every_experiment_is_offered() -> None:
+    """A module of the folder that can be run as one is in the list, and what is in the list is there."""
+    folder = Path(program.__file__).parent
+    found = {path.stem for path in folder.glob("*.py") if "def run(quick: bool, work: Work)" in path.read_text()}
+    assert found == set(program.EXPERIMENTS)
+
+
+def test_the_conditions_of_the_paper_are_those_of_the_room() -> None:
+    report = table1.run(True, Work())
+    assert report.figures[0].ok, report.tables[0].text()
