@@ -25,7 +25,7 @@ ANYWHERE = np.diag((1e3, 1e3, 10.0))
 """Covariance (m, m, rad) of a place that no way joins with the others."""
 
 NEAR_M, NEAR_RAD = 0.4, 0.25 * math.pi
-"""What is nearer together is kept only so often; along the way keyframes lie 0.25 m apart, so a first lap is kept."""
+"""What lies nearer together shows the same (see `estimator.mapping.retire`)."""
 
 LONGEST_M = 1e6
 """Ranges beyond are kept as this: they say the same, and fit into single precision."""

@@ -29,6 +29,9 @@ PATIENCE_S = 1.0
 NEAR = 0.4
 """Keyframes nearer together than this, in steps, are not laid: a robot that stands and trembles lays none."""
 
+PASS = SIZE
+"""So many keyframes later the robot has come by again: 3 m of way or half a turn, well beyond what is near."""
+
 NOTHING = 1e-9 * np.eye(3)
 
 
@@ -129,15 +132,17 @@ def update_map(state: State, scan: Scan, points: ScanPoints) -> None:
 
 
 def retire(state: State, newest: Keyframe) -> None:
-    """Bound what is kept per area: of the keyframes near one place with one heading, the newest few stay.
+    """Bound what is kept per area: near one place, with one heading, the newest few of earlier passes stay.
 
-    Were they counted by the squares that list them, squares that a lap only touches would go on filling up for hours.
+    This pass's own are left alone: in a curve, or where the robot sways, they lie close together. Were all counted by
+    the squares that list them, squares that a lap only touches would go on filling up for hours.
     """
     T, atlas = newest.T_map_keyframe, state.atlas
     # what is adrift, or watched, may lie elsewhere: it takes the place of nothing older
     since = max(atlas.since, atlas.kept if atlas.held else 0, 0 if atlas.watch is None else atlas.watch.since)
-    here = sorted(key for key, T_key in listed(state, T, newest.key) if key >= since and near(T, T_key))
-    for key in here[: -state.settings.keep]:
+    here = sorted(key for key, T_key in listed(state, T, newest.key) if since <= key and near(T, T_key))
+    earlier = [key for key in here if key <= newest.key - PASS]
+    for key in earlier[: max(0, len(earlier) + 1 - state.settings.keep)]:
         drop(state, key)
     if atlas.held:
         own = [key for key in state.keyframes if key >= atlas.kept]

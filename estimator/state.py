@@ -44,7 +44,7 @@ class Settings:
         quality: Q of the filter; a beam whose intensity is lower is not used (only where a scan has intensities).
         keyframe_m, keyframe_rad: a keyframe is laid after this much motion, or where fewer than ``keyframe_share`` of
             the beams still fit the map.
-        keep: keyframes kept within 0.4 m and 45 deg of each other.
+        keep: passes of one place, 0.4 m and 45 deg around, whose keyframes are kept.
         history: keep the pose of keyframes whose scan has been let go; for replay, which needs them once at the end.
         localise: a map that was restored is only used: it never moves, and what is laid on top of it is let go soon.
         live_m: metres per cell of a map that is kept up to date for whoever shows it; 0: none is.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from estimator import se2
 from estimator.keyframe import Keyframe, keep, near
-from estimator.mapping import retire
+from estimator.mapping import PASS, retire
 from estimator.records import Array
 from estimator.state import State, new_state
 from tests.estimator.world import scan_in
@@ -39,13 +40,42 @@ def test_laps_beside_each_other_leave_no_more_than_the_first_ones() -> None:
     assert sum(map(len, state.places.values())) <= 2 * len(state.keyframes)
 
 
-def test_the_newest_few_of_a_place_stay() -> None:
+def swaying(x: float) -> Array:
+    """2 cm to either side, once a metre."""
+    return np.array((x, 0.02 * np.sin(2.0 * np.pi * x), np.arctan(0.04 * np.pi * np.cos(2.0 * np.pi * x))))
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        [swaying(x) for x in np.arange(0.0, 20.0, 0.16)],
+        [np.array((0.01 * k, 0.0, 0.26 * k)) for k in range(24)],
+        [np.array((np.cos(a), np.sin(a), a + 0.5 * np.pi)) for a in np.arange(0.0, 6.2, 0.13)],
+    ],
+    ids=["swaying", "turning on the spot", "a circle"],
+)
+def test_what_is_seen_once_is_kept_however_close_together(way: list[Array]) -> None:
     state = new_state()
-    frames = [laid(state, np.array((0.49 + 0.01 * i, 0.0, np.pi if i % 2 else -np.pi))) for i in range(4)]
-    assert list(state.keyframes) == [frame.key for frame in frames[-state.settings.keep :]]
+    for T in way:
+        laid(state, T)
+    assert len(state.keyframes) >= 0.95 * len(way)  # the end of a circle has come by its begin
+    for _ in range(6):
+        for T in way:
+            laid(state, T)
+    assert len(state.keyframes) <= 2 * len(way)
+
+
+def test_of_earlier_passes_the_newest_stay() -> None:
+    state = new_state()
+    for yaw in (-np.pi, np.pi, np.pi):
+        here = [laid(state, np.array((0.5, 0.0, yaw))).key]
+        for x in range(PASS):
+            laid(state, np.array((3.0 + x, 0.0, 0.0)))
     other = laid(state, np.array((0.5, 0.0, 0.0)))
-    assert not near(frames[-1].T_map_keyframe, other.T_map_keyframe)
-    assert len(state.keyframes) == state.settings.keep + 1
+    near_it = laid(state, np.array((0.5, 0.0, np.pi)))
+    left = [frame.key for frame in state.keyframes.values() if near(frame.T_map_keyframe, near_it.T_map_keyframe)]
+    assert left == [*here[1 - state.settings.keep :], near_it.key]
+    assert other.key in state.keyframes
 
 
 def test_a_keyframe_that_has_moved_with_the_map_is_found_where_it_lies_now() -> None:
@@ -54,6 +84,6 @@ def test_a_keyframe_that_has_moved_with_the_map_is_found_where_it_lies_now() -> 
     for step in range(1, 7):  # corrections of the map carry it away little by little
         first.submap.T_map_submap = np.array((0.3 * step, 0.0, 0.0))
         laid(state, np.array((0.3 * step, 0.6, 0.0)))
-    for _ in range(state.settings.keep):
+    for _ in range(PASS + state.settings.keep):
         laid(state, np.array((1.8, 0.0, 0.0)))
     assert first.key not in state.keyframes
