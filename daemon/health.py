@@ -181,7 +181,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.RECORDER_FAILED: ("the recording cannot be written", "free disk space, or name another directory"),
     Fault.MAP_NOT_SAVED: (
         "the map cannot be saved; what was saved before stays",
-        "read the log; free disk space, or name another `map.folder` that may be written",
+        "read the log; free disk space, end another daemon that keeps its maps there, or name another `map.folder`",
     ),
     Fault.FLIGHT_RECORDER_FAILED: (
         "the flight recorder cannot keep a state or a dump",
@@ -284,9 +284,10 @@ def describe(fault: Fault, now: Vitals | None = None) -> str:
 
 def _words(fault: Fault, now: Vitals) -> str:
     """The driver's error that a fault stands for, or the lag, if it stands for one."""
-    for error, noun in ((now.error, _noun), (now.adc_error, _adc_noun)):
-        if error is not None and fault is noun(error):
-            return str(error)
+    if now.error is not None and fault is _noun(now.error):
+        return str(now.error)
+    if now.adc_error is not None and fault is _adc_noun(now.adc_error):
+        return str(now.adc_error)
     late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
     return f"scans are {now.lag:+.2f} s late against the wheels" if now.lag and late else ""
 

@@ -138,7 +138,7 @@ class Store:
     """A folder of maps, used by one process at a time.
 
     Attributes:
-        refused: whether a map was found and could not be used.
+        refused: whether a map was found and could not be used. trouble: what kept `claim` from taking the folder.
     """
 
     def __init__(self, folder: Path, mend: bool = True) -> None:
@@ -149,13 +149,15 @@ class Store:
         self._origin: Path | None = None
         self._good: dict[Path, bool] = {}
         self._lock: int | None = None
+        self.trouble = ""
 
     def claim(self) -> None:
-        """Take the folder for this process before there is a map to save: what keeps it from that is said at once."""
+        """Take the folder for this process before there is a map to save: what keeps it from that is known at once."""
         try:
             self._use()
         except OSError as error:
-            log.error("no map can be kept in %s: %s; name another `map.folder`, or end that", self.folder, said(error))
+            self.trouble = f"{self.folder}: {said(error)}"
+            log.error("no map can be kept in %s; mend that, or name another `map.folder`", self.trouble)
 
     def generations(self) -> list[Generation]:
         """All that are there, newest first."""

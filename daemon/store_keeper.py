@@ -84,7 +84,7 @@ class Keeper:
         clock: Clock,
     ) -> None:
         """Nothing happens before :meth:`run`. ``state``: None while the estimator is loaded."""
-        self.error = ""
+        self.error = "" if store is None else store.trouble
         self.saves = 0
         self.busy_since: float | None = None
         self._store, self._start, self._state, self._map_id = store, start, state, map_id
@@ -256,7 +256,8 @@ class Keeper:
         else:
             self._anew |= self._saved is not None and self._saved[0] != self._map_id()
         if error and not self.error:
-            log.error("the map cannot be saved: %s; what was saved before stays, and it is tried again", error)
+            again = "" if self._last else ", and it is tried again"
+            log.error("the map cannot be saved: %s; what was saved before stays%s", error, again)
         self.error = error
         for told in waiting:
             told(error)

@@ -138,7 +138,10 @@ class Patience:
             raise DemoError(f"it is not ready after {COLD_START_S:.0f} s; read {self._out / log}")
         if waited > TELL_S and not self._told:
             self._told = True
-            print("first start: compiling the numerical kernels, up to a minute; later starts take seconds", flush=True)
+            print(
+                "not ready yet: a first start compiles the numerical kernels, up to a minute; later ones take seconds",
+                flush=True,
+            )
         time.sleep(0.05)
 
 

@@ -299,7 +299,9 @@ def test_a_second_daemon_on_one_folder_is_told_at_its_start(tmp_path: Path, capl
     first, _ = started(settings, None)
     assert first is not None
     assert not caplog.messages
-    started(settings, None)
+    second, _ = started(settings, None)
+    assert second is not None
+    assert "another process" in second.trouble
     assert f"no map can be kept in {tmp_path}: another process keeps its maps there" in caplog.text
     first.close()
     caplog.clear()

@@ -335,3 +335,30 @@ def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) ->
         assert not bench.keeper.refused
 
     asyncio.run(run())
+
+
+def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_done(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        other = Store(tmp_path)
+        other.claim()
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        bench.store.claim()
+        keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
+        assert keeper.fault
+        bench.keeper = keeper
+        bench.drive()
+        await bench.turn(FIRST_S)
+        assert keeper.fault
+        assert caplog.text.count("another process keeps its maps there") == 1
+        await keeper.finish()
+        assert "it is tried again" not in caplog.text
+        other.close()
+        bench.drive()
+        await bench.turn(RETRY_S)
+        assert not keeper.fault
+        assert bench.files == 1
+
+    asyncio.run(run())

@@ -147,7 +147,7 @@ class Agent(Machine):
         self.process.wait()
 
 
-def test_an_insidethat_is_started_anew_fails_its_order_and_not_the_bench(tmp_path: Path) -> None:
+def test_an_inside_that_is_started_anew_fails_its_order_and_not_the_bench(tmp_path: Path) -> None:
     inside = Agent(b'{"up": true}\n', tmp_path)
     with pytest.raises(Order, match="started anew while"):
         inside.run("true")

@@ -45,7 +45,7 @@ LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
 
 
 @pytest.mark.parametrize("path", sorted(BUILT_IN.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenarios_that_come_with_the_benchare_whole(path: Path) -> None:
+def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
     made = load(path)
     assert made.title != path.stem
     assert all(one.until <= made.drive.seconds and one.from_ < made.drive.seconds for one in made.expect)

@@ -36,11 +36,23 @@ def share(lidar: Path, *more: str) -> float:
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as daemon:
         try:
             time.sleep(SETTLE_S)
+            _alive(daemon, "the daemon")
             begun, before = time.monotonic(), processor_s(daemon.pid)
             time.sleep(SPAN_S)
+            _alive(daemon, "the daemon")
             return (processor_s(daemon.pid) - before) / (time.monotonic() - begun)
         finally:
             daemon.send_signal(signal.SIGTERM)
+
+
+def _alive(child: subprocess.Popen[bytes], name: str) -> None:
+    """A process that has ended takes no processor time, and would look good.
+
+    Raises:
+        RuntimeError: it has.
+    """
+    if child.poll() is not None:
+        raise RuntimeError(f"{name} ended with {child.returncode}: nothing can be measured")
 
 
 def run() -> list[Figure]:
@@ -52,6 +64,7 @@ def run() -> list[Figure]:
         with subprocess.Popen(fake, stdout=subprocess.DEVNULL) as sensor:
             try:
                 while not os.path.lexists(link):
+                    _alive(sensor, "the fake sensor")
                     time.sleep(0.02)
                 share(link)  # it may compile
                 for _ in range(PAIRS):
