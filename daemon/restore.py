@@ -113,7 +113,7 @@ def fill(made: object, said: dict[str, Any]) -> None:
     """Set fields of an object of one of our classes: these and nothing else of it.
 
     Raises:
-        UnpicklingError: it is something that others share, or that is no field of it.
+        UnpicklingError: it is something that others share, that is no field of it, or not all of its fields.
     """
     kind: type = type(made)
     if isinstance(made, Enum) or not _ours(kind):
@@ -122,6 +122,9 @@ def fill(made: object, said: dict[str, Any]) -> None:
         if not _is_field(kind, name):
             raise pickle.UnpicklingError(f"{kind.__name__} has no field {name!r}")
         object.__setattr__(made, name, value)
+    for name in field_names(kind):
+        if not hasattr(made, name):
+            raise pickle.UnpicklingError(f"{kind.__name__} lacks {name!r}: other software has written it")
 
 
 def function_within(

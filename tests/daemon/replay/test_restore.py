@@ -166,3 +166,9 @@ def test_what_is_honest_comes_back() -> None:
         assert one.dtype == other.dtype
         assert np.array_equal(one, other)
     assert back["partial"].func is se2.compose
+
+
+def test_what_other_software_has_written_with_fewer_fields_is_refused_by_name() -> None:
+    """Else it would fail in the middle of a replay, for want of an attribute."""
+    with pytest.raises(pickle.UnpicklingError, match="Limits lacks 'icp_iterations': other software"):
+        reading.fill(reading.blank(Limits), {"points": 1})
