@@ -184,13 +184,18 @@ def test_the_newest_is_taken_once() -> None:
 def test_what_was_taken_is_noted_and_a_spoilt_note_is_none(tmp_path: Path) -> None:
     records = Records(tmp_path / "state" / RECORD)
     assert records.held() == {}
-    records.note(OFFER)
-    records.note(msgspec.structs.replace(OFFER, kind=MAP, version=2))
+    lights, hall = tmp_path / "lights.toml", tmp_path / "maps" / "map-00000077-00000001.lumimap"
+    records.note(OFFER, lights)
+    records.note(msgspec.structs.replace(OFFER, kind=MAP, version=2, map_id=0x77), hall)
     again = Records(records.path)
+    assert again.held() == {}  # noted, but there are no such files
+    lights.touch()
+    hall.parent.mkdir()
+    hall.with_name("map-00000077-00000009.lumimap").touch()  # as the daemon has saved it since
     assert again.held() == {SURVEY: Held(7, "aa", "lights.toml"), MAP: Held(2, "aa", "lights.toml")}
     records.path.write_bytes(b'{"survey": 7}')
     os.utime(records.path, ns=(1, 1))
-    assert again.held() == {}
+    assert again.taken() == {}
 
 
 def test_a_version_is_when_the_file_was_changed(survey: Path) -> None:

@@ -121,6 +121,59 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
     assert "the daemon goes on in it" in capsys.readouterr().err
 
 
+def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "hall.lumimap"
+    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    outcomes = ["refused", "refused", "done"]
+
+    async def switch(host: str, port: int, map_id: int) -> str:
+        assert map_id == 0x77
+        return outcomes.pop(0)
+
+    monkeypatch.setattr("taps.fleet.fetch.switch_map", switch)
+    with router() as made:
+        for failed, said in ((True, "is in"), (True, "refused"), (False, "here already; the daemon goes on in it")):
+            one = fetcher(made, tmp_path, what=[MAP], switch=True)
+            asyncio.run(beside(one.run(), sharing(made, map=path, version=1)))
+            assert one.failed is failed
+            assert said in capsys.readouterr().err
+        one = fetcher(made, tmp_path, what=[MAP], switch=True)  # nothing is left to be asked for
+        asyncio.run(beside(one.run(), sharing(made, map=path, version=1)))
+    assert not one.failed
+
+
+def test_what_was_deleted_or_is_wanted_elsewhere_is_fetched_again(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "hall.lumimap"
+    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+    def fetch(made: Router, **more: Any) -> str:
+        one = fetcher(made, tmp_path, what=[], **more)
+        asyncio.run(beside(one.run(), sharing(made, survey=survey, map=path, version=1)))
+        assert not one.failed
+        return capsys.readouterr().err
+
+    def maps() -> list[Path]:
+        return list((tmp_path / "state").rglob("*.lumimap"))
+
+    lights, other = tmp_path / "lights.toml", tmp_path / "other.toml"
+    with router() as made:
+        fetch(made)
+        assert fetch(made).count("is here already") == 2
+        lights.unlink()
+        maps()[0].unlink()
+        assert "here already" not in fetch(made)
+        assert lights.exists()
+        assert len(maps()) == 1
+        fetch(made, survey=other)
+        assert other.exists()
+
+
 @pytest.mark.parametrize(
     "offer",
     [
