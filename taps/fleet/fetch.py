@@ -17,7 +17,7 @@ from daemon.publish.client import NoAnswer, address_of
 from daemon.wholefile import reason_of
 from hal.serving import work_until_told
 from taps.fleet import messages
-from taps.fleet.messages import SHARED, Unreadable
+from taps.fleet.messages import SHARED, Unreadable, printable
 from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, Taken, chosen, home, place, sha256_of
 from taps.fleet.share import key_of
 from taps.view.orders import OrderRefused, switch_map
@@ -97,7 +97,7 @@ class Fetcher:
                 said, self.failed = str(error), True
             if said != self._said.get(kind):
                 self._said[kind] = said
-                cli.say(said)
+                cli.say(printable(said))  # who shares has chosen some of the words
 
     async def _fetch(self, session: zenoh.Session, kind: str, modbus: tuple[str, int] | None) -> str:
         """What came of it.
@@ -149,7 +149,7 @@ class Fetcher:
                 try:
                     offers.append(messages.read(content, Offer))
                 except Unreadable as error:
-                    cli.say(f"what is offered as {kind} is not one: {error}")
+                    cli.say(printable(f"what is offered as {kind} is not one: {error}"))
             if offers or not left:
                 break
             await asyncio.sleep(PAUSE_S)

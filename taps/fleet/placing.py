@@ -105,13 +105,16 @@ def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Surv
     Raises:
         Refused: it is none that could be used.
     """
-    with tempfile.TemporaryDirectory(prefix="lumiloop-fleet-") as folder:
-        path = Path(folder) / "survey"
-        path.write_bytes(content)
-        try:
-            return read_survey(path, profile)
-        except SurveyError as error:
-            raise Refused(str(error).replace(str(path), name)) from None
+    try:
+        with tempfile.TemporaryDirectory(prefix="lumiloop-fleet-") as folder:
+            path = Path(folder) / "survey"
+            path.write_bytes(content)
+            try:
+                return read_survey(path, profile)
+            except SurveyError as error:
+                raise Refused(str(error).replace(str(path), name)) from None
+    except OSError as error:
+        raise Refused(f"{name}: cannot be checked, for want of a temporary file: {reason_of(error)}") from None
 
 
 class Taken(Held, frozen=True):

@@ -15,7 +15,9 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
 from daemon import cli
+from taps import zenohlink
 from taps.fleet import messages, robot, show
+from taps.fleet.claim import Claim
 from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import Roster
@@ -157,6 +159,28 @@ def test_of_two_that_have_spoken_the_first_keeps_the_name(
         asyncio.run(beside(body(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
 
 
+def test_who_leaves_while_the_name_is_asked_for_does_not_keep_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taps.fleet.claim.ALONE_S", 1.0)
+    mine: list[bool] = []
+
+    async def body(made: Router) -> None:
+        async with joined(made.address) as session, joined(made.address) as other:
+            token = other.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
+            await asyncio.sleep(0.2)
+
+            async def listed(*asked: Any) -> list[str]:
+                found = await zenohlink.listed(*asked)
+                token.undeclare()
+                await asyncio.sleep(0.3)
+                return found
+
+            monkeypatch.setattr("taps.fleet.claim.listed", listed)
+            await beside(until(lambda: mine[-1:] == [True], 5.0), Claim(session, "agv", "here", mine.append).run())
+
+    with router() as made:
+        asyncio.run(body(made))
+
+
 def test_a_router_that_dies_is_said_and_all_go_on_when_it_is_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -280,6 +304,12 @@ def test_what_cannot_be_is_said(
         code = cli.INTERRUPTED
     assert code != cli.OK
     assert said in capsys.readouterr().err
+
+
+def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["ros2", "--domain", "-1"])
+    assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
 
 
 async def interrupted(seconds: float) -> None:

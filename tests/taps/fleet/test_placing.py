@@ -95,6 +95,15 @@ def test_a_disk_that_is_full_leaves_the_survey_as_it_was(
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml"}
 
 
+def test_a_survey_that_cannot_be_checked_for_a_full_disk_is_refused(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offer, content = offer_of(SURVEY, survey, 3)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    with pytest.raises(Refused, match=r"shared\.toml: cannot be checked, for want of a temporary file: No such file"):
+        place(offer, content, settings(tmp_path), None)
+
+
 def test_a_map_is_what_the_next_start_takes(tmp_path: Path, shared_map: Path) -> None:
     given = settings(tmp_path)
     maps = Path(given.map.folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from daemon.surveyfile import dump, read_survey
 from estimator.lamps import Lamp, Survey
 from taps.fleet import messages
 from taps.fleet.fetch import Fetcher
-from taps.fleet.placing import MAP, SURVEY, Records, offer_of
+from taps.fleet.placing import MAP, SURVEY, Offer, Records, offer_of
 from taps.fleet.share import key_of, share
 from taps.zenohlink import config
 from tests.daemon import mapmaker
@@ -94,6 +95,27 @@ def test_what_comes_damaged_is_refused(tmp_path: Path, survey: Path, capsys: pyt
     assert one.failed
     assert "is not what was announced" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml"}
+
+
+def test_what_the_sender_writes_does_not_reach_the_terminal_as_orders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = b'"\\u001b[2J" = 1\n'
+    digest = hashlib.sha256(content).hexdigest()
+    offer = Offer(kind=SURVEY, name="\x1b[2Jx", version=7, sha256=digest, size=len(content))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for key, told in ((key_of(SURVEY), messages.encode(offer)), (key_of(SURVEY, digest), content)):
+                if query.key_expr.intersects(key):
+                    query.reply(key, told)
+
+    with router() as made, zenoh.open(config("client", made.address)) as session:
+        session.declare_queryable("lumiloop/@shared/**", answer)
+        asyncio.run(fetcher(made, tmp_path).run())
+    said = capsys.readouterr().err
+    assert "unknown key" in said
+    assert "\x1b" not in said
 
 
 def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
