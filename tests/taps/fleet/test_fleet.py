@@ -218,6 +218,11 @@ def test_a_robot_waits_for_a_router_and_a_daemon(tmp_path: Path, capsys: pytest.
         with served(tmp_path / "s"):
             await until(lambda: roster.members["agv"].localised)
         await until(lambda: not roster.members["agv"].state.up)  # type: ignore[union-attr]
+        assert not roster.members["agv"].localised
+        late = Roster()
+        await beside(until(lambda: "agv" in late.members and late.members["agv"].pose), looking(made, late))
+        assert late.members["agv"].place == (1.0, 2.0, 3.0)
+        assert late.members["agv"].pose.agvPosition["positionInitialized"] is False  # type: ignore[union-attr,index]
 
     with router() as made:
         made.end()
