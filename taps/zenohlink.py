@@ -24,6 +24,8 @@ from hal.beside import beside
 
 LEASE_S: Final = 5.0
 """Who has been silent for so long is gone, for the other side; who does not answer so long is not there."""
+MOST_BYTES: Final = 257 << 20
+"""No message is larger: the largest map that a fleet shares, and its key. Zenoh's own limit is four times that."""
 RETRY_S: Final = 1.0
 CLOSE_S: Final = 2.0
 BEAT_S: Final = 0.5
@@ -72,6 +74,7 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             f"{side}/endpoints": [locator(endpoint)],
             "scouting/multicast/enabled": False,
             "timestamping/enabled": True,  # the caches for those who come late need it
+            "transport/link/rx/max_message_size": MOST_BYTES,
             "transport/link/tx/lease": round(1e3 * LEASE_S),
             "transport/unicast/open_timeout": round(1e3 * LEASE_S),
         }.items():
