@@ -22,7 +22,7 @@ from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import Roster
 from taps.stream import Stream
-from taps.zenohlink import config, joined
+from taps.zenohlink import BadEndpoint, config, joined
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 from tests.taps.serving import served
 
@@ -288,7 +288,8 @@ def in_a_loop_of_its_own(words: list[str]) -> int:
     ("words", "said"),
     [
         (["fleet", "--router", "nohost"], "Expected `host:port`"),
-        (["fleet", "--router", "nothing/x"], "no Zenoh router answers"),
+        (["fleet", "--router", "nothing/x"], "'nothing' is no protocol; there are tcp, tls"),
+        (["fleet", "--router", "tcp/127.0.0.1:1"], "waiting for it (Unable to connect"),
         (["fleet", "join", "--router", "a b:1"], "Expected `host:port`"),
         (["ros2", "--namespace", "agv-1"], "--namespace: Expected a namespace"),
         (["fleet", "share"], "say what to share"),
@@ -300,7 +301,7 @@ def in_a_loop_of_its_own(words: list[str]) -> int:
 def test_what_cannot_be_is_said(
     words: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if "nothing/x" in words:
+    if "tcp/127.0.0.1:1" in words:
         monkeypatch.setattr("taps.zenohlink.RETRY_S", -1.0)
         monkeypatch.setattr(asyncio, "sleep", interrupted)
     try:
@@ -315,6 +316,18 @@ def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixtur
     with pytest.raises(SystemExit):
         cli.main(["ros2", "--domain", "-1"])
     assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(None, "cannot be read: No such file"), ("rubbish", "no certificate or")]
+)
+def test_a_certificate_that_is_none_is_said_and_not_waited_for(tmp_path: Path, content: str | None, said: str) -> None:
+    pem, file = tmp_path / "ca.pem", tmp_path / "zenoh.json5"
+    file.write_text(json.dumps({"transport": {"link": {"tls": {"root_ca_certificate": str(pem)}}}}))
+    if content is not None:
+        pem.write_text(content)
+    with pytest.raises(BadEndpoint, match=said):
+        config("client", "tls/localhost:1", file)
 
 
 async def interrupted(seconds: float) -> None:
