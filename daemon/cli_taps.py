@@ -14,6 +14,8 @@ from daemon import cli
 from daemon.extras import how_to_install
 
 Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
+MOST_DOMAIN = 232
+"""The ports of a larger one would be beyond 65535 (DDS)."""
 OURS = ("daemon", "estimator", "hal", "taps")
 
 
@@ -51,7 +53,7 @@ def _foxglove(parser: argparse.ArgumentParser) -> None:
 
 
 def _ros2(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--domain", type=int, default=0, metavar="N", help="ROS_DOMAIN_ID; default: 0")
+    parser.add_argument("--domain", type=_domain, default=0, metavar="N", help="ROS_DOMAIN_ID; default: 0")
     parser.add_argument(
         "--namespace", default="", metavar="NAME", help="before every topic, as in /agv1; default: none"
     )
@@ -104,6 +106,13 @@ def _meeting(parser: argparse.ArgumentParser) -> None:
         "--router", default="127.0.0.1:7447", metavar="HOST:PORT", help="Zenoh router; default: %(default)s"
     )
     parser.add_argument("--zenoh", type=Path, metavar="FILE", help="Zenoh's own configuration: certificates, rights")
+
+
+def _domain(text: str) -> int:
+    number = int(text)
+    if not 0 <= number <= MOST_DOMAIN:
+        raise argparse.ArgumentTypeError(f"{text}: ROS 2 has domains 0 to {MOST_DOMAIN}")
+    return number
 
 
 def _hertz(text: str) -> float:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +37,9 @@ BLOCK_BYTES: Final = 1 << 18
 DTYPES: Final = ("|u1", "<i4", "<i8", "<f4", "<f8")
 MOST_BYTES: Final = 1 << 31
 """No map is larger; a table that says otherwise is damaged."""
+SMALL_BYTES: Final = 64 << 20
+MOST_RATIO: Final = 32
+"""Of more than `SMALL_BYTES`, no map is so much smaller when packed (measured: 2 times); zlib can do 1000."""
 SORTED, DIFFERENCES = 1, 2
 LEVEL: Final = 1
 """Of zlib: higher ones take five times as long for a twentieth less."""
@@ -96,8 +99,8 @@ def _checksum(version: int, table: bytes) -> int:
     return zlib.crc32(table, version)
 
 
-def unpack(data: bytes) -> dict[str, AnyArray]:
-    """The arrays of a file, each of its own memory.
+def unpack(data: bytes, known: Container[str] | None = None) -> dict[str, AnyArray]:
+    """The arrays of a file, each of its own memory; ``known``: names that there may be, None: any.
 
     Raises:
         Foreign: not a map file. Newer: of a version to come. Damaged: anything else; names the place.
@@ -106,6 +109,7 @@ def unpack(data: bytes) -> dict[str, AnyArray]:
     table = data[HEAD.size : HEAD.size + count * ROW.size]
     if len(table) != count * ROW.size or _checksum(version, table) != crc:
         raise Damaged("its table of contents is damaged (checksum)")
+    _bounded(table, len(data), known)
     at, arrays = HEAD.size + len(table), {}
     for name, dtype, columns, rows, length, crc, packing in ROW.iter_unpack(table):
         title = name.rstrip(b"\0").decode("ascii", "replace")
@@ -117,6 +121,18 @@ def unpack(data: bytes) -> dict[str, AnyArray]:
     if at != len(data):
         raise Damaged(f"{len(data) - at} bytes follow its last part")
     return arrays
+
+
+def _bounded(table: bytes, packed: int, known: Container[str] | None) -> None:
+    """Whether what the table promises may be unpacked at all, before any of it is."""
+    size = 0
+    for name, dtype, columns, rows, *_ in ROW.iter_unpack(table):
+        title, kind = name.rstrip(b"\0").decode("ascii", "replace"), dtype.decode("ascii", "replace").rstrip("\0")
+        if known is not None and title not in known:
+            raise Damaged(f"the part {title!r} is none of version {VERSION}")
+        size += rows * max(1, columns) * (np.dtype(kind).itemsize if kind in DTYPES else 1)
+    if size > min(MOST_BYTES, max(SMALL_BYTES, MOST_RATIO * packed)):
+        raise Damaged(f"its {packed} bytes are said to unpack to {size}: no map is packed so well")
 
 
 def _head(data: bytes) -> tuple[int, int, int]:

@@ -122,7 +122,7 @@ def read(content: bytes) -> Stored:
     Raises:
         BadMap: it cannot be used; the text says why.
     """
-    tables = unpack(content)
+    tables = unpack(content, KINDS)
     meta = _meta(tables)
     check(tables)
     keep = main_part(tables)

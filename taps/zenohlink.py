@@ -24,6 +24,9 @@ from hal.beside import beside
 
 LEASE_S: Final = 5.0
 """Who has been silent for so long is gone, for the other side; who does not answer so long is not there."""
+MOST_BYTES: Final = 257 << 20
+"""No message is larger: the largest map that a fleet shares, and its key. Zenoh's own limit is four times that."""
+PROTOCOLS: Final = ("tcp", "tls", "quic", "udp", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 RETRY_S: Final = 1.0
 CLOSE_S: Final = 2.0
 BEAT_S: Final = 0.5
@@ -45,6 +48,8 @@ def locator(text: str) -> str:
         BadEndpoint: it is neither.
     """
     if "/" in text:
+        if (protocol := text.partition("/")[0]) not in PROTOCOLS:
+            raise BadEndpoint(f"{text}: {protocol!r} is no protocol; there are {', '.join(PROTOCOLS)}")
         return text
     try:
         host, port = parse_endpoint(text)
@@ -72,13 +77,31 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             f"{side}/endpoints": [locator(endpoint)],
             "scouting/multicast/enabled": False,
             "timestamping/enabled": True,  # the caches for those who come late need it
+            "transport/link/rx/max_message_size": MOST_BYTES,
             "transport/link/tx/lease": round(1e3 * LEASE_S),
             "transport/unicast/open_timeout": round(1e3 * LEASE_S),
         }.items():
             made.insert_json5(key, json.dumps(value))
+        _check_files(made)
     except zenoh.ZError as error:
         raise BadEndpoint(f"{endpoint if file is None else f'{endpoint}, {file}'}: {words(error)}") from None
     return made
+
+
+def _check_files(made: zenoh.Config) -> None:
+    """Whether certificates and keys are there and are such: of those, Zenoh says only that it cannot connect.
+
+    Raises:
+        BadEndpoint: one is not.
+    """
+    for key, path in json.loads(made.get_json("transport/link/tls")).items():
+        if isinstance(path, str) and key.endswith(("certificate", "private_key")):
+            try:
+                content = Path(path).read_bytes()
+            except OSError as error:
+                raise BadEndpoint(f"{path} ({key}): cannot be read: {error.strerror}") from None
+            if b"-----BEGIN " not in content:
+                raise BadEndpoint(f"{path} ({key}): no certificate or key in PEM form")
 
 
 def words(error: Exception) -> str:
@@ -101,9 +124,9 @@ async def joined(router: str, file: Path | None = None, say: Say = cli.say) -> A
         try:
             session = await beside(partial(zenoh.open, made), "zenoh")
             break
-        except zenoh.ZError:
+        except zenoh.ZError as error:
             if not said:
-                say(f"no Zenoh router answers at {router}; waiting for it")
+                say(f"no Zenoh router answers at {router}; waiting for it ({words(error)})")
                 said = True
             await asyncio.sleep(RETRY_S)
     if said:

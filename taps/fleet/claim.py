@@ -7,6 +7,7 @@ name: the least token has the word then (`messages.instance_of`), the other one 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import Final
 
@@ -36,16 +37,16 @@ class Claim:
     ) -> None:
         self.mine = False
         self._session, self._robot, self._host, self._on_change, self._say = session, robot, host, on_change, say
-        self._others: set[str] = set()
+        self._others: dict[str, bool] = {}  # whether it is there, as heard last
         self._token: zenoh.LivelinessToken | None = None
         self._instance = ""
         self._listening: zenoh.Subscriber[None] | None = None
 
     async def run(self) -> None:
         """Have the name whenever nobody else has it, until cancelled."""
-        await self._begin()
         alone = 0.0
         try:
+            await self._begin()
             while True:
                 await asyncio.sleep(BEAT_S)
                 free = not self._before() and bool(self._session.info.routers_zid())
@@ -60,30 +61,33 @@ class Claim:
     async def _begin(self) -> None:
         """Who is there already is before us, whatever clocks say."""
         everybody = messages.alive(self._robot, "*")
-        self._others = {name.rpartition("/")[2] for name in await listed(self._session, everybody)}
-        after = max((messages.claimed_of(one) + 1 for one in self._others), default=0)
-        claimed = max(after, messages.now_ms())
-        self._instance = messages.instance_of(str(self._session.info.zid()), self._host, claimed)
         loop = asyncio.get_running_loop()
 
         def heard(sample: zenoh.Sample) -> None:
             there = sample.kind == zenoh.SampleKind.PUT
             instance = str(sample.key_expr).rpartition("/")[2]
-            loop.call_soon_threadsafe(self._heard, instance, there)
+            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody claims it any more
+                loop.call_soon_threadsafe(self._heard, instance, there)
 
-        self._settle(not self._before())
+        # before the list is asked for: who leaves in the meantime would be in it for ever
         self._listening = self._session.liveliness().declare_subscriber(everybody, heard, history=True)
+        for name in await listed(self._session, everybody):
+            self._others.setdefault(name.rpartition("/")[2], True)
+        there = [one for one, is_there in self._others.items() if is_there]
+        claimed = max([messages.now_ms(), *(messages.claimed_of(one) + 1 for one in there)])
+        self._instance = messages.instance_of(str(self._session.info.zid()), self._host, claimed)
+        self._settle(not self._before())
 
     def _heard(self, instance: str, there: bool) -> None:
         if instance == self._instance:
             return
-        (self._others.add if there else self._others.discard)(instance)
+        self._others[instance] = there
         if self.mine and self._before():
             self._settle(False)
 
     def _before(self) -> str:
         """Who has the name before us; empty: nobody."""
-        first = min(self._others, default="")
+        first = min((one for one, there in self._others.items() if there), default="")
         return first if first and first < self._instance else ""
 
     def _settle(self, mine: bool) -> None:

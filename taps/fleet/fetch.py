@@ -14,10 +14,11 @@ import zenoh
 
 from daemon import cli
 from daemon.publish.client import NoAnswer, address_of
+from daemon.wholefile import reason_of
 from hal.serving import work_until_told
 from taps.fleet import messages
-from taps.fleet.messages import SHARED, Unreadable
-from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, chosen, place, sha256_of
+from taps.fleet.messages import SHARED, Unreadable, printable
+from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, Taken, chosen, home, place, sha256_of
 from taps.fleet.share import key_of
 from taps.view.orders import OrderRefused, switch_map
 from taps.zenohlink import BadEndpoint, answers, joined, watched
@@ -96,7 +97,7 @@ class Fetcher:
                 said, self.failed = str(error), True
             if said != self._said.get(kind):
                 self._said[kind] = said
-                cli.say(said)
+                cli.say(printable(said))  # who shares has chosen some of the words
 
     async def _fetch(self, session: zenoh.Session, kind: str, modbus: tuple[str, int] | None) -> str:
         """What came of it.
@@ -104,20 +105,41 @@ class Fetcher:
         Raises:
             Refused: nothing came, or it is not taken.
         """
-        held = self._records.held().get(kind)
-        offer = chosen(kind, await self._offers(session, kind), held)
-        if offer is None:
-            assert held is not None
-            return f"{kind} version {held.version} is here already"
         survey: Path | None = self._args.survey
+        taken = self._records.taken().get(kind)
+        if taken is not None and taken.kept_in() != home(kind, self._args.settings, survey):
+            taken = None  # it has been deleted, or is wanted elsewhere now
+        offer = chosen(kind, await self._offers(session, kind), taken)
+        if offer is None:
+            assert taken is not None
+            said = f"{kind} version {taken.version} is here already"
+            if kind == MAP and modbus is not None and not taken.switched:
+                said = f"{said}; {await self._switch(modbus, taken)}"
+            return said
         where, note = place(offer, await self._content(session, offer), self._args.settings, survey)
         try:
-            self._records.note(offer)
+            taken = self._records.note(offer, where)
         except OSError as error:
-            raise Refused(f"{self._records.path}: {error.strerror}; {where} is in place all the same") from None
+            raise Refused(f"{self._records.path}: {reason_of(error)}; {where} is in place all the same") from None
         if kind == MAP and modbus is not None:
-            note = await switched(modbus, offer.map_id)
+            try:
+                note = await self._switch(modbus, taken)
+            except Refused as error:
+                raise Refused(f"{offer.said()} is in {where}; {error}") from None
         return f"{offer.said()} is in {where}; {note}"
+
+    async def _switch(self, modbus: tuple[str, int], taken: Taken) -> str:
+        """Have the daemon go on in the map, and note it: until then it is asked again at every call.
+
+        Raises:
+            Refused: it does not, or that cannot be noted.
+        """
+        await switched(modbus, taken.map_id)
+        try:
+            self._records.switched(taken)
+        except OSError as error:
+            raise Refused(f"{self._records.path}: {reason_of(error)}; the daemon goes on in it all the same") from None
+        return "the daemon goes on in it"
 
     async def _offers(self, session: zenoh.Session, kind: str) -> list[Offer]:
         """What is shared; who shares may just be coming back, as after a router's restart."""
@@ -127,7 +149,7 @@ class Fetcher:
                 try:
                     offers.append(messages.read(content, Offer))
                 except Unreadable as error:
-                    cli.say(f"what is offered as {kind} is not one: {error}")
+                    cli.say(printable(f"what is offered as {kind} is not one: {error}"))
             if offers or not left:
                 break
             await asyncio.sleep(PAUSE_S)
@@ -144,12 +166,15 @@ class Fetcher:
         raise Refused(f"{offer.said()}: is announced, and does not come; is the connection to who shares it broken?")
 
 
-async def switched(modbus: tuple[str, int], map_id: int) -> str:
-    """Ask the daemon to go on in the map; what came of it."""
+async def switched(modbus: tuple[str, int], map_id: int) -> None:
+    """Ask the daemon to go on in the map.
+
+    Raises:
+        Refused: it does not, or cannot be asked.
+    """
     try:
         outcome = await switch_map(*modbus, map_id)
     except OrderRefused as error:
-        return f"the daemon could not be asked to go on in it: {error}"
-    if outcome == "done":
-        return "the daemon goes on in it"
-    return f"the daemon was asked to go on in it: {outcome}; its log says why"
+        raise Refused(f"the daemon could not be asked to go on in it: {error}") from None
+    if outcome != "done":
+        raise Refused(f"the daemon was asked to go on in it: {outcome}; its log says why")

@@ -105,13 +105,34 @@ def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Surv
     Raises:
         Refused: it is none that could be used.
     """
-    with tempfile.TemporaryDirectory(prefix="lumiloop-fleet-") as folder:
-        path = Path(folder) / "survey"
-        path.write_bytes(content)
-        try:
-            return read_survey(path, profile)
-        except SurveyError as error:
-            raise Refused(str(error).replace(str(path), name)) from None
+    try:
+        with tempfile.TemporaryDirectory(prefix="lumiloop-fleet-") as folder:
+            path = Path(folder) / "survey"
+            path.write_bytes(content)
+            try:
+                return read_survey(path, profile)
+            except SurveyError as error:
+                raise Refused(str(error).replace(str(path), name)) from None
+    except OSError as error:
+        raise Refused(f"{name}: cannot be checked, for want of a temporary file: {reason_of(error)}") from None
+
+
+class Taken(Held, frozen=True):
+    """What has been put to its place, ``path``; ``switched``: the daemon has gone on in it when asked."""
+
+    path: str = ""
+    map_id: int = 0
+    switched: bool = False
+
+    def kept_in(self) -> Path | None:
+        """The survey's file, or the folder of maps, if it is still there; a daemon renames the map with every save."""
+        path = Path(self.path)
+        if not self.path or not self.map_id:
+            return path if self.path and path.exists() else None
+        with contextlib.suppress(OSError):
+            if any(one.map_id == self.map_id for one in Store(path.parent, mend=False).generations()):
+                return path.parent
+        return None
 
 
 class Records:
@@ -119,26 +140,43 @@ class Records:
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or state_folder() / RECORD
-        self._read: tuple[int, dict[str, Held]] = -1, {}
+        self._read: tuple[int, dict[str, Taken]] = -1, {}
 
-    def held(self) -> dict[str, Held]:
-        """By kind; empty where there is none, or the file cannot be read."""
+    def taken(self) -> dict[str, Taken]:
+        """By kind, as noted; empty where there is none, or the file cannot be read."""
         try:
             changed = self.path.stat().st_mtime_ns
         except OSError:
             return {}
         if changed != self._read[0]:
-            found: dict[str, Held] = {}
+            found: dict[str, Taken] = {}
             with contextlib.suppress(OSError, msgspec.DecodeError, UnicodeDecodeError):
-                found = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Held])
+                found = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Taken])
             self._read = changed, found
         return self._read[1]
 
-    def note(self, offer: Offer) -> None:
-        """It has been taken; raises `OSError`."""
+    def held(self) -> dict[str, Held]:
+        """What of it is still in its place, for the fleet."""
+        return {
+            kind: Held(one.version, one.sha256, one.name)
+            for kind, one in self.taken().items()
+            if one.kept_in() is not None
+        }
+
+    def note(self, offer: Offer, where: Path) -> Taken:
+        """It has been put there; raises `OSError`."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        held = {**self.held(), offer.kind: Held(offer.version, offer.sha256, offer.name)}
-        write_whole(self.path, msgspec.json.format(msgspec.json.encode(held), indent=2) + b"\n")
+        one = Taken(offer.version, offer.sha256, offer.name, str(where.absolute()), offer.map_id)
+        self._write(offer.kind, one)
+        return one
+
+    def switched(self, one: Taken) -> None:
+        """The daemon goes on in that map; raises `OSError`."""
+        self._write(MAP, msgspec.structs.replace(one, switched=True))
+
+    def _write(self, kind: str, one: Taken) -> None:
+        taken = {**self.taken(), kind: one}
+        write_whole(self.path, msgspec.json.format(msgspec.json.encode(taken), indent=2) + b"\n")
 
 
 def chosen(kind: str, offers: list[Offer], held: Held | None) -> Offer | None:
@@ -192,18 +230,29 @@ def place(offer: Offer, content: bytes, settings: Config, survey: Path | None) -
         if map_id != offer.map_id:
             raise Refused(f"{offer.said()}: holds map {map_id:08x}, not {offer.map_id:08x} as announced")
         return place_map(content, map_id, settings)
-    where = survey or (Path(settings.lights.survey) if settings.lights.survey else None)
-    if where is None:
-        raise Refused("where should the survey go? set `lights.survey`, or name a file with --survey FILE")
+    where = home(SURVEY, settings, survey)
     profile = PROFILES[settings.photodiode.profile]
     return place_survey(survey_in(content, offer.name, profile), where)
 
 
+def home(kind: str, settings: Config, survey: Path | None) -> Path:
+    """Where it goes: the survey's file, or the folder of maps; ``survey``: as the command line names it.
+
+    Raises:
+        Refused: nobody has said so.
+    """
+    if kind == MAP:
+        if not settings.map.kept:
+            raise Refused("maps are not kept: `map.folder` is none")
+        return maps_folder(settings.map.folder).absolute()
+    if survey is None and not settings.lights.survey:
+        raise Refused("where should the survey go? set `lights.survey`, or name a file with --survey FILE")
+    return (survey or Path(settings.lights.survey)).absolute()
+
+
 def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]:
     """As the newest generation in the folder of maps, where the next start takes it."""
-    if not settings.map.kept:
-        raise Refused("maps are not kept: `map.folder` is none")
-    store = Store(maps_folder(settings.map.folder), mend=False)
+    store = Store(home(MAP, settings, None), mend=False)
     try:
         return keep(settings, content, map_id), "the next start goes on in it"
     except BadMap as error:

@@ -131,6 +131,7 @@ class Robot:
         self._tiles = Tiles()
         self._heard = self._stated = self._drawn = -math.inf
         self._seq = -1
+        self._lost = False
         self._said: StateTold | None = None
         self._name: tuple[int, str] = 0, ""
 
@@ -155,17 +156,14 @@ class Robot:
         """Tell what is due."""
         now = time.monotonic()
         stands = now - self._heard > OLD_S
-        if (pose := self._pose) is not None and not stands and pose.seq != self._seq:
-            self._seq = pose.seq
-            at = position_v2(pose, self._held, self._map_name(pose.map_id))
-            told = PoseTold(
-                seq=pose.seq,
-                t_utc=pose.utc(pose.t_mono),
-                agvPosition=at,
-                velocity=pose.velocity,
-                covariance=pose.covariance,
-            )
-            self._voice.say("pose", messages.encode(told))
+        if (pose := self._pose) is not None and not stands:
+            if pose.seq != self._seq:
+                self._seq, self._lost = pose.seq, False
+                self._tell(pose)
+        elif (held := self._held) is not None and not self._lost:
+            # what was told last is given to who comes late: it must not say that the robot knows its place
+            self._seq, self._lost = -1, True
+            self._tell(msgspec.structs.replace(held, pose=None, covariance=None, velocity=None))
         state = self._state(stands)
         since = now - self._stated
         if (
@@ -178,6 +176,16 @@ class Robot:
         if self._tiles.fresh and now - self._drawn >= MAP_S:
             self._drawn = now
             self._draw()
+
+    def _tell(self, pose: Pose) -> None:
+        told = PoseTold(
+            seq=pose.seq,
+            t_utc=pose.utc(pose.t_mono),
+            agvPosition=position_v2(pose, self._held, self._map_name(pose.map_id)),
+            velocity=pose.velocity,
+            covariance=pose.covariance,
+        )
+        self._voice.say("pose", messages.encode(told))
 
     def _state(self, stands: bool) -> StateTold:
         if self._pose is None or stands:

@@ -60,7 +60,8 @@ class Member:
     def localised(self) -> bool:
         """Whether it knows its place, and tells it."""
         at = self.pose.agvPosition if self.pose is not None else None
-        return bool(self.speakers) and at is not None and at.get("positionInitialized") is True
+        up = self.state is None or self.state.up
+        return bool(self.speakers) and up and at is not None and at.get("positionInitialized") is True
 
 
 class Roster:

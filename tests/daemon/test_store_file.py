@@ -256,3 +256,17 @@ def test_parts_that_only_light_joins_are_one_map() -> None:
     stored = read(packed(made, meta_of(made, 0.0, "", "")))
     assert stored.isolated == 0
     assert len(stored.tables["submap.key"]) == 8
+
+
+def test_a_small_file_that_says_it_is_huge_is_refused_before_it_is_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
+    huge = np.zeros(40 << 20, np.uint8)
+    data = store_file.pack({"beam": huge, "frame.lit": huge})
+    monkeypatch.setattr(store_file, "_array", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(BadMap, match="are said to unpack to 83886080: no map is packed so well"):
+        store_file.unpack(data)
+
+
+def test_a_part_that_no_map_has_is_refused() -> None:
+    data = store_file.pack({**store_file.unpack(content()), "more": np.zeros(3)})
+    with pytest.raises(BadMap, match="the part 'more' is none of version 1"):
+        read(data)

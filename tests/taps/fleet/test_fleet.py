@@ -15,12 +15,14 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
 from daemon import cli
+from taps import zenohlink
 from taps.fleet import messages, robot, show
+from taps.fleet.claim import Claim
 from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import Roster
 from taps.stream import Stream
-from taps.zenohlink import config, joined
+from taps.zenohlink import BadEndpoint, config, joined
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 from tests.taps.serving import served
 
@@ -157,6 +159,28 @@ def test_of_two_that_have_spoken_the_first_keeps_the_name(
         asyncio.run(beside(body(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
 
 
+def test_who_leaves_while_the_name_is_asked_for_does_not_keep_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taps.fleet.claim.ALONE_S", 1.0)
+    mine: list[bool] = []
+
+    async def body(made: Router) -> None:
+        async with joined(made.address) as session, joined(made.address) as other:
+            token = other.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
+            await asyncio.sleep(0.2)
+
+            async def listed(*asked: Any) -> list[str]:
+                found = await zenohlink.listed(*asked)
+                token.undeclare()
+                await asyncio.sleep(0.3)
+                return found
+
+            monkeypatch.setattr("taps.fleet.claim.listed", listed)
+            await beside(until(lambda: mine[-1:] == [True], 5.0), Claim(session, "agv", "here", mine.append).run())
+
+    with router() as made:
+        asyncio.run(body(made))
+
+
 def test_a_router_that_dies_is_said_and_all_go_on_when_it_is_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -194,6 +218,11 @@ def test_a_robot_waits_for_a_router_and_a_daemon(tmp_path: Path, capsys: pytest.
         with served(tmp_path / "s"):
             await until(lambda: roster.members["agv"].localised)
         await until(lambda: not roster.members["agv"].state.up)  # type: ignore[union-attr]
+        assert not roster.members["agv"].localised
+        late = Roster()
+        await beside(until(lambda: "agv" in late.members and late.members["agv"].pose), looking(made, late))
+        assert late.members["agv"].place == (1.0, 2.0, 3.0)
+        assert late.members["agv"].pose.agvPosition["positionInitialized"] is False  # type: ignore[union-attr,index]
 
     with router() as made:
         made.end()
@@ -259,7 +288,8 @@ def in_a_loop_of_its_own(words: list[str]) -> int:
     ("words", "said"),
     [
         (["fleet", "--router", "nohost"], "Expected `host:port`"),
-        (["fleet", "--router", "nothing/x"], "no Zenoh router answers"),
+        (["fleet", "--router", "nothing/x"], "'nothing' is no protocol; there are tcp, tls"),
+        (["fleet", "--router", "tcp/127.0.0.1:1"], "waiting for it (Unable to connect"),
         (["fleet", "join", "--router", "a b:1"], "Expected `host:port`"),
         (["ros2", "--namespace", "agv-1"], "--namespace: Expected a namespace"),
         (["fleet", "share"], "say what to share"),
@@ -271,7 +301,7 @@ def in_a_loop_of_its_own(words: list[str]) -> int:
 def test_what_cannot_be_is_said(
     words: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if "nothing/x" in words:
+    if "tcp/127.0.0.1:1" in words:
         monkeypatch.setattr("taps.zenohlink.RETRY_S", -1.0)
         monkeypatch.setattr(asyncio, "sleep", interrupted)
     try:
@@ -280,6 +310,24 @@ def test_what_cannot_be_is_said(
         code = cli.INTERRUPTED
     assert code != cli.OK
     assert said in capsys.readouterr().err
+
+
+def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["ros2", "--domain", "-1"])
+    assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(None, "cannot be read: No such file"), ("rubbish", "no certificate or")]
+)
+def test_a_certificate_that_is_none_is_said_and_not_waited_for(tmp_path: Path, content: str | None, said: str) -> None:
+    pem, file = tmp_path / "ca.pem", tmp_path / "zenoh.json5"
+    file.write_text(json.dumps({"transport": {"link": {"tls": {"root_ca_certificate": str(pem)}}}}))
+    if content is not None:
+        pem.write_text(content)
+    with pytest.raises(BadEndpoint, match=said):
+        config("client", "tls/localhost:1", file)
 
 
 async def interrupted(seconds: float) -> None:

@@ -95,6 +95,15 @@ def test_a_disk_that_is_full_leaves_the_survey_as_it_was(
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml"}
 
 
+def test_a_survey_that_cannot_be_checked_for_a_full_disk_is_refused(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offer, content = offer_of(SURVEY, survey, 3)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    with pytest.raises(Refused, match=r"shared\.toml: cannot be checked, for want of a temporary file: No such file"):
+        place(offer, content, settings(tmp_path), None)
+
+
 def test_a_map_is_what_the_next_start_takes(tmp_path: Path, shared_map: Path) -> None:
     given = settings(tmp_path)
     maps = Path(given.map.folder)
@@ -184,13 +193,18 @@ def test_the_newest_is_taken_once() -> None:
 def test_what_was_taken_is_noted_and_a_spoilt_note_is_none(tmp_path: Path) -> None:
     records = Records(tmp_path / "state" / RECORD)
     assert records.held() == {}
-    records.note(OFFER)
-    records.note(msgspec.structs.replace(OFFER, kind=MAP, version=2))
+    lights, hall = tmp_path / "lights.toml", tmp_path / "maps" / "map-00000077-00000001.lumimap"
+    records.note(OFFER, lights)
+    records.note(msgspec.structs.replace(OFFER, kind=MAP, version=2, map_id=0x77), hall)
     again = Records(records.path)
+    assert again.held() == {}  # noted, but there are no such files
+    lights.touch()
+    hall.parent.mkdir()
+    hall.with_name("map-00000077-00000009.lumimap").touch()  # as the daemon has saved it since
     assert again.held() == {SURVEY: Held(7, "aa", "lights.toml"), MAP: Held(2, "aa", "lights.toml")}
     records.path.write_bytes(b'{"survey": 7}')
     os.utime(records.path, ns=(1, 1))
-    assert again.held() == {}
+    assert again.taken() == {}
 
 
 def test_a_version_is_when_the_file_was_changed(survey: Path) -> None:

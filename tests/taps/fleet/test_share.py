@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from daemon.surveyfile import dump, read_survey
 from estimator.lamps import Lamp, Survey
 from taps.fleet import messages
 from taps.fleet.fetch import Fetcher
-from taps.fleet.placing import MAP, SURVEY, Records, offer_of
+from taps.fleet.placing import MAP, SURVEY, Offer, Records, offer_of
 from taps.fleet.share import key_of, share
 from taps.zenohlink import config
 from tests.daemon import mapmaker
@@ -96,6 +97,27 @@ def test_what_comes_damaged_is_refused(tmp_path: Path, survey: Path, capsys: pyt
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml"}
 
 
+def test_what_the_sender_writes_does_not_reach_the_terminal_as_orders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = b'"\\u001b[2J" = 1\n'
+    digest = hashlib.sha256(content).hexdigest()
+    offer = Offer(kind=SURVEY, name="\x1b[2Jx", version=7, sha256=digest, size=len(content))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for key, told in ((key_of(SURVEY), messages.encode(offer)), (key_of(SURVEY, digest), content)):
+                if query.key_expr.intersects(key):
+                    query.reply(key, told)
+
+    with router() as made, zenoh.open(config("client", made.address)) as session:
+        session.declare_queryable("lumiloop/@shared/**", answer)
+        asyncio.run(fetcher(made, tmp_path).run())
+    said = capsys.readouterr().err
+    assert "unknown key" in said
+    assert "\x1b" not in said
+
+
 def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,6 +141,59 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
             assert found.read_bytes() == path.read_bytes()
             assert asked == ([("127.0.0.1", 1502, 0x77)] if wished else [])
     assert "the daemon goes on in it" in capsys.readouterr().err
+
+
+def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "hall.lumimap"
+    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    outcomes = ["refused", "refused", "done"]
+
+    async def switch(host: str, port: int, map_id: int) -> str:
+        assert map_id == 0x77
+        return outcomes.pop(0)
+
+    monkeypatch.setattr("taps.fleet.fetch.switch_map", switch)
+    with router() as made:
+        for failed, said in ((True, "is in"), (True, "refused"), (False, "here already; the daemon goes on in it")):
+            one = fetcher(made, tmp_path, what=[MAP], switch=True)
+            asyncio.run(beside(one.run(), sharing(made, map=path, version=1)))
+            assert one.failed is failed
+            assert said in capsys.readouterr().err
+        one = fetcher(made, tmp_path, what=[MAP], switch=True)  # nothing is left to be asked for
+        asyncio.run(beside(one.run(), sharing(made, map=path, version=1)))
+    assert not one.failed
+
+
+def test_what_was_deleted_or_is_wanted_elsewhere_is_fetched_again(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "hall.lumimap"
+    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+    def fetch(made: Router, **more: Any) -> str:
+        one = fetcher(made, tmp_path, what=[], **more)
+        asyncio.run(beside(one.run(), sharing(made, survey=survey, map=path, version=1)))
+        assert not one.failed
+        return capsys.readouterr().err
+
+    def maps() -> list[Path]:
+        return list((tmp_path / "state").rglob("*.lumimap"))
+
+    lights, other = tmp_path / "lights.toml", tmp_path / "other.toml"
+    with router() as made:
+        fetch(made)
+        assert fetch(made).count("is here already") == 2
+        lights.unlink()
+        maps()[0].unlink()
+        assert "here already" not in fetch(made)
+        assert lights.exists()
+        assert len(maps()) == 1
+        fetch(made, survey=other)
+        assert other.exists()
 
 
 @pytest.mark.parametrize(

@@ -10,35 +10,40 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
 from daemon.publish.holding import CommandCode, Outcome, Request
 from taps.fleet.fetch import switched
+from taps.fleet.placing import Refused
 from tests.daemon.publish.network import publishing
 from tests.taps.routers import free_port, until
 
 
-@pytest.mark.parametrize(
-    ("outcome", "said"),
-    [
-        (Outcome.DONE, "the daemon goes on in it"),
-        (Outcome.REFUSED, "asked to go on in it: refused; its log says why"),
-    ],
-)
-def test_the_map_that_was_fetched_is_asked_for(outcome: Outcome, said: str) -> None:
-    async def run() -> str:
+def ask(outcome: Outcome) -> None:
+    async def run() -> None:
         asked: list[Request] = []
         async with publishing(write=True, on_command=asked.append) as modbus:
             asking = asyncio.ensure_future(switched(("127.0.0.1", modbus.port), 0x89ABCDEF))
             await until(lambda: asked)
             assert (asked[0].code, asked[0].map_id) == (CommandCode.SWITCH_MAP, 0x89ABCDEF)
             modbus.acknowledge(asked[0].number, outcome)
-            return await asking
+            await asking
 
-    assert said in asyncio.run(run())
+    asyncio.run(run())
+
+
+def test_the_map_that_was_fetched_is_asked_for() -> None:
+    ask(Outcome.DONE)
+
+
+def test_a_daemon_that_does_not_go_on_in_it_is_a_failure() -> None:
+    with pytest.raises(Refused, match="asked to go on in it: refused; its log says why"):
+        ask(Outcome.REFUSED)
 
 
 def test_a_daemon_that_takes_no_orders_or_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def refused() -> str:
+    async def refused() -> None:
         async with publishing(write=False) as modbus:
-            return await switched(("127.0.0.1", modbus.port), 1)
+            await switched(("127.0.0.1", modbus.port), 1)
 
-    assert "set `modbus.write = true`" in asyncio.run(refused())
+    with pytest.raises(Refused, match=r"set `modbus\.write = true`"):
+        asyncio.run(refused())
     monkeypatch.setattr("taps.view.orders.TRY_S", 0.05)
-    assert "does not answer" in asyncio.run(switched(("127.0.0.1", free_port()), 1))
+    with pytest.raises(Refused, match="does not answer"):
+        asyncio.run(switched(("127.0.0.1", free_port()), 1))
