@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 
@@ -31,6 +32,9 @@ NEAR = 0.4
 
 PASS = SIZE
 """So many keyframes later the robot has come by again: 3 m of way or half a turn, well beyond what is near."""
+
+AGAIN = 8
+"""Squares that are looked at anew with each keyframe."""
 
 NOTHING = 1e-9 * np.eye(3)
 
@@ -151,9 +155,13 @@ def retire(state: State, newest: Keyframe) -> None:
 
 
 def listed(state: State, T_map: Array, newest: int) -> Iterator[tuple[int, Array]]:
-    """The newest keyframe and those about its place, with theirs; who has moved along with the map is listed anew."""
+    """The newest keyframe and those about its place, with theirs; who has moved along with the map is listed anew.
+
+    So are a few of those that have not been looked at for longest: a map that turns a little moves its far end by
+    metres, where else they would be missed on the next pass.
+    """
     about = [newest]
-    for square in squares_about(T_map):
+    for square in (*squares_about(T_map), *islice(state.places, AGAIN)):
         about += state.places.pop(square, ())
     for key in about:
         frame = state.keyframes.get(key)

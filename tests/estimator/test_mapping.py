@@ -87,3 +87,15 @@ def test_a_keyframe_that_has_moved_with_the_map_is_found_where_it_lies_now() -> 
     for _ in range(PASS + state.settings.keep):
         laid(state, np.array((1.8, 0.0, 0.0)))
     assert first.key not in state.keyframes
+
+
+def test_the_far_end_of_a_map_that_has_turned_is_not_missed_on_the_next_pass() -> None:
+    state = new_state()
+    far = [laid(state, np.array((40.0 + 0.25 * k, 0.0, 0.0))) for k in range(8)]
+    for frame in far:  # 0.03 rad about the robot, which is at the near end
+        frame.submap.T_map_submap = np.array((frame.submap.T_map_submap[0], 1.3, 0.03))
+    for k in range(20):
+        laid(state, np.array((0.5 * k, 0.0, 0.0)))
+    for k in range(8):
+        laid(state, np.array((40.0 + 0.25 * k, 1.3, 0.03)))
+    assert sum(frame.key in state.keyframes for frame in far) <= 4
