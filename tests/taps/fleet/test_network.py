@@ -5,11 +5,14 @@ The robots' streams are served by this process; what joins, shares, fetches and 
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
+import queue
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,8 +23,10 @@ import pytest
 
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
+from daemon.publish.holding import Outcome, Request
 from tests.daemon import mapmaker
 from tests.daemon.mapmaker import Shape
+from tests.daemon.publish.network import publishing
 from tests.taps.routers import free_port
 from tests.taps.serving import served
 from tests.taps.test_docs import commands
@@ -135,15 +140,41 @@ class View:
             time.sleep(0.1)
 
 
+@contextmanager
+def obedient() -> Iterator[int]:
+    """Port of a daemon's Modbus, in a thread of its own, that does what it is asked."""
+    ready: queue.SimpleQueue[tuple[int, asyncio.AbstractEventLoop, asyncio.Event]] = queue.SimpleQueue()
+
+    async def serve() -> None:
+        loop, end = asyncio.get_running_loop(), asyncio.Event()
+
+        def obey(asked: Request) -> None:
+            loop.call_soon(modbus.acknowledge, asked.number, Outcome.DONE)
+
+        async with publishing(write=True, on_command=obey) as modbus:
+            ready.put((modbus.port, loop, end))
+            await end.wait()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    port, loop, end = ready.get(timeout=10.0)
+    try:
+        yield port
+    finally:
+        loop.call_soon_threadsafe(end.set)
+        thread.join()
+
+
 def test_the_commands_of_the_documents(tmp_path: Path) -> None:
     """In their order, against a router of their own: what ends by itself ends well, the rest runs until it is told."""
     address, lasting = f"127.0.0.1:{free_port()}", []
     shutil.copy(ROOT / "systemd/lights/room-of-16.toml", tmp_path / "lights.toml")
     (tmp_path / "hall.lumimap").write_bytes(mapmaker.content(Shape(map_id=0x77)))
-    (tmp_path / "lumiloop.toml").write_text('name = "agv1"\n[lights]\nsurvey = "own.toml"\n')
     (tmp_path / "run" / "lumiloop").mkdir(parents=True)
     environment = {"XDG_STATE_HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path / "run"), "PYTHONPATH": str(ROOT)}
     with ExitStack() as stack:
+        modbus = f"[modbus]\nport = {stack.enter_context(obedient())}\nwrite = true\n"
+        (tmp_path / "lumiloop.toml").write_text(f'name = "agv1"\n{modbus}[lights]\nsurvey = "own.toml"\n')
         for name in ("agv1", "lumiloop"):
             stack.enter_context(served(tmp_path / "run" / "lumiloop" / f"{name}.stream"))
         for words in commands(ROOT / "docs" / "fleet.md"):
@@ -152,6 +183,7 @@ def test_the_commands_of_the_documents(tmp_path: Path) -> None:
             command, given = [sys.executable, "-m", "daemon", *told], {**os.environ, **environment}
             if {"router", "ros2", "join", "share", "--watch", "--follow"} & set(words):
                 running = subprocess.Popen(command, cwd=tmp_path, env=given, stdout=subprocess.DEVNULL)
+                stack.callback(running.wait)
                 stack.callback(running.kill)
                 lasting.append(running)
                 time.sleep(3.0)
