@@ -251,6 +251,7 @@ def test_odometry_over_udp_has_the_kernels_time_of_arrival() -> None:
 
     async def run() -> tuple[float, float]:
         async with publishing(write=True, on_odometry=readings.append) as publisher:
+            await asyncio.sleep(0.3)  # the kernel begins to stamp in a work queue, some time after it was asked to
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
                 sock.connect(("127.0.0.1", publisher.port))
                 for number in (1, 2):
