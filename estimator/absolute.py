@@ -21,11 +21,12 @@ import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Virtual
-from estimator.linear3 import add_turned, det3, invert3, largest_of, positive_part
+from estimator.linear3 import det3, invert3, largest_of, positive_part
 from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
+from estimator.row import doubt
 from estimator.state import State
 from estimator.trail import KEPT_S
 
@@ -51,11 +52,6 @@ TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 FAR_M, FAR_RAD = 1.5, 0.5
 """While the laser has held the pose without a break, light that disagrees by less than this is told, not followed: the
 laser does not lose so little, and light that reflects in an unusual place can be off by as much."""
-ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2
-"""Lamps that stand less than the first off a line tell the distance from that line only by how weak they are all
-together, which is what is known least: the second is then allowed for across the line, and the third for the heading,
-which is told by how that distance changes."""
-
 SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
@@ -267,10 +263,13 @@ def correct(state: State, T_map_base: Array, T_odom_base: Array) -> None:
 
 
 def virtual(state: State) -> Virtual | None:
-    """What light alone says of the place just now, None where it says nothing good."""
+    """What light alone says of the place just now, None where it says nothing good.
+
+    A row of lamps would else turn the map by what it does not know: its far end moved by metres between two laps.
+    """
     if state.light is None or state.light.result.fix is not Fix.GOOD:
         return None
-    lights = state.light.result
+    lights = across_the_row(state, state.light.result)
     moved = se2.between(pose_at(state, max(lights.t_mono, lights.t_pose)), state.fused.T_odom_base)
     return Virtual(se2.compose(lights.T_map_base, moved), lights.covariance, lights.accepted)
 
@@ -331,27 +330,13 @@ def without_heading(lights: LightsResult) -> LightsResult:
 def across_the_row(state: State, lights: LightsResult) -> LightsResult:
     """The lights' result, trusted less across the row where all lamps in use stand in one."""
     assert state.light is not None
-    lamps = state.light.filter.catalogue.by_id
-    at = [(lamps[k].x, lamps[k].y) for k in lights.accepted if k in lamps]
-    if not at:
+    more = doubt(state.light.filter.catalogue, lights.accepted)
+    if not more.any():
         return lights
-    along, across, angle = _spread(at)  # one lamp is a row both ways
-    wide, narrow = (math.exp(-variance / ROW_M**2) for variance in (along, across))
-    P = lights.covariance.copy()
-    add_turned(angle, np.array((ACROSS_M**2 * wide, ACROSS_M**2 * narrow, ACROSS_RAD**2 * narrow)), P)
+    P = lights.covariance + more
     keep = invert3(P) @ lights.covariance
     made = keep.T @ lights.gained_by  # what is told must go with what it weighs: else each wander across adds up
     return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T), gained_by=made)
-
-
-def _spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
-    """Variances of points along and across the line that fits them best, and that line's direction."""
-    n = len(at)
-    x, y = sum(p[0] for p in at) / n, sum(p[1] for p in at) / n
-    xx, yy = sum((p[0] - x) ** 2 for p in at) / n, sum((p[1] - y) ** 2 for p in at) / n
-    xy = sum((p[0] - x) * (p[1] - y) for p in at) / n
-    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    return mean + half, max(mean - half, 0.0), 0.5 * math.atan2(2.0 * xy, xx - yy)
 
 
 def blind(state: State) -> bool:

@@ -52,6 +52,7 @@ class Catalogue:
         rims: by number, what each gives at the very edge of view of a level receiver, A.
         heard: by number, when each that the survey does not name was last heard, longest ago first.
         told: by number, the frame and code last learned, the lamp they were of, and whether the survey says otherwise.
+        doubts: by numbers of lamps, what they do not tell together (`row.doubt`).
     """
 
     depth: float
@@ -63,9 +64,11 @@ class Catalogue:
     rims: dict[int, float] = field(default_factory=dict)
     heard: dict[int, float] = field(default_factory=dict)
     told: dict[int, tuple[LampFrame, int, Lamp, bool]] = field(default_factory=dict)
+    doubts: dict[frozenset[int], Array] = field(default_factory=dict)
 
     def add(self, lamp: Lamp) -> None:
         """Take a lamp in; one of the same number is replaced."""
+        self.doubts.clear()
         old = self.by_id.get(lamp.lamp_id)
         if old is not None:
             self.by_code[old.code].remove(old)
@@ -82,6 +85,7 @@ class Catalogue:
 
     def drop(self, lamp_id: int) -> None:
         """Forget a lamp that the survey does not name."""
+        self.doubts.clear()
         lamp = self.by_id.pop(lamp_id)
         self.by_code[lamp.code].remove(lamp)
         del self.rows[lamp_id], self.rims[lamp_id], self.heard[lamp_id]

@@ -16,7 +16,6 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
-from estimator.absolute import ACROSS_M, ROW_M
 from estimator.cdma_epoch import UNUSABLE
 from estimator.lamps import Lamp
 from estimator.light import Light
@@ -26,6 +25,7 @@ from estimator.lights_state import Lights, Track
 from estimator.linear3 import invert3
 from estimator.records import Array
 from estimator.result import SURPRISE, Fix, LinkState
+from estimator.row import ACROSS_M, ROW_M, spread
 from estimator.state import State
 
 CHANCE: Final = 1e-4
@@ -221,11 +221,8 @@ def beside(lights: Lights) -> float:
     """What is added to a window where the lamps in use stand in one row: the other side of it fits nearly as well."""
     lamps = lights.catalogue.by_id
     seen = () if lights.result is None else lights.result.accepted
-    at = np.array([(lamps[k].x, lamps[k].y) for k in seen if k in lamps]).reshape(-1, 2)
-    if len(at) < 2:
-        return ACROSS_M
-    narrow = float(np.linalg.eigvalsh(np.cov(at.T, bias=True))[0])
-    return ACROSS_M * math.exp(-max(narrow, 0.0) / ROW_M**2)
+    at = [(lamps[k].x, lamps[k].y) for k in seen if k in lamps]
+    return ACROSS_M * math.exp(-spread(at)[1] / ROW_M**2) if at else ACROSS_M
 
 
 def compatible(state: State, T_map_base: Array) -> bool | None:

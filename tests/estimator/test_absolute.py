@@ -13,6 +13,7 @@ from estimator import absolute, se2
 from estimator.pipeline import State, keyframe_poses, step
 from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
 from estimator.result import SURPRISE, Fix, LightsResult
+from estimator.row import doubt
 from tests.estimator.lit import Log, Truth, lit_state, play, scans, together
 from tools.sim.buildings import building
 from tools.sim.ceiling import ceiling_of
@@ -303,6 +304,28 @@ def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> No
     assert (x, y) == pytest.approx((0.04, 0.2), rel=0.05), "a correction goes with what it weighs, along and across"
     grid = absolute.across_the_row(state, lights_at(T, frozenset((1, 4, 13, 16)), state))
     assert np.sqrt(np.diag(grid.covariance)) == pytest.approx((0.05, 0.05, 0.02), abs=0.005)
+
+
+def test_what_light_says_of_a_keyframe_is_as_doubtful_across_a_row(driven: tuple[State, Log]) -> None:
+    """It anchors the map, which would be turned to and fro between two laps by what a row of lamps cannot know."""
+    state = copy.deepcopy(driven[0])
+    assert state.light is not None
+    T = driven[1].results[-1].T_map_odom
+    state.light.result = lights_at(T, frozenset((1, 2, 3, 4)), state)
+    told = absolute.virtual(state)
+    assert told is not None
+    assert np.sqrt(np.diag(told.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
+    assert told.accepted == {1, 2, 3, 4}
+
+
+def test_a_lamp_that_is_learned_anew_changes_what_its_row_does_not_tell(driven: tuple[State, Log]) -> None:
+    catalogue = copy.deepcopy(driven[0].light.filter.catalogue)  # type: ignore[union-attr]  # lit
+    row = frozenset((1, 2, 3))
+    before = doubt(catalogue, row)
+    assert before is doubt(catalogue, row)
+    catalogue.add(replace(catalogue.by_id[2], y=catalogue.by_id[2].y + 3.0))
+    assert doubt(catalogue, row)[1, 1] < 0.1 * before[1, 1]
+    assert not doubt(catalogue, frozenset((998, 999))).any()
 
 
 @pytest.mark.parametrize(("anew", "followed"), [(False, False), (True, True)])
