@@ -314,11 +314,15 @@ class Atlas:
 
     def spread(self, T_odom: Array) -> Array:
         """Covariance (odom axes, of the map's oldest submap) of a place reached from the newest submap."""
+        return self.reached(self.marginal, T_odom)
+
+    def reached(self, P_newest: Array, T_odom: Array) -> Array:
+        """The same, with ``P_newest`` for that of the newest submap."""
         newest = self.newest
         assert newest is not None
         x, y, _ = (T_odom - newest.T_odom_submap).tolist()
         F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
-        return np.asarray(F @ self.marginal @ F.T + self.C)
+        return np.asarray(F @ P_newest @ F.T + self.C)
 
     def loosen(self, P: Array, T_odom: Array) -> None:
         """Add to what the way has lost, at a place: covariance ``P`` in odom axes."""

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator import absolute, livemap, se2
+from estimator import absolute, bymap, livemap, se2
 from estimator.atlas import LOOK, SOLVE, Atlas, Ints, Waiting
 from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
@@ -232,8 +232,8 @@ def solve_graph(state: State, atlas: Atlas) -> None:
 
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
-        before, solution, ties = along(submaps, graph.poses, *payload)
-        if correct(state, atlas, submaps, before, solution):
+        before, solution, ties = along(submaps, graph.poses, *payload[:2])
+        if correct(state, atlas, submaps, before, solution, payload[2]):
             R = se2.rotation(-state.T_map_odom[2])
             atlas.tied = submaps[-1]
             turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
@@ -242,11 +242,12 @@ def solve_graph(state: State, atlas: Atlas) -> None:
     atlas.solution = atlas.ask(SOLVE, lambda: solved(graph), then)
 
 
-def solved(graph: Graph) -> tuple[Solution, Array]:
-    """The graph's solution, and how surely the newest submap lies relative to each (`tied`)."""
+def solved(graph: Graph) -> tuple[Solution, Array, bymap.Said | None]:
+    """The graph's solution, how surely the newest submap lies to each (`tied`), and what the map says of its place."""
     last = len(graph.poses) - 1
     solution = optimise(graph, MOST, SETTLED, PHI, covariance_of=last)
-    return solution, tied(graph, solution.poses, solution.trust, last)
+    ties = tied(graph, solution.poses, solution.trust, last)
+    return solution, ties, bymap.said(graph, solution, ties, (MOST, SETTLED, PHI))
 
 
 def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
@@ -316,9 +317,17 @@ def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: 
     return places, solution, np.asarray(R @ ties @ R.T)
 
 
-def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:
+def correct(
+    state: State,
+    atlas: Atlas,
+    submaps: tuple[Submap, ...],
+    before: Array,
+    solution: Solution,
+    said: bymap.Said | None = None,
+) -> bool:
     """Move the submaps to where the graph has them, and the robot with the newest one.
 
+    A robot that light holds is moved by what the map, as ``said``, knows better (`bymap`).
     Returns whether it did: a solution of what has been moved or forgotten meanwhile is thrown away, and the graph
     solved once more.
     """
@@ -340,6 +349,8 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
             submap.T_map_submap = T
     state.T_map_start = se2.compose(first, state.T_map_start)
     if held:
+        if said is not None and newest is last:
+            bymap.take(state, se2.compose(solution.poses[-1], said.T_newest_said), said.P)
         return True
     for submap in atlas.submaps.values():
         if submap.key > last.key:
