@@ -263,15 +263,20 @@ def correct(state: State, T_map_base: Array, T_odom_base: Array) -> None:
 
 
 def virtual(state: State) -> Virtual | None:
-    """What light alone says of the place just now, None where it says nothing good.
+    """What light alone says of the place just now, as far as the map may rely on it; None where it says nothing good.
 
-    A row of lamps would else turn the map by what it does not know: its far end moved by metres between two laps.
+    What it does not know it must not say: a row of lamps would turn the map to and fro, so that its far end moved by
+    metres between two laps; and without wheels the heading may have settled the wrong way round.
     """
-    if state.light is None or state.light.result.fix is not Fix.GOOD:
+    tie = state.absolute
+    if tie is None or state.light is None or state.light.result.fix is not Fix.GOOD:
         return None
+    wheels = state.fused.odometry
     lights = across_the_row(state, state.light.result)
+    lights = lights if wheels else without_heading(lights)
+    _, factor = doubted_covariance(tie, lights, wheels)
     moved = se2.between(pose_at(state, max(lights.t_mono, lights.t_pose)), state.fused.T_odom_base)
-    return Virtual(se2.compose(lights.T_map_base, moved), lights.covariance, lights.accepted)
+    return Virtual(se2.compose(lights.T_map_base, moved), factor / TRUST * lights.covariance, lights.accepted)
 
 
 def begun_anew(state: State, lights: LightsResult) -> bool:

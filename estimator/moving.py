@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.kernel import kernel
-from estimator.linear3 import add_turned, invert3, swing
+from estimator.linear3 import add_turned, invert3, largest_of, swing
 from estimator.records import Array
 
 
@@ -124,9 +124,28 @@ def times(A: Array, B: Array, out: Array) -> None:
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def no_more(P: Array, X: Array, K: Array) -> None:
+    """Scale the share ``K = X W^-1`` so that ``K W K' = X K'``, what it explains of ``P``, is no more than ``P``."""
+    explained = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            explained[i, j] = 0.0
+            for k in range(3):
+                explained[i, j] += 0.5 * (X[i, k] * K[j, k] + X[j, k] * K[i, k])
+    most = largest_of(invert3(P), explained)
+    if most > 1.0:
+        for i in range(3):
+            for j in range(3):
+                K[i, j] /= np.sqrt(most)
+
+
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1])")
 def mend_tie(P: Array, X: Array, more: Array, before: Array, after: Array, out: Array) -> None:
     """The tie's covariances after a match that has brought the pose's own from ``before`` to ``after``.
+
+    No match takes more from the tie's error than there is: scans that came late, with light in between, may have left
+    an ``X`` that says so, and a negative variance would end the daemon where its root is taken.
 
     Args:
         P: of the tie.
@@ -144,6 +163,7 @@ def mend_tie(P: Array, X: Array, more: Array, before: Array, after: Array, out: 
             out[1, i, j] = X[i, j] + more[i, j]
             gained[i, j] = wide[i, j] - after[i, j]
     times(out[1], invert3(wide), out[2])
+    no_more(out[0], out[1], out[2])
     times(out[2], gained, part)
     for i in range(3):
         for j in range(3):

@@ -56,14 +56,32 @@ def test_the_tie_grows_by_the_noise_that_the_pose_has_taken_on(rng: np.random.Ge
 
 
 def test_the_tie_is_mended_as_far_as_its_error_is_the_poses(rng: np.random.Generator) -> None:
-    P, X, before, after, out = *(covariance(rng) for _ in range(4)), np.empty((3, 3, 3))
-    more = 0.5 * before
+    before, H, out = covariance(rng), invert3(covariance(rng)), np.empty((3, 3, 3))
+    X = rng.normal(size=(3, 3)) @ before
+    P, more = X @ invert3(before) @ X.T + covariance(rng), 0.5 * before
+    after = invert3(invert3(before + more) + H)
     mend_tie(P, X, more, before, after, out)
     share = (X + more) @ invert3(before + more)
     mended = P + more - share @ (before + more - after) @ share.T
     assert out[2] == pytest.approx(share, rel=1e-9, abs=1e-9)
     assert out[0] == pytest.approx(0.5 * (mended + mended.T), rel=1e-9, abs=1e-9)
     assert out[1] == pytest.approx(share @ after, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1.001, 2.0, 1e3])
+def test_no_match_takes_more_from_the_ties_error_than_there_is(rng: np.random.Generator, scale: float) -> None:
+    """An ``X`` too large for the two covariances, as late scans may leave it; the match leaves nearly no error."""
+    before, out = covariance(rng), np.empty((3, 3, 3))
+    X = scale * rng.normal(size=(3, 3)) @ before
+    P, nothing = X @ invert3(before) @ X.T / scale**2, np.zeros((3, 3))
+    P += 1e-9 * np.eye(3)
+    mend_tie(P, X, nothing, before, 0.01 * before, out)
+    assert np.linalg.eigvalsh(out[0]).min() > -1e-9 * np.trace(P)
+    joint = np.block([[out[0], out[1]], [out[1].T, 0.01 * before]])
+    size = np.sqrt(np.diag(joint))
+    assert np.linalg.eigvalsh(joint / np.outer(size, size)).min() > -1e-6
+    share = X @ invert3(before)
+    assert out[2] == pytest.approx(share * (out[2][0, 0] / share[0, 0]), rel=1e-6, abs=1e-9), "in the same directions"
 
 
 def test_covariances_turn_hang_and_take_information_in(rng: np.random.Generator) -> None:
