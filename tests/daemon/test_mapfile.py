@@ -27,7 +27,7 @@ from estimator.keyframe import Keyframe
 from estimator.mapimage import Identity, MapImage, image_of
 from estimator.records import Array, Beam
 from tests.daemon.mapmaker import Shape, content, image
-from tests.estimator.test_closing import driven
+from tests.estimator.circuit import driven
 
 pytestmark = pytest.mark.jit
 MAP = 0xABCD

@@ -11,7 +11,7 @@ from estimator.pipeline import Settings, keyframe_poses, new_state, step
 from estimator.records import UNLIMITED, Array, Command, Order
 from estimator.submap import SIZE, Settled
 from tests.estimator.adrift import Corners, Robot, furnished, mapped, stored, way
-from tests.estimator.test_closing import driven, lay, run_jobs
+from tests.estimator.circuit import driven, lay, run_jobs
 from tools.bench._scenes import Scene, box
 
 

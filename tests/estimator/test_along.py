@@ -13,7 +13,7 @@ from estimator.closing import take_answer
 from estimator.mapframe import shift_map
 from estimator.records import Answer, Job
 from estimator.state import State
-from tests.estimator.test_closing import TOLD, driven
+from tests.estimator.circuit import TOLD, driven
 
 pytestmark = pytest.mark.jit  # whole maps
 

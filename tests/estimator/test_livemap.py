@@ -16,7 +16,7 @@ from estimator.patch import SIDE, UNIT, render
 from estimator.pipeline import Settings, new_state, render_map, step
 from estimator.records import UNLIMITED, Answer, Array, Beam, Job, Odometry, Record, Scan
 from estimator.state import State
-from tests.estimator.test_closing import circuit, drifted, lay, run_jobs
+from tests.estimator.circuit import circuit, drifted, lay, run_jobs
 from tests.estimator.world import scan_in
 from tools.bench._scenes import Scene, bearings, box
 

@@ -12,7 +12,8 @@ from estimator.closing import candidates, found_again, keyframe_laid
 from estimator.keyframe import Submap, Virtual, keep
 from estimator.loop import BLURRED, Condition, Found, Told, look_in, passed, told_by_light
 from estimator.result import LoopReason
-from tests.estimator.test_closing import HALF, SMALL, TOLD, driven, frame_at
+from tests.estimator.circuit import HALF, SMALL, TOLD, driven
+from tests.estimator.test_closing import frame_at
 from tests.estimator.world import scan_in
 from tools.bench._scenes import Scene, bearings, box, paper_room
 

@@ -17,8 +17,8 @@ from estimator.mapimage import Identity, MapImage, finished, image_of, restored
 from estimator.mapping import square_of
 from estimator.records import Odometry
 from estimator.state import State
+from tests.estimator.circuit import driven
 from tests.estimator.light_room import LAMPS, RECEIVER, Room, circle
-from tests.estimator.test_closing import driven
 
 pytestmark = pytest.mark.jit
 

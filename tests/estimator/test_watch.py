@@ -18,7 +18,7 @@ from estimator.mapimage import image_of
 from estimator.records import Answer
 from estimator.relocate import Fit, Looked, Verdict
 from estimator.state import State
-from tests.estimator.test_closing import driven, run_jobs
+from tests.estimator.circuit import driven, run_jobs
 
 
 def watched(until_m: float = 1e6) -> tuple[State, Watch, Keyframe]:
