@@ -282,6 +282,11 @@ def describe(fault: Fault, now: Vitals | None = None) -> str:
     return f"{line}: {words}" if now is not None and (words := _words(fault, now)) else line
 
 
+def describe_over(fault: Fault, seconds: float) -> str:
+    """One line for a log: a fault that is over, and how long it was there."""
+    return f"over: fault {int(fault)}: {FAULTS[fault][0]}; it lasted {seconds:.0f} s"
+
+
 def _words(fault: Fault, now: Vitals) -> str:
     """The driver's error that a fault stands for, or the lag, if it stands for one."""
     if now.error is not None and fault is _noun(now.error):

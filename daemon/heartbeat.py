@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from daemon.health import WINDOW_S, Fault, Vitals, assess, describe
+from daemon.health import WINDOW_S, Fault, Vitals, assess, describe, describe_over
 from daemon.logs import of_fault
 from daemon.notify import notify
 
@@ -42,7 +42,7 @@ class Heartbeat:
         self._statistics = statistics
         self._alive = alive
         self._samples: deque[Vitals] = deque()
-        self._seen: dict[Fault, float] = {}  # those that have been said, and when they were last present
+        self._seen: dict[Fault, tuple[float, float]] = {}  # those that have been said: when first and last present
         self._beats = 0
         self._failing = False
 
@@ -94,8 +94,10 @@ class Heartbeat:
         for fault in faults:
             if fault not in self._seen:
                 log.warning("%s", describe(fault, now), extra=of_fault(fault))
-            self._seen[fault] = now.t_mono
-        for fault in [fault for fault, t_mono in self._seen.items() if now.t_mono - t_mono >= OVER_S]:
-            del self._seen[fault]
-            log.info("over: %s", describe(fault), extra=of_fault(fault, over=True))
+            begun, _ = self._seen.get(fault, (now.t_mono, 0.0))
+            self._seen[fault] = begun, now.t_mono
+        for fault, (begun, last) in list(self._seen.items()):
+            if now.t_mono - last >= OVER_S:
+                del self._seen[fault]
+                log.info("%s", describe_over(fault, last - begun + BEAT_S), extra=of_fault(fault, over=True))
         self.faults = faults

@@ -133,8 +133,22 @@ def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: py
     assert heart.fault() == 0
     assert [record.message.split(" (")[0] for record in caplog.records] == [
         "fault 105: more than 5 % of the lidar's frames are damaged",
-        "over: fault 105: more than 5 % of the lidar's frames are damaged",
+        "over: fault 105: more than 5 % of the lidar's frames are damaged; it lasted 10 s",
     ]
+
+
+def test_what_is_over_is_said_with_how_long_it_lasted_and_nothing_is_to_be_done(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    gone = DeviceMissing("/dev/ttyACM0", "no such device", "plug it in")
+    for beat in range(30):
+        lost = 5 <= beat < 12 and beat != 8  # once back for a second: one fault all the same
+        patient.now = replace(patient.now, link=Link.WAITING if lost else Link.STREAMING, error=gone)
+        heart.beat(0.0)
+    assert caplog.messages[1:] == ["over: fault 101: the lidar is not there; it lasted 7 s"]
 
 
 def test_a_lag_between_laser_and_wheels_is_said_once_each_way_with_its_seconds(
