@@ -100,6 +100,13 @@ def test_every_fault_has_a_meaning_and_a_remedy() -> None:
     assert describe(Fault.OVERRUNS).startswith("fault 302: more than 5 % of the cycles")
 
 
+@pytest.mark.parametrize("fault", [Fault.LIDAR_LATE, Fault.ODOMETRY_GAPS])
+def test_what_is_stamped_late_may_be_stamped_at_arrival(fault: Fault) -> None:
+    text, remedy = FAULTS[fault]
+    assert "stamped late" in text
+    assert "at arrival" in remedy
+
+
 class Patient:
     """Vitals that a test sets."""
 
