@@ -80,8 +80,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.LIDAR_GAPS: ("more than 2 % of the lidar's scans are missing", "check the computer's load and the line rate"),
     Fault.LIDAR_LATE: (
         "scans arrive more than two periods after they were measured, or are all stamped late against the wheels",
-        "take load off the computer; look for a slow line, a USB hub or a network in between, and for a driver or gateway "
-        "that stamps scans at arrival, not when they were measured",
+        "take load off the computer; look for a slow line, a USB hub or a network in between, and for a driver or "
+        "gateway that stamps scans at arrival, not when they were measured",
     ),
     Fault.LIDAR_MISFIT: (
         "what the lidar measures does not fit the map where the robot must be, or anywhere after a start",
