@@ -178,7 +178,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
-        "read the log; is the port taken by another program?",
+        "read the log, which names it: is the port, or the stream's socket, taken by another program, or another daemon?",
     ),
     Fault.RECORDER_FAILED: ("the recording cannot be written", "free disk space, or name another directory"),
     Fault.MAP_NOT_SAVED: (
@@ -290,11 +290,13 @@ def describe_over(fault: Fault, seconds: float) -> str:
 
 
 def _words(fault: Fault, now: Vitals) -> str:
-    """The driver's error that a fault stands for, or the lag, if it stands for one."""
+    """The driver's error that a fault stands for, the parts that are down, or the lag, if it stands for one."""
     if now.error is not None and fault is _noun(now.error):
         return str(now.error)
     if now.adc_error is not None and fault is _adc_noun(now.adc_error):
         return str(now.adc_error)
+    if fault in (Fault.PUBLISHER_FAILED, Fault.PART_FAILED):
+        return ", ".join(sorted(_publishers(now) if fault is Fault.PUBLISHER_FAILED else _others(now)))
     late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
     return f"scans are {now.lag:+.2f} s late against the wheels" if now.lag and late else ""
 
@@ -403,7 +405,16 @@ def _outputs(now: Vitals) -> Iterable[Fault]:
     for part, fault in STORE.items():
         if part in now.failed:
             yield fault
-    if now.failed & PUBLISHERS:
+    if _publishers(now):
         yield Fault.PUBLISHER_FAILED
-    if now.failed - {"recorder", *STORE} - PUBLISHERS:
+    if _others(now):
         yield Fault.PART_FAILED
+
+
+def _publishers(now: Vitals) -> frozenset[str]:
+    return now.failed & PUBLISHERS
+
+
+def _others(now: Vitals) -> frozenset[str]:
+    """Parts that are down and have no fault of their own."""
+    return now.failed - {"recorder", *STORE} - PUBLISHERS

@@ -107,6 +107,15 @@ def test_what_is_stamped_late_may_be_stamped_at_arrival(fault: Fault) -> None:
     assert "at arrival" in remedy
 
 
+def test_what_cannot_publish_is_named() -> None:
+    now = replace(WELL, failed=frozenset(["stream", "map", "odometry"]))
+    assert describe(Fault.PUBLISHER_FAILED, now).endswith("): stream")
+    assert describe(Fault.PART_FAILED, now).endswith("): odometry")
+    both = replace(WELL, failed=frozenset(["stream", "modbus"]))
+    assert describe(Fault.PUBLISHER_FAILED, both).endswith("): modbus, stream")
+    assert "stream's socket" in FAULTS[Fault.PUBLISHER_FAILED][1]
+
+
 class Patient:
     """Vitals that a test sets."""
 
