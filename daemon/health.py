@@ -178,7 +178,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
-        "read the log, which names it: is the port, or the stream's socket, taken by another program, or another daemon?",
+        "read the log, which names it: is the port, or the stream's socket, taken by another program or daemon?",
     ),
     Fault.RECORDER_FAILED: ("the recording cannot be written", "free disk space, or name another directory"),
     Fault.MAP_NOT_SAVED: (

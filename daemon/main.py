@@ -12,6 +12,7 @@ import gc
 import logging
 import math
 import signal
+import time
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
@@ -35,7 +36,7 @@ from daemon.lights import CannotBegin, Lights, SurveyError, load_lights, new_sta
 from daemon.logs import start_log
 from daemon.mapswitch import Maps, MapSwitch, Switch, take_over
 from daemon.network import Feeds, Network
-from daemon.notify import notify
+from daemon.notify import managed, notify
 from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
@@ -74,6 +75,10 @@ QUIET_S: Final = 2.0
 """Seconds a part may take to stop: the lidar has to be told to switch its laser off."""
 EXTEND_US: Final = 30_000_000
 """Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
+ANEW_S: Final = 10.0
+"""Pause before the end of a start that came to nothing: the service manager would start anew after 0.2 s, which is for
+a crash. What was missing (a map, room for kernels or a recording) has not come by then, and each start takes seconds of
+processor time and lines of the log."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
 """States in which there is a pose to speak of."""
 
@@ -409,8 +414,17 @@ def main(args: argparse.Namespace) -> int:
         return USAGE
     except (HalError, CannotLoad, NoMap) as error:
         log.error("%s", error)
+        _wait_before_anew()
         return FAILED
     return OK
+
+
+def _wait_before_anew() -> None:
+    """Let the service manager wait where a start came to nothing; a stop ends it (SIGTERM, as its default is)."""
+    if managed():
+        notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=cannot start, see the log; tried again soon")
+        log.info("the next start is tried in %.0f s", ANEW_S)
+        time.sleep(ANEW_S)
 
 
 def _world(settings: Config) -> World:
