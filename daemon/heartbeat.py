@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from daemon.health import WINDOW_S, Fault, Vitals, assess, describe, describe_over
+from daemon.health import STALLED_PERIODS, WINDOW_S, Fault, Vitals, assess, describe, describe_over
 from daemon.logs import of_fault
 from daemon.notify import notify
 
@@ -45,6 +45,7 @@ class Heartbeat:
         self._seen: dict[Fault, tuple[float, float]] = {}  # those that have been said: when first and last present
         self._beats = 0
         self._failing = False
+        self._late = False
 
     def fault(self) -> int:
         """Number of the gravest present fault, 0 for none."""
@@ -59,7 +60,7 @@ class Heartbeat:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            due = max(due + BEAT_S, loop.time())
+            due = due + BEAT_S if loop.time() < due + BEAT_S else loop.time() + BEAT_S
             await asyncio.sleep(due - loop.time())
             try:
                 self.beat(loop.time() - due)
@@ -79,7 +80,11 @@ class Heartbeat:
         while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
             self._samples.popleft()
         worst = max(sample.lateness for sample in self._samples)
-        self._tell(now, assess(replace(now, lateness=worst), self._samples[0]))
+        found = assess(replace(now, lateness=worst), self._samples[0])
+        before, self._late = self._late, lateness > STALLED_PERIODS * now.period
+        if self._late and not before:  # what has arrived meanwhile nobody has taken yet: the next beat will know
+            found = tuple(fault for fault in found if fault is Fault.LOOP_STALLED or fault in self.faults)
+        self._tell(now, found)
         if (len(self._samples) < 2 or now.cycles > self._samples[-2].cycles) and self._alive():
             notify("WATCHDOG=1")
         self._beats += 1

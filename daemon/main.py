@@ -319,7 +319,7 @@ class Daemon:
             failed.add("stored map")
         if self.answers.look() - {Thread.I2C}:  # a bus has faults of its own
             failed.add("thread")
-        return vitals(self.cycle, failed, lateness)
+        return vitals(self.cycle, failed, max(lateness, self.pacemaker.latest()))
 
 
 class _Estimator:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
@@ -193,6 +195,27 @@ def test_a_stall_is_said_once_and_over_when_none_has_come_for_a_while(caplog: py
     assert len(caplog.records) == 2
 
 
+def test_a_beat_that_comes_late_names_no_device_before_it_has_been_heard(caplog: pytest.LogCaptureFixture) -> None:
+    """When a stopped process wakes, nobody has taken what has arrived; what is wrong still, the next beat names."""
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    seen: list[tuple[Fault, ...]] = []
+    for beat in range(12):
+        woken = beat == 3
+        silent = woken or 6 <= beat <= 8
+        patient.now = replace(patient.now, silent=silent, odometry=not woken)
+        heart.beat(3.0 if woken or beat == 7 else 0.0)
+        seen.append(heart.faults)
+    assert seen[3] == (Fault.LOOP_STALLED,)
+    assert seen[6:9] == [(Fault.LIDAR_SILENT, Fault.LOOP_STALLED)] * 3, "what has been named is not taken back"
+    for _ in range(2):
+        patient.now = replace(patient.now, silent=True)
+        heart.beat(3.0)
+    assert Fault.LIDAR_SILENT in heart.faults, "a loop that is always late hides nothing"
+    assert [message[:10] for message in caplog.messages[:2]] == ["fault 301:", "fault 104:"]
+
+
 def test_a_fault_that_comes_and_goes_is_one_fault_and_said_in_the_devices_words(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -266,6 +289,29 @@ def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
     run_virtual(go())
     assert len(seen) == 10
     assert max(seen) < 1e-6
+
+
+def test_after_a_beat_that_came_late_the_next_one_is_a_second_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once it would find nothing but what the late one has found."""
+    monkeypatch.setattr(module, "BEAT_S", 0.05)
+    beats: list[float] = []
+
+    async def go() -> None:
+        loop = asyncio.get_running_loop()
+
+        def sample(lateness: float) -> Vitals:
+            beats.append(loop.time())
+            return Vitals(loop.time())
+
+        beating = asyncio.create_task(Heartbeat(sample, str).run())
+        await asyncio.sleep(0.06)
+        time.sleep(0.23)  # noqa: ASYNC251  # the loop stands still: that is what is tested
+        await asyncio.sleep(0.2)
+        beating.cancel()
+
+    asyncio.run(go())
+    assert len(beats) >= 3
+    assert min(after - before for before, after in pairwise(beats)) > 0.045
 
 
 def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next_is_tried(
