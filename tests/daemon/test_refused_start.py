@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon import cli, main
+from daemon import cli, run
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,7 +35,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
 def test_it_is_not_started_again_at_once(
     tmp_path: Path, manager: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(main, "ANEW_S", 0.5)
+    monkeypatch.setattr(run, "ANEW_S", 0.5)
     begun = time.monotonic()
     assert cli.main(refused(tmp_path / "maps")) == cli.FAILED
     assert time.monotonic() - begun >= 0.5
@@ -46,7 +46,7 @@ def test_at_a_terminal_the_answer_comes_at_once(tmp_path: Path, monkeypatch: pyt
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     begun = time.monotonic()
     assert cli.main(refused(tmp_path / "maps")) == cli.FAILED
-    assert time.monotonic() - begun < main.ANEW_S / 2
+    assert time.monotonic() - begun < run.ANEW_S / 2
 
 
 @pytest.mark.system
@@ -57,8 +57,8 @@ def test_a_stop_ends_the_wait(tmp_path: Path, manager: socket.socket) -> None:
         assert b"STATUS=cannot start" in manager.recv(1000)
         begun = time.monotonic()
         process.terminate()
-        assert process.wait(main.ANEW_S) == -signal.SIGTERM
-        assert time.monotonic() - begun < main.ANEW_S / 2
+        assert process.wait(run.ANEW_S) == -signal.SIGTERM
+        assert time.monotonic() - begun < run.ANEW_S / 2
     finally:
         process.kill()
         process.wait()
