@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from daemon.health import STALLED_PERIODS, WINDOW_S, Fault, Vitals, assess, describe, describe_over
+from daemon.faults import Fault, describe_over
+from daemon.health import STALLED_PERIODS, WINDOW_S, Vitals, assess, describe
 from daemon.logs import of_fault
 from daemon.notify import notify
 

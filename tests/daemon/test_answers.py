@@ -11,7 +11,8 @@ import pytest
 
 from daemon.answers import COMPUTING_S, DISK_S, Answers
 from daemon.condition import Reporter
-from daemon.health import Fault, Vitals
+from daemon.faults import Fault
+from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.publish.snapshot import Part, Thread
 from daemon.supervise import Supervisor

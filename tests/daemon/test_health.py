@@ -12,7 +12,8 @@ import pytest
 
 from daemon import heartbeat as module
 from daemon.condition import NAMES
-from daemon.health import FAULTS, PUBLISHERS, Fault, Vitals, assess, describe
+from daemon.faults import FAULTS, Fault
+from daemon.health import PUBLISHERS, Vitals, assess, describe
 from daemon.heartbeat import Heartbeat
 from hal.clock import run_virtual
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused

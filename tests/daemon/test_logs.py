@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from daemon import logs
-from daemon.health import FAULTS, Fault, Vitals
+from daemon.faults import FAULTS, Fault
+from daemon.health import Vitals
 from daemon.heartbeat import OVER_S, Heartbeat
 
 CATALOG = Path(__file__).parents[2] / "systemd" / "lumiloop.catalog"

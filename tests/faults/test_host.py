@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.heartbeat import BEAT_S, OVER_S
 from daemon.publish.client import NoAnswer, Reader
 from daemon.publish.holding import CommandCode, Outcome
