@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from daemon.cycle import Cycle, CycleRecord
 from daemon.disk import SEGMENT_BYTES, SegmentWriter
+from daemon.faults import FAULTS, Fault
 from daemon.flight import ASKED, Begun, Flight, Told
-from daemon.health import FAULTS, Fault
 from daemon.moment import CYCLE_PARTS
 from estimator.records import Job
 from hal.clock import Clock

@@ -146,7 +146,7 @@ def _fields_of(piece: object) -> dict[str, Any]:
 def take(state: State, rest: dict[str, object]) -> Taken:
     """Take the estimator's state and the ``rest``, which may refer to the same things.
 
-    Measured: 0.7 ms with 175 submaps (docs/replay.md); it grows with the submaps, not with the keyframes.
+    It takes longer the more submaps and keyframes there are; docs/replay.md has figures.
 
     Raises:
         CannotTake: something in them cannot be pickled.

@@ -104,7 +104,7 @@ def _run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--last", type=_minutes, metavar="MINUTES", help="record in a ring; a fault, or a command, makes a dump of it"
     )
-    parser.set_defaults(body=_recording(later("daemon.main", "main")))
+    parser.set_defaults(body=_recording(later("daemon.run", "main")))
 
 
 def _minutes(text: str) -> float:

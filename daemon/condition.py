@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from daemon.answers import Answers
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.publish.snapshot import Condition, Part
 from daemon.supervise import Supervisor
 from hal.adc import AdcStatus

@@ -66,7 +66,10 @@ class Mask(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     sectors: Annotated[
         tuple[tuple[Degrees, Degrees], ...],
-        Meta(description="[from, to] in degrees in the lidar's own frame, counter-clockwise from `from` to `to`"),
+        Meta(
+            description="[from, to] in degrees in the lidar's own frame, counter-clockwise from `from` to `to`",
+            examples=[((-135.0, -120.0), (120.0, 135.0))],
+        ),
     ] = ()
     near: Annotated[float, Meta(ge=0.0, le=10.0, description="metres; everything nearer is ignored")] = 0.05
 
@@ -133,7 +136,9 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     bus: Annotated[
         str,
         Meta(
-            description="I2C bus of its converter: /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port; empty: none"
+            description="I2C bus of its converter: /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port; "
+            "empty: none",
+            examples=["/dev/i2c-1"],
         ),
     ] = ""
     converter: Annotated[str, Meta(description="its converter, chip@address: mcp3221, adc121c021 or adc121c027")] = (
@@ -141,7 +146,10 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     )
     level: Annotated[
         str,
-        Meta(description="DC channel that tells dark from dazzled, chip@address/channel: ads1115@0x48/0; empty: none"),
+        Meta(
+            description="DC channel that tells dark from dazzled, chip@address/channel: ads1115@0x48/0; empty: none",
+            examples=["ads1115@0x48/0"],
+        ),
     ] = ""
     profile: Annotated[str, Meta(description="air interface of the lamps: A, B or D")] = "A"
 
@@ -191,7 +199,10 @@ class LightsConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     survey: Annotated[
         str,
-        Meta(description="survey file of lamps and receiver, relative to this file; empty: lamps describe themselves"),
+        Meta(
+            description="survey file of lamps and receiver, relative to this file; empty: lamps describe themselves",
+            examples=["lights.toml"],
+        ),
     ] = ""
 
 
@@ -204,7 +215,10 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     folder: Annotated[
         str,
-        Meta(description="folder for maps, relative to this file; empty: the state directory; none: maps are not kept"),
+        Meta(
+            description="folder for maps, relative to this file; empty: the state directory; none: maps are not kept",
+            examples=["maps"],
+        ),
     ] = ""
     localise: Annotated[
         bool, Meta(description="true to use the stored map as it is: it is never changed and never written")
@@ -212,7 +226,7 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if self.localise and not self.kept:
-            raise ValueError("Expected a folder that holds a map in `folder` where `localise` is true, got `none`")
+            raise ValueError("Expected a folder that holds a map, because `localise` is true, in `folder`, got `none`")
 
     @property
     def kept(self) -> bool:
@@ -223,7 +237,9 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class OdometryConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """Optional input of wheel odometry and gyro readings."""
 
-    port: Annotated[Port, Meta(description="UDP port that takes odometry and IMU datagrams; 0: none")] = 0
+    port: Annotated[
+        Port, Meta(description="UDP port that takes odometry and IMU datagrams; 0: none", examples=[9001])
+    ] = 0
 
 
 class CycleConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -242,7 +258,8 @@ class ModbusConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         str,
         Meta(
             description="serial line for RTU, /dev/ttyUSB1@115200#1: path, line rate (19200; a format may follow, "
-            "@9600,8N1; else 8E1), our unit (1); empty: none"
+            "@9600,8N1; else 8E1), our unit (1); empty: none",
+            examples=["/dev/ttyUSB1@115200#1"],
         ),
     ] = ""
     write: Annotated[bool, Meta(description="true to accept writes (commands, odometry)")] = False
@@ -273,7 +290,8 @@ class PoseConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         tuple[str, ...],
         Meta(
             description="where to send them, each `host:port`, a multicast group too; `*:port`: to whoever subscribes "
-            "by a datagram to that port"
+            "by a datagram to that port",
+            examples=[("192.168.0.20:9000", "*:9000")],
         ),
     ] = ()
 
@@ -288,7 +306,12 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """All of it."""
 
     name: Annotated[
-        str, Meta(pattern=r"^[A-Za-z0-9_.-]{1,32}$", description="this robot's name in logs and recordings")
+        str,
+        Meta(
+            pattern=r"^[A-Za-z0-9_.-]{1,32}$",
+            description="this robot's name in logs and recordings: 1 to 32 letters (a to z), digits, `_`, `.` and `-`",
+            examples=["agv-11"],
+        ),
     ] = "lumiloop"
     bind: Annotated[
         str,
@@ -297,7 +320,8 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     allow: Annotated[
         tuple[str, ...],
         Meta(
-            description="addresses and networks (192.168.0.0/24) that the servers answer; empty: all that reach `bind`"
+            description="addresses and networks (192.168.0.0/24) that the servers answer; empty: all that reach `bind`",
+            examples=[("192.168.0.0/24", "10.0.0.7")],
         ),
     ] = ()
     lidar: LidarConfig = LidarConfig()
@@ -323,7 +347,8 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     def _check_ports(self) -> None:
         if self.odometry.port and self.odometry.port == self.modbus.port:
-            raise ValueError(f"Expected a port other than Modbus's in `odometry.port`, got {self.odometry.port}")
+            raise ValueError(f"Expected a port other than `modbus.port` in `odometry.port`, got {self.odometry.port}")
         port = subscription_port(self.pose.receivers)
-        if port and port in (self.odometry.port, self.modbus.port):
-            raise ValueError(f"Expected a port of its own in `pose.receivers`, got `*:{port}`")
+        for key, other in (("odometry.port", self.odometry.port), ("modbus.port", self.modbus.port)):
+            if port and port == other:
+                raise ValueError(f"Expected a port other than `{key}` in `pose.receivers`, got `*:{port}`")

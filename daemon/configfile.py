@@ -1,92 +1,85 @@
 """Reads, explains and prints the configuration tree.
 
-An error names the file, the line, the path of the key, what was expected and what the key is for; an unknown key names
-the nearest known one. What is printed (``--print-config``, the reference in the documentation) can be pasted back.
+All errors are told at once (`daemon/configwords.py` has the words). What is printed (``--print-config``, the reference
+in the documentation) can be pasted back.
 """
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
 from daemon.config import Config
+from daemon.configwords import MOVED, Option, options, problems, value_text
 from daemon.endpoints import AUTO
 from daemon.wholefile import write_whole
 
-if TYPE_CHECKING:
-    from msgspec import inspect
+__all__ = [
+    "MOVED",
+    "REFERENCE_HEAD",
+    "ConfigError",
+    "Option",
+    "brought_up",
+    "dump",
+    "load",
+    "options",
+    "reference",
+    "refuse_overwriting",
+    "schema",
+    "value_text",
+    "write",
+]
 
 REFERENCE_HEAD: Final = """\
 # Configuration
 
 Generated from the configuration tree by `lumiloop --reference`; a test keeps it current.
 
-One TOML file holds everything, and every key has a default: an empty file is a valid configuration. An unknown key or
-a wrong value is refused with the file, the line, the key and what was expected. `lumiloop check FILE` says whether a
-file is good, `lumiloop check FILE --print-config` prints every value that results, and `lumiloop --schema` prints a
-JSON schema for editors. `--set KEY=VALUE` on the command line overrules the file.
+One TOML file holds everything, and every key has a default: an empty file is a valid configuration. Unknown keys and
+wrong values are refused, all at once, each with the file, the line, the key, what was found, what is allowed and an
+example. `lumiloop check FILE` says whether a file is good, `lumiloop check FILE --print-config` prints every value that
+results, and `lumiloop --schema` prints a JSON schema for editors. `--set KEY=VALUE` on the command line overrules the
+file.
 
 All keys with their defaults, ready to paste:
 
 """
 
 
-MOVED: Final = {
-    "lidar.serial": 'write lidar.device = "auto:SERIAL", as in "auto:H0906091"',
-    "lidar.baud": 'write the rate behind the path, as in lidar.device = "/dev/ttyUSB0@115200", or leave it out: it is '
-    "found by itself",
-}
-"""Keys of earlier versions, and what to write instead."""
-
-
 class ConfigError(Exception):
-    """The configuration cannot be used; the text says where, what was expected and what to do."""
-
-
-@dataclass(frozen=True, slots=True)
-class Option:
-    """One key of the tree, as people need to know it."""
-
-    path: str
-    kind: str
-    default: Any
-    description: str
+    """The configuration cannot be used; each line of the text says where, what was expected and what to do."""
 
 
 def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
     """Read a file (None: defaults only), lay ``KEY=VALUE`` overrides over it, and check the result.
 
     Raises:
-        ConfigError: unreadable, not TOML, an unknown key, or a wrong value.
+        ConfigError: unreadable, not TOML, unknown keys, or wrong values; all of them, a line each.
     """
     text = _read(file) if file is not None else ""
     name = str(file) if file is not None else "built-in defaults"
     try:
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: not valid TOML: {error}") from None
-    _convert(tree, name, text)
+        at = re.search(r" \(at line (\d+), column \d+\)$", str(error))
+        place = f"{name}:{at[1]}" if at else name
+        raise ConfigError(f"{place}: not valid TOML: {error}") from None
+    found = problems(tree, name, text)
     for override in overrides:
-        _lay_over(tree, override)
-        _convert(tree, f"--set {override}", "")
-    _refuse_nul(tree, name)
-    return _anchored(_convert(tree, name, text), file)
-
-
-def _refuse_nul(tree: dict[str, Any], name: str, parents: str = "") -> None:
-    """TOML can write the character that ends a name for the operating system; no path or address has it."""
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            _refuse_nul(value, name, f"{parents}{key}.")
-        elif "\0" in str(value):
-            raise ConfigError(f"{name}: `{parents}{key}` holds the character \\u0000; leave it out")
+        try:
+            _lay_over(tree, override)
+        except ConfigError as error:
+            found.append(str(error))
+        else:
+            found += problems(tree, f"--set {override}")
+    if found:
+        raise ConfigError("\n".join(found))
+    return _anchored(msgspec.convert(tree, Config), file)
 
 
 def _anchored(config: Config, file: Path | None) -> Config:
@@ -114,15 +107,6 @@ def brought_up(tree: dict[str, Any]) -> dict[str, Any]:
     elif baud and str(device).startswith("/"):
         lidar["device"] = f"{device}@{baud}"
     return tree | {"lidar": lidar} if lidar else tree
-
-
-def options() -> list[Option]:
-    """Every option of the tree in order of declaration."""
-    from msgspec import inspect  # costs 10 ms, and only explanations need it
-
-    kind = inspect.type_info(Config)
-    assert isinstance(kind, inspect.StructType)
-    return list(_walk(kind, ""))
 
 
 def dump(config: Config) -> str:
@@ -204,102 +188,6 @@ def _lay_over(tree: dict[str, Any], override: str) -> None:
     tree[key] = value
 
 
-def _convert(tree: dict[str, Any], name: str, text: str) -> Config:
-    try:
-        return msgspec.convert(tree, Config)
-    except msgspec.ValidationError as error:
-        raise ConfigError(_explain(str(error), name, text)) from None
-
-
-def _explain(message: str, name: str, text: str) -> str:
-    path = match[1] if (match := re.search(r"at `\$\.?([^`]*)`", message)) else ""
-    if unknown := re.search(r"contains unknown field `([^`]*)`", message):
-        path = f"{path}.{unknown[1]}".lstrip(".")
-        message = f"unknown key `{path}`{_nearest(path)}"
-        if path in MOVED:
-            message = f"`{path}` is now part of `lidar.device`: {MOVED[path]}"
-    else:
-        message = message.replace("Expected `array`, got", 'Expected `array`, a list in brackets as in ["..."], got')
-        if inner := re.search(r"`([a-z_.]+)(\[\d+\])?`(, got|$| -)", message):
-            candidate = f"{path}.{inner[1]}".lstrip(".")
-            path = candidate if candidate in _descriptions() else path
-        message += _purpose(path)
-    line = _line_of(text, path)
-    return f"{name}:{line}: {message}" if line else f"{name}: {message}"
-
-
-def _nearest(path: str) -> str:
-    known = list(_descriptions())
-    last = path.rpartition(".")[2]
-    same_name = [other for other in known if other.rpartition(".")[2] == last]
-    near = same_name or difflib.get_close_matches(path, known, n=1, cutoff=0.6)
-    if not near:
-        return "; `lumiloop --print-config` lists all keys"
-    return "; did you mean " + " or ".join(f"`{other}`" for other in near[:3]) + "?"
-
-
-def _purpose(path: str) -> str:
-    description = _descriptions().get(re.sub(r"\[.*", "", path), "")
-    return f" ({description})" if description else ""
-
-
-def _descriptions() -> dict[str, str]:
-    return {option.path: option.description for option in options()}
-
-
-def _line_of(text: str, path: str) -> int:
-    """Line of the assignment that holds the key at ``path``, or of its table; 0 where neither is written out."""
-    wanted = re.sub(r"\[\d+\]", "", path)
-    table = ""
-    best, best_length = 0, 0
-    for number, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
-            table = _plain(header[1])
-            here = table
-        elif key := re.match(r"\s*([\w.\-\"' ]+?)\s*=", line):
-            here = f"{table}.{_plain(key[1])}".lstrip(".")
-        else:
-            continue
-        if (wanted == here or wanted.startswith(here + ".")) and len(here) > best_length:
-            best, best_length = number, len(here)
-    return best
-
-
-def _plain(key: str) -> str:
-    return re.sub(r"[\"' ]", "", key)
-
-
-def _walk(kind: inspect.StructType, prefix: str) -> Iterator[Option]:
-    from msgspec import inspect
-
-    for field in kind.fields:
-        path = prefix + field.name
-        if isinstance(field.type, inspect.StructType):
-            yield from _walk(field.type, path + ".")
-        else:
-            yield Option(path, _kind(field.type), field.default, _description(field.type))
-
-
-def _description(kind: inspect.Type) -> str:
-    from msgspec import inspect
-
-    found = (kind.extra_json_schema or {}).get("description", "") if isinstance(kind, inspect.Metadata) else ""
-    return str(found)
-
-
-def _kind(kind: inspect.Type) -> str:
-    from msgspec import inspect
-
-    if isinstance(kind, inspect.Metadata):
-        return _kind(kind.type)
-    if isinstance(kind, (inspect.IntType, inspect.FloatType)):
-        name = "whole number" if isinstance(kind, inspect.IntType) else "number"
-        return f"{name}, {kind.ge} to {kind.le}" if kind.ge is not None and kind.le is not None else name
-    if isinstance(kind, inspect.BoolType):
-        return "true or false"
-    return "list" if isinstance(kind, inspect.VarTupleType) else "text"
-
-
 def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
     if prefix:
@@ -308,15 +196,3 @@ def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
     for key, value in table.items():
         if key not in plain:
             _dump_table(value, f"{prefix}.{key}".lstrip("."), lines)
-
-
-def value_text(value: object) -> str:
-    """A value of the tree as TOML writes it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (int, float)):
-        return repr(value)
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(value_text(item) for item in value) + "]"
-    # a JSON string is a TOML basic string, except that TOML wants DEL escaped too
-    return msgspec.json.encode(value).decode().replace("\x7f", "\\u007F")

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from daemon import configfile
 from daemon.cli import FAILED, OK, fail
-from daemon.health import FAULTS
+from daemon.faults import FAULTS
 from daemon.publish import holding, integrity, registers
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.points import Layout, Point

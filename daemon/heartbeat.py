@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from daemon.health import WINDOW_S, Fault, Vitals, assess, describe
+from daemon.faults import Fault, describe_over
+from daemon.health import STALLED_PERIODS, WINDOW_S, Vitals, assess, describe
 from daemon.logs import of_fault
 from daemon.notify import notify
 
@@ -42,9 +43,10 @@ class Heartbeat:
         self._statistics = statistics
         self._alive = alive
         self._samples: deque[Vitals] = deque()
-        self._seen: dict[Fault, float] = {}  # those that have been said, and when they were last present
+        self._seen: dict[Fault, tuple[float, float]] = {}  # those that have been said: when first and last present
         self._beats = 0
         self._failing = False
+        self._late = False
 
     def fault(self) -> int:
         """Number of the gravest present fault, 0 for none."""
@@ -59,7 +61,7 @@ class Heartbeat:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            due = max(due + BEAT_S, loop.time())
+            due = due + BEAT_S if loop.time() < due + BEAT_S else loop.time() + BEAT_S
             await asyncio.sleep(due - loop.time())
             try:
                 self.beat(loop.time() - due)
@@ -79,7 +81,11 @@ class Heartbeat:
         while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
             self._samples.popleft()
         worst = max(sample.lateness for sample in self._samples)
-        self._tell(now, assess(replace(now, lateness=worst), self._samples[0]))
+        found = assess(replace(now, lateness=worst), self._samples[0])
+        before, self._late = self._late, lateness > STALLED_PERIODS * now.period
+        if self._late and not before:  # what has arrived meanwhile nobody has taken yet: the next beat will know
+            found = tuple(fault for fault in found if fault is Fault.LOOP_STALLED or fault in self.faults)
+        self._tell(now, found)
         if (len(self._samples) < 2 or now.cycles > self._samples[-2].cycles) and self._alive():
             notify("WATCHDOG=1")
         self._beats += 1
@@ -94,8 +100,10 @@ class Heartbeat:
         for fault in faults:
             if fault not in self._seen:
                 log.warning("%s", describe(fault, now), extra=of_fault(fault))
-            self._seen[fault] = now.t_mono
-        for fault in [fault for fault, t_mono in self._seen.items() if now.t_mono - t_mono >= OVER_S]:
-            del self._seen[fault]
-            log.info("over: %s", describe(fault), extra=of_fault(fault, over=True))
+            begun, _ = self._seen.get(fault, (now.t_mono, 0.0))
+            self._seen[fault] = begun, now.t_mono
+        for fault, (begun, last) in list(self._seen.items()):
+            if now.t_mono - last >= OVER_S:
+                del self._seen[fault]
+                log.info("%s", describe_over(fault, last - begun + BEAT_S), extra=of_fault(fault, over=True))
         self.faults = faults

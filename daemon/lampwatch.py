@@ -10,7 +10,7 @@ import logging
 from dataclasses import dataclass, field
 from typing import Final
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from estimator.cdma_epoch import UNUSABLE, BlockFlag
 from estimator.result import Fix, LightsResult, Link, LinkState
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.health import FAULTS, Fault
+from daemon.faults import FAULTS, Fault
 
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
@@ -31,8 +31,10 @@ Fields = Mapping[str, object]
 def of_fault(fault: Fault, over: bool = False) -> dict[str, Any]:
     """``extra=`` of a line that tells that a fault has come, or is over."""
     text, remedy = FAULTS[fault]
-    fields = {"LUMILOOP_FAULT": int(fault), "LUMILOOP_FAULT_NAME": fault.name, "LUMILOOP_REMEDY": remedy}
-    return _extra({"MESSAGE_ID": OVER_ID if over else FAULT_ID, **fields, "LUMILOOP_MEANING": text})
+    fields = {"LUMILOOP_FAULT": int(fault), "LUMILOOP_FAULT_NAME": fault.name, "LUMILOOP_MEANING": text}
+    if over:
+        return _extra({"MESSAGE_ID": OVER_ID, **fields})  # nothing needs to be done
+    return _extra({"MESSAGE_ID": FAULT_ID, **fields, "LUMILOOP_REMEDY": remedy})
 
 
 def of_state(state: str, reason: str, remedy: str) -> dict[str, Any]:

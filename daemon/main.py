@@ -1,4 +1,4 @@
-"""``lumiloop run``: puts the rooms together, keeps every part running, and stops cleanly.
+"""Puts the rooms together, keeps every part running, and stops cleanly; `daemon/run.py` is the command.
 
 Start order: publishers, lidar, photodiode and inputs (their hand-shakes take time), then the estimator is loaded in a
 thread while they do, then cycles. Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recording.
@@ -6,57 +6,47 @@ thread while they do, then cycles. Stop order: cycles, lidar (its laser is switc
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import gc
 import logging
 import math
-import signal
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from daemon import configfile
 from daemon.answers import COMPUTING_S, DISK_S, Answers
 from daemon.bridge import SampleBridge, ScanBridge
-from daemon.cli import FAILED, OK, USAGE
 from daemon.condition import Reporter
 from daemon.config import Config
 from daemon.cycle import Cycle, Parts, Step
-from daemon.folders import maps_folder, runtime_folder, state_folder
+from daemon.folders import state_folder
 from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.lastpose import LastPose
-from daemon.lights import CannotBegin, Lights, SurveyError, load_lights, new_state
-from daemon.logs import start_log
+from daemon.lights import CannotBegin, Lights, load_lights, new_state
 from daemon.mapswitch import Maps, MapSwitch, Switch, take_over
 from daemon.network import Feeds, Network
 from daemon.notify import notify
 from daemon.pacemaker import Pacemaker
 from daemon.photodiode import BlockWatch
 from daemon.publish.snapshot import Snapshot, State, Thread
-from daemon.realtime import claim, give_back, line_up
-from daemon.sampleclock import SampleClock
-from daemon.stallwatch import StallWatch
-from daemon.store import NoMap, Start, judge_for, started
+from daemon.realtime import claim, line_up
+from daemon.store import NoMap, Start, judge_for
 from daemon.store_keeper import About, Keeper
 from daemon.store_tables import digest_of
 from daemon.streambeat import StreamBeat
 from daemon.supervise import Supervisor
 from daemon.tapped import tapped
 from daemon.vitals import process_age_s, resident_mb, statistics, vitals
-from daemon.warmup import CannotLoad, Warmth, warm_up
+from daemon.warmup import Warmth
 from daemon.worker import ThreadWorker
 from daemon.world import NoLidar, World
 from estimator.records import Command, Limits, Order, Record, no_lap
 from estimator.result import StepResult
 from hal.adc import BusStuck, RawSamples
-from hal.clock import SystemClock
-from hal.errors import HalError
 from hal.inputs import OnImu, OnOdometry
 from hal.lidar import Lidar, RawScan
 from hal.photodiode.silence import HANG_S
@@ -66,7 +56,7 @@ if TYPE_CHECKING:
     from daemon.record import Recorder
     from estimator.state import State as Estimate
 
-__all__ = ["Daemon", "World", "main"]
+__all__ = ["Daemon", "World"]
 
 log = logging.getLogger(__name__)
 
@@ -314,7 +304,7 @@ class Daemon:
             failed.add("stored map")
         if self.answers.look() - {Thread.I2C}:  # a bus has faults of its own
             failed.add("thread")
-        return vitals(self.cycle, failed, lateness)
+        return vitals(self.cycle, failed, max(lateness, self.pacemaker.latest()))
 
 
 class _Estimator:
@@ -386,65 +376,3 @@ async def _stop(task: asyncio.Task[Any] | None) -> None:
         log.warning("%s does not stop", task.get_name())
     elif not task.cancelled() and (error := task.exception()) is not None:
         log.error("%s failed while stopping", task.get_name(), exc_info=error)
-
-
-def main(args: argparse.Namespace) -> int:
-    """The command ``run``. ``args``: the configuration (``settings``), where to ``record``, how much (``last``)."""
-    start_log()
-    settings: Config = args.settings
-    log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
-    recorder = None
-    give_back()
-    try:
-        world = _world(settings)
-        log.info("%s", _whereabouts(settings, args.record, world.stream))
-        if args.record is not None:
-            from daemon.record import Recorder
-
-            keep_s = math.inf if args.last is None else 60.0 * args.last
-            recorder = Recorder(args.record, settings, world.clock, world.lights, world.start, keep_s)
-        asyncio.run(_run_until_signal(settings, world, recorder))
-    except SurveyError as error:
-        log.error("%s", error)
-        return USAGE
-    except (HalError, CannotLoad, NoMap) as error:
-        log.error("%s", error)
-        return FAILED
-    return OK
-
-
-def _world(settings: Config) -> World:
-    """The real one, with what is stored and surveyed of map and lights; raises `SurveyError` and `NoMap`."""
-    stream = runtime_folder() / f"{settings.name}.stream"
-    if not settings.photodiode.fitted:
-        store, start = started(settings.map, None)
-        return World(SystemClock(), store=store, start=start, stream=stream)
-    clock = SampleClock(settings.photodiode)
-    lights = load_lights(settings, clock.ppm)
-    store, start = started(settings.map, lights)
-    world = World(SystemClock(), store=store, start=start, stream=stream)
-    return replace(world, warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=clock)
-
-
-def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> str:
-    """One line for the person at the terminal: where the pose can be read, what is kept, how to stop."""
-    modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
-    said = [modbus if settings.modbus.port else "no Modbus on the network"]
-    said += [f"Modbus RTU on {settings.modbus.serial}"] if settings.modbus.serial else []
-    said += [f"answering {', '.join(settings.allow)} only"] if settings.allow else []
-    said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
-    said += [f"stream {stream}"] if stream is not None else []
-    used = "map from" if settings.map.localise else "maps in"
-    said += [f"{used} {maps_folder(settings.map.folder)}"] if settings.map.kept else ["no map is kept"]
-    said += [f"recording into {record}"] if record is not None else []
-    return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
-
-
-async def _run_until_signal(settings: Config, world: World, recorder: Recorder | None) -> None:
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
-    daemon = Daemon(settings, world, recorder)
-    daemon.pacemaker.watch = StallWatch()
-    await daemon.run(stop)

@@ -6,11 +6,16 @@ import os
 import socket
 
 
+def managed() -> bool:
+    """Whether a service manager has started us, and wants to be told."""
+    return os.environ.get("NOTIFY_SOCKET", "").startswith(("/", "@"))
+
+
 def notify(*words: str) -> None:
     """Tell the service manager, e.g. ``READY=1``; silently nothing when there is none or it has gone."""
-    address = os.environ.get("NOTIFY_SOCKET", "")
-    if not address.startswith(("/", "@")):
+    if not managed():
         return
+    address = os.environ["NOTIFY_SOCKET"]
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock:
             sock.sendto("\n".join(words).encode(), address.replace("@", "\0", 1))

@@ -41,6 +41,7 @@ class Pacemaker:
         self._cycle = cycle
         self._due: asyncio.Future[None] | None = None
         self._due_since = 0.0
+        self._latest = 0.0
 
     def on_scan(self, scan: RawScan) -> None:
         """Take a scan from the driver; the cycle starts in the next turn of the loop, with the latest by then."""
@@ -54,6 +55,14 @@ class Pacemaker:
         silence = cycle.lidar_silence(cycle.parts.clock.now())
         if silence is None or silence > IDLE_PERIODS:
             self._wake(cycle.parts.clock.now())
+
+    def latest(self) -> float:
+        """Seconds by which the loop was late for a cycle when it stood still since this was last asked; 0: it did not.
+
+        Of several times it is the worst.
+        """
+        latest, self._latest = self._latest, 0.0
+        return latest
 
     async def run(self) -> None:
         """Run cycles until cancelled."""
@@ -69,18 +78,19 @@ class Pacemaker:
                 idle.at(idle_until)
                 await self._due
                 cycle.taker.late(cycle.parts.clock.now() - self._due_since)
-                self._watch_stalls((IDLE_PERIODS + STALL_PERIODS) * period)
+                self._watch_stalls(period)
                 cycle.run()
         finally:
             idle.close()
             if self.watch is not None:
                 self.watch.close()
 
-    def _watch_stalls(self, seconds: float) -> None:
+    def _watch_stalls(self, period: float) -> None:
         """A cycle begins; if it should have long ago, count that, with the stage in which it was."""
         cycle = self._cycle
-        if self.watch is None or (lasted := self.watch.arm(seconds)) is None:
+        if self.watch is None or (lasted := self.watch.arm((IDLE_PERIODS + STALL_PERIODS) * period)) is None:
             return
+        self._latest = max(self._latest, lasted - IDLE_PERIODS * period)
         inside = (cycle.cycle_us or 0) * 1e-6 >= 0.5 * lasted
         cycle.taker.stalled(lasted, cycle.laps.longest() if inside else Stage.OUTSIDE)
 

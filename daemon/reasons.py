@@ -38,7 +38,10 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.WARMING_UP: ("starting up", "wait; the first start of a version compiles for a minute or two"),
     Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
-    Reason.LIDAR_SILENT: ("no valid scan for three scan periods", "check the lidar's power and cable"),
+    Reason.LIDAR_SILENT: (
+        "no valid scan for three scan periods, or not steadily again",
+        "check the lidar's power and cable",
+    ),
     Reason.UNPROVED: ("the pose follows the laser, nothing has confirmed it yet", "wait, or drive a metre or two"),
     Reason.AXIS_UNKNOWN: ("the surroundings do not fix every axis of the pose", "read the known-axis bits"),
     Reason.MATCH_FAILED: ("scans do not fit the map, the pose is held", "is the lidar covered, lifted or crowded in?"),

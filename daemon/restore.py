@@ -42,7 +42,7 @@ PARTS: Final = frozenset(
     (
         *(
             f"daemon.{name}"
-            for name in ("alarm", "bridge", "evidence", "health", "inbox", "lampwatch", "leftout", "pace", "picture")
+            for name in ("alarm", "bridge", "evidence", "faults", "inbox", "lampwatch", "leftout", "pace", "picture")
         ),
         *(f"daemon.{name}" for name in ("publish.snapshot", "reasons", "state", "state_evidence", "state_memory")),
         *("daemon.watch", "daemon.witness", "hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),

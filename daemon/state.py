@@ -14,7 +14,7 @@ from typing import Final
 from daemon.publish.snapshot import State
 from daemon.reasons import Reason
 from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light
-from daemon.state_memory import AXIS_FOUND_SCANS, DARK_S, FAILED_SCANS, HELD_S, Memory, remember
+from daemon.state_memory import AXIS_FOUND_SCANS, DARK_S, FAILED_SCANS, HELD_S, Memory, remember, steady
 
 PROOF_S: Final = 2.0
 PROOF_SCANS: Final = 10
@@ -50,7 +50,7 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """The table, gravest first."""
-    if evidence.silence is None or evidence.silence >= SILENT_PERIODS:
+    if evidence.silence is None or evidence.silence >= SILENT_PERIODS or not steady(memory, evidence.t_mono):
         return _say_without_laser(memory, evidence)
     if evidence.places is not None:
         if evidence.places > 1:

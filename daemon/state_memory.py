@@ -29,6 +29,12 @@ THERE_RAD: Final = 0.06
 """A pose that was proved is found again where it was taken to be: the first match moves it by no more than this."""
 
 
+AGAIN_S: Final = 3.0
+"""A laser that falls silent again so soon after it has come back is one that comes and goes."""
+STEADY_S: Final = 0.8
+"""It is said to be back when no silence has come for this long: a pose that was sure is proved by then."""
+
+
 Streak = tuple[int, float]
 """How many in a row, and when it began."""
 
@@ -49,6 +55,8 @@ class Memory:
         lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
         odd_since: since when light has contradicted the place; both None while it does not.
         led: light has moved the pose, and has not been sure of the place since.
+        gone: the laser is silent. back: when it last came back, None: it has not been away. fitful: it had fallen
+            silent again soon after it had come back, the last time that it did.
     """
 
     state: State = State.STARTING
@@ -69,6 +77,9 @@ class Memory:
     lit_last: float | None = None
     odd_since: float | None = None
     led: bool = False
+    gone: bool = False
+    back: float | None = None
+    fitful: bool = False
 
 
 def remember(memory: Memory, evidence: Evidence) -> Memory:
@@ -76,6 +87,8 @@ def remember(memory: Memory, evidence: Evidence) -> Memory:
     now = evidence.t_mono
     memory = _odd(memory, None) if evidence.light is None else _take_light(memory, evidence.light, now)
     silent = evidence.silence is not None and evidence.silence >= SILENT_PERIODS
+    if silent is not memory.gone:
+        memory = _gone(memory, now) if silent else replace(memory, gone=False, back=now)
     if not evidence.lidar or silent or evidence.unused is not None:
         return _forget_laser(memory, evidence)
     since = memory.disagree_since if memory.disagree_since is not None else now
@@ -90,6 +103,16 @@ def remember(memory: Memory, evidence: Evidence) -> Memory:
     if evidence.match is None:
         return memory
     return _take_good(memory, evidence.match, now) if evidence.match.good else _take_failed(memory)
+
+
+def steady(memory: Memory, now: float) -> bool:
+    """Whether the laser can be said to be there: one that comes and goes must not take what is said along."""
+    return not memory.fitful or (not memory.gone and memory.back is not None and now - memory.back >= STEADY_S)
+
+
+def _gone(memory: Memory, now: float) -> Memory:
+    """The laser has fallen silent."""
+    return replace(memory, gone=True, fitful=memory.back is not None and now - memory.back < AGAIN_S)
 
 
 def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
@@ -107,6 +130,9 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
         lit_last=memory.lit_last,
         odd_since=memory.odd_since,
         led=memory.led,
+        gone=memory.gone,
+        back=memory.back,
+        fitful=memory.fitful,
     )
 
 

@@ -152,12 +152,16 @@ class Store:
         self.trouble = ""
 
     def claim(self) -> None:
-        """Take the folder for this process before there is a map to save: what keeps it from that is known at once."""
+        """Take the folder for this process before there is a map to save: what keeps it from that is known at once.
+
+        May be tried again; what has not changed is not said again.
+        """
         try:
             self._use()
         except OSError as error:
-            self.trouble = f"{self.folder}: {said(error)}"
-            log.error("no map can be kept in %s; mend that, or name another `map.folder`", self.trouble)
+            before, self.trouble = self.trouble, f"{self.folder}: {said(error)}"
+            if self.trouble != before:
+                log.error("no map can be kept in %s; mend that, or name another `map.folder`", self.trouble)
 
     def generations(self) -> list[Generation]:
         """All that are there, newest first."""
@@ -309,7 +313,7 @@ class Store:
             raise
         if self._lock is not None:
             os.close(self._lock)
-        self._lock = lock
+        self._lock, self.trouble = lock, ""
         for part in self.folder.glob(".map-*.part"):
             part.unlink(missing_ok=True)
 

@@ -35,6 +35,8 @@ FIRST_S: Final = 60.0
 EVERY_S: Final = 300.0
 """And every five minutes: what a power cut costs is mapped again on the next pass, and memory cards wear."""
 RETRY_S: Final = 60.0
+LOOK_S: Final = 10.0
+"""A folder that could not be taken at the start is tried so often, whether there is something to be saved or not."""
 BREATH_S: Final = 0.0005
 """Pause between two slices of packing."""
 STOP_S: Final = 4.0
@@ -93,6 +95,7 @@ class Keeper:
         self._map_of = map_id()
         self._anew = self._last = False
         self._due = clock.now() + FIRST_S
+        self._look_due = clock.now() + LOOK_S
         self._waiting: list[Told] = []
         self._over = asyncio.Event()
         self._over.set()
@@ -175,7 +178,12 @@ class Keeper:
     def _go_on(self) -> None:
         """Begin a save where one is due and none is under way."""
         state, store = self._state(), self._store
-        if store is None or state is None or self._about.localise or not self._over.is_set():
+        if store is None or self._about.localise or not self._over.is_set():
+            return
+        if store.trouble and not self._last and self._clock.now() >= self._look_due:
+            self._look(store)
+            return
+        if state is None:
             return
         revision = self._revision(state)
         if self._map_id() != self._map_of:  # begun anew, which counts at once: the old map must not come back
@@ -186,13 +194,46 @@ class Keeper:
         self._anew = False
         waiting, self._waiting = self._waiting, []
         end = partial(self._end, revision, waiting)
-        self.busy_since = time.monotonic()
-        self._over.clear()
+        self._busy(True)
         try:
             self._begin(store, state, end)
         except Exception as failure:  # no memory, no thread, or a defect: whoever waits is told, and it is tried again
             log.exception("the save of the map cannot begin")
             end(None, f"the save cannot begin: {failure!r}")
+
+    def _busy(self, busy: bool) -> None:
+        """A thread is at the folder from now on, or no more."""
+        self.busy_since = time.monotonic() if busy else None
+        if busy:
+            self._over.clear()
+        else:
+            self._over.set()
+
+    def _look(self, store: Store) -> None:
+        """Try again to take the folder, in a thread: a disk may hang."""
+        self._look_due = self._clock.now() + LOOK_S
+        loop, before = asyncio.get_running_loop(), store.trouble
+
+        def work() -> None:
+            store.claim()
+            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+                loop.call_soon_threadsafe(self._looked, store, before)
+
+        self._busy(True)
+        try:
+            threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
+        except Exception:  # no memory, or no thread: the next look is soon
+            log.exception("the folder of maps cannot be looked at")
+            self._busy(False)
+
+    def _looked(self, store: Store, before: str) -> None:
+        """Back in the loop's thread: what kept the folder from being taken is over, or it is not."""
+        self._busy(False)
+        if self.error == before:
+            self.error = store.trouble
+        if not store.trouble:
+            log.info("maps can be kept in %s from now on", store.folder)
+        self._go_on()
 
     def _begin(self, store: Store, state: State, end: End) -> None:
         """Gather the map, and have a thread save it, which calls ``end`` in this one."""
@@ -245,8 +286,7 @@ class Keeper:
 
     def _end(self, revision: Revision, waiting: list[Told], path: Path | None, error: str) -> None:
         """Back in the loop's thread."""
-        self._over.set()
-        self.busy_since = None
+        self._busy(False)
         self._due = self._clock.now() + (RETRY_S if error else EVERY_S)
         if path is not None:
             self._saved = revision
@@ -254,7 +294,8 @@ class Keeper:
             news = waiting or self.error or self.saves == 1 or self._last
             log.log(logging.INFO if news else logging.DEBUG, "map saved: %s", path)
         else:
-            self._anew |= self._saved is not None and self._saved[0] != self._map_id()
+            # tried again, though there may be nothing new: the fault is to end when what was in the way has gone
+            self._anew |= self._saved is not None and (self._saved == revision or self._saved[0] != self._map_id())
         if error and not self.error:
             again = "" if self._last else ", and it is tried again"
             log.error("the map cannot be saved: %s; what was saved before stays%s", error, again)

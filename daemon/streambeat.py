@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from daemon.cycle import Cycle
-from daemon.health import FAULTS, Fault
+from daemon.faults import FAULTS, Fault
 from daemon.maptiles import MapTiles
 from daemon.publish.stream import StreamServer
 from daemon.vitals import process_age_s, resident_mb

@@ -63,13 +63,15 @@ def main(args: argparse.Namespace) -> int:
     try:
         span, utc = find(spans(folder), args.time, folder)
         told, rerun = moments(span, utc)
-        sys.stdout.write(whysaid.report(told, utc, span.path.name))
+        second = whole_second(args.time)
+        sys.stdout.write(whysaid.report(told, utc, span.path.name, second))
         if rerun.comparison.differ:
             cli.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
             )
         if args.out is not None:
-            return _draw(args.out, told, utc, rerun)
+            changed = whysaid.first_change(told, utc) if second else None
+            return _draw(args.out, told, utc if changed is None else told[changed].utc, rerun)
     except (HalError, NoMoment, OutputRefused, warmup.CannotLoad) as error:
         return cli.fail(str(error))
     return cli.OK
@@ -127,18 +129,28 @@ def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:
 def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float]:
     """The recording that holds a moment, with most of the time before it, and that moment (UTC).
 
+    Of a whole second it may hold a part: the moment is not before it begins.
+
     Raises:
         NoMoment: none does, or that is no time.
     """
-    asked = [(span, utc) for span in recorded for utc in meant(words, span)]
+    wide = whysaid.SECOND_S if whole_second(words) else 0.0
+    asked = [(span, utc, max(utc, span.begin)) for span in recorded for utc in meant(words, span)]
     here = [
-        (min(utc - span.begin, BEFORE_S), span.begin, span, utc) for span, utc in asked if span.begin <= utc <= span.end
+        (min(begin - span.begin, BEFORE_S), span.begin, span, begin)
+        for span, utc, begin in asked
+        if utc <= span.end and span.begin <= utc + wide
     ]
     if here:
         _, _, span, utc = max(here, key=lambda one: one[:2])
         return span, utc
     there = "\n".join(f"  {whysaid.clock(s.begin)} to {whysaid.clock(s.end)}  {s.path.name}" for s in recorded)
     raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n{there}")
+
+
+def whole_second(words: str) -> bool:
+    """Whether no fraction is named: then all that came in that second is meant, as where the journal says the time."""
+    return "." not in words
 
 
 def meant(words: str, span: Span) -> list[float]:

@@ -28,6 +28,8 @@ GAP: Final = 16.27
 SILENT_S: Final = 0.5
 MOST: Final = 12
 """Changes that are listed."""
+SECOND_S: Final = 1.0
+"""A time without a fraction, as the journal writes it, is of all that came in this long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,18 +88,37 @@ def at(told: Sequence[Moment], utc: float) -> int:
     return max((k for k, one in enumerate(told) if one.utc <= utc), default=0)
 
 
-def report(told: Sequence[Moment], utc: float, where: str) -> str:
-    """The text."""
-    k = at(told, utc)
+def first_change(told: Sequence[Moment], utc: float) -> int | None:
+    """Index of the first cycle of a second in which state, reason or fault are others than before; None: in none."""
+    for k in range(1, len(told)):
+        if utc <= told[k].utc < utc + SECOND_S and _key(told[k]) != _key(told[k - 1]):
+            return k
+    return None
+
+
+def _key(one: Moment) -> tuple[State, Reason, int]:
+    return one.state, one.reason, one.snapshot.fault
+
+
+def report(told: Sequence[Moment], utc: float, where: str, second: bool = False) -> str:
+    """The text of an instant; ``second``: of the whole second that begins then, at the first change in it."""
+    k = last = at(told, utc)
+    when = clock(utc)
+    if second:
+        changed = first_change(told, utc)
+        k = k if changed is None else changed
+        last = max((j for j, one in enumerate(told) if one.utc < utc + SECOND_S), default=k)
+        what = "nothing changes" if changed is None else "state, reason or fault first change in it"
+        when = f"{when.partition('.')[0]}, the whole second: {what}"
     one = told[k]
-    lines = [f"{clock(utc)}, cycle of {of_day(one.utc)}, {where}", *_state(told, k)]
+    lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *_state(told, k)]
     lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
     if one.snapshot.light is not None:
         lines += ["", "lamps", *(f"  {line}" for line in _lamps(told, k))]
-    changes = list(_changes(told[: k + 1]))
+    changes = list(_changes(told[: last + 1]))
     first = f"{one.utc - told[0].utc:.0f} s before"
-    lines += ["", f"what changed in the {first}"]
+    lines += ["", f"what changed in the {first}{' and in this second' if second else ''}"]
     lines += [f"  ... {len(changes) - MOST} more"] if len(changes) > MOST else []
     lines += [f"  {line}" for line in changes[-MOST:]] or ["  nothing"]
     return "\n".join(lines) + "\n"

@@ -26,7 +26,7 @@ from typing import Any, Final
 import msgspec
 
 from daemon import configfile, store_file
-from daemon.health import FAULTS
+from daemon.faults import FAULTS
 from daemon.publish import (
     holding,
     integrity,

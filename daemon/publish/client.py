@@ -285,7 +285,7 @@ def _meaning(subject: str, number: Value) -> str:
     """What a reason or fault number means and what to do; the tables are loaded only when there is one to explain."""
     if not number:
         return "none"
-    from daemon.health import FAULTS
+    from daemon.faults import FAULTS
     from daemon.reasons import REASONS
 
     meanings: Mapping[Any, tuple[str, str]] = REASONS if subject == "reason" else FAULTS

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.health import FAULTS
+from daemon.faults import FAULTS
 from daemon.publish import holding, integrity, lights, modbus, parts, pulse, registers, requests
 from daemon.publish.block import Block
 from daemon.publish.document_udp import udp_page

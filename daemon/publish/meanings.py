@@ -9,7 +9,7 @@ from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
 
 STATES: Final[dict[State, str]] = {
     State.STARTING: "warming up, nothing to say yet",
-    State.NO_LIDAR: "no valid scan for three scan periods",
+    State.NO_LIDAR: "no valid scan for three scan periods, or not steadily again",
     State.MAPPING: "the pose follows the laser, but no witness has proved it yet",
     State.TRACKING: "two witnesses agree, or one has proved itself",
     State.DEGRADED: "the pose is held, at least one axis or witness is missing",

@@ -14,7 +14,7 @@ class State(IntEnum):
     """The published state machine. Numbers are part of the contract: never renumber."""
 
     STARTING = 0  # warming up, nothing to say yet
-    NO_LIDAR = 1  # no valid scan for three scan periods
+    NO_LIDAR = 1  # no valid scan for three scan periods, or not steadily again
     MAPPING = 2  # the pose follows the laser, but no witness has proved it yet
     TRACKING = 3  # two witnesses agree, or one has proved itself
     DEGRADED = 4  # the pose is held, at least one axis or witness is missing

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
 import time
@@ -9,15 +10,20 @@ from pathlib import Path
 
 import pytest
 
+from daemon import main
 from daemon.answers import COMPUTING_S, DISK_S, Answers
 from daemon.condition import Reporter
-from daemon.health import Fault, Vitals
+from daemon.faults import Fault
+from daemon.health import Vitals
 from daemon.heartbeat import Heartbeat
 from daemon.publish.snapshot import Part, Thread
 from daemon.supervise import Supervisor
-from daemon.worker import ThreadWorker
+from daemon.worker import URGENT, ThreadWorker
+from daemon.world import World
 from estimator.records import Job
+from hal.clock import LoopClock, run_virtual
 from hal.lidar import LidarStatus
+from tests.daemon.test_daemon import SETTINGS
 
 
 class Stand:
@@ -104,3 +110,41 @@ def test_the_condition_is_one_object_until_something_changes(tmp_path: Path) -> 
     assert told.uptime_s == 1
     assert (told.restarts[Part.LIDAR], told.restarts[Part.POSE], told.restarts[Part.OTHER]) == (6, 4, 1)
     assert told.down == {Part.POSE, Part.OTHER}
+
+
+@pytest.mark.parametrize("thread", [Thread.SOLVER, Thread.SEARCH])
+def test_background_work_that_hangs_is_a_fault_within_seconds_and_starves_the_watchdog(
+    thread: Thread, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole daemon, whose worker waits for ever; the map gives such a job up only after many keyframes."""
+    monkeypatch.setattr(main, "COMPUTING_S", 0.05)
+    fed: list[str] = []
+    monkeypatch.setattr("daemon.heartbeat.notify", lambda *words: fed.extend(words))
+    go = threading.Event()
+
+    async def run() -> None:
+        clock = LoopClock(asyncio.get_running_loop())
+        daemon = main.Daemon(SETTINGS, World(clock, make_worker=ThreadWorker, draw_map_id=lambda: 1))
+        worker = daemon.cycle.parts.worker
+        assert isinstance(worker, ThreadWorker)
+        try:
+            for _ in range(3):
+                daemon.cycle.cycles += 1
+                daemon.heartbeat.beat(0.0)
+            assert daemon.heartbeat.faults == ()
+            assert fed.count("WATCHDOG=1") == 3
+            worker.submit([Job(1, URGENT if thread is Thread.SOLVER else URGENT + 1, go.wait)])
+            end = time.monotonic() + 5.0
+            while Fault.THREAD_HANGS not in daemon.heartbeat.faults and time.monotonic() < end:
+                time.sleep(0.01)  # noqa: ASYNC251  # the thread's time is the real one
+                fed.clear()
+                daemon.cycle.cycles += 1
+                daemon.heartbeat.beat(0.0)
+            assert daemon.answers.hanging == {thread}
+            assert daemon.heartbeat.faults == (Fault.THREAD_HANGS,)
+            assert "WATCHDOG=1" not in fed
+        finally:
+            go.set()
+            worker.close()
+
+    run_virtual(run())

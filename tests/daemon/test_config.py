@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 from pathlib import Path
 
 import msgspec
@@ -23,6 +24,7 @@ from daemon.config import (
     parse_chip,
 )
 from daemon.configfile import ConfigError, load
+from daemon.configwords import problems
 from daemon.endpoints import LidarPlace, RtuLine, parse_endpoint, parse_lidar, parse_line
 from estimator import cdma_profile
 
@@ -61,16 +63,31 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("\n[modbus]\nport = 70000", "robot.toml:3: Expected `int` <= 65535 - at `$.modbus.port`"),
-        ("[modbus]\nwrite = 1", "robot.toml:2: Expected `bool`, got `int` - at `$.modbus.write`"),
-        ("[lidar]\nmount = {x = nan}", "robot.toml:2: Expected `float` >= -100.0 - at `$.lidar.mount.x`"),
-        ("lidar.mount.x = inf", "robot.toml:1: Expected `float` <= 100.0 - at `$.lidar.mount.x`"),
-        ("lidar = 3", "robot.toml:1: Expected `object`, got `int` - at `$.lidar`"),
-        ("[lidar.mask]\nsectors = [[1, 2], [3]]", "Expected `array` of length 2, got 1 - at `$.lidar.mask.sectors[1]`"),
-        ("[lidar.mask]\nsectors = [[1, 1]]", "robot.toml:2: Expected two different bearings in `sectors`"),
-        ("[lidar]\ndevice = '/dev/ttyS1@9600'", "robot.toml:2: Expected a line rate of 19200, 38400"),
-        ("[lidar]\ndevice = 'auto:'", "robot.toml:2: Expected `auto`, `auto:SERIAL`, `none`, a path"),
-        ("[lidar]\ndevice = 'auto:a b'", "robot.toml:2: Expected a serial number behind `auto:`, as in auto:H0906091"),
+        ("\n[modbus]\nport = 70000", "robot.toml:3: `modbus.port` = 70000: expected a whole number, 0 to 65535"),
+        ("[modbus]\nwrite = 1", "robot.toml:2: `modbus.write` = 1: expected true or false"),
+        ("[lidar]\nmount = {x = nan}", "robot.toml:2: `lidar.mount.x` = nan: expected a number, -100.0 to 100.0"),
+        ("lidar.mount.x = inf", "robot.toml:1: `lidar.mount.x` = inf: expected a number, -100.0 to 100.0"),
+        ("lidar = 3", "robot.toml:1: `lidar` = 3: expected a table, [lidar], of device, intensity, mask, mount"),
+        (
+            "[lidar.mask]\nsectors = [[1, 2], [3]]",
+            "robot.toml:2: `lidar.mask.sectors[1]` = [3]: expected a list of [number, number], each -360.0 to",
+        ),
+        (
+            "[lidar.mask]\nsectors = [[1, 1]]",
+            "robot.toml:2: `lidar.mask.sectors`: expected two different bearings, got [1.0, 1.0]",
+        ),
+        (
+            "[lidar]\ndevice = '/dev/ttyS1@9600'",
+            "robot.toml:2: `lidar.device`: expected a line rate of 19200, 38400, 57600, 115200, 250000, 500000,",
+        ),
+        (
+            "[lidar]\ndevice = 'auto:'",
+            "robot.toml:2: `lidar.device`: expected `auto`, `auto:SERIAL`, `none`, a path such as /dev/ttyACM0",
+        ),
+        (
+            "[lidar]\ndevice = 'auto:a b'",
+            "robot.toml:2: `lidar.device`: expected a serial number behind `auto:`, as in auto:H0906091, got",
+        ),
         (
             "[lidar]\nserial = 'H1'",
             'robot.toml:2: `lidar.serial` is now part of `lidar.device`: write lidar.device = "auto:SERIAL"',
@@ -79,49 +96,97 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
             "lidar.baud = 19200",
             "robot.toml:1: `lidar.baud` is now part of `lidar.device`: write the rate behind the path, as in",
         ),
-        ("allow = ['10.0.0.1/24']", "robot.toml:1: Expected `10.0.0.0/24` (the network) or an address without `/`"),
-        ("allow = ['::1', 'plc']", "Expected an address or a network such as 192.168.0.0/24, got `plc` in `allow[1]`"),
-        ("[modbus]\nserial = 'ttyUSB1'", "robot.toml:2: Expected a path with its line rate and our unit, as in"),
-        ("[modbus]\nserial = '/dev/a@9601'", "robot.toml:2: Expected a line rate of 1200, 2400, 4800, 9600"),
-        ("[modbus]\nserial = '/dev/a@9600,7E1'", "robot.toml:2: Expected a format of 8E1, 8O1, 8N1, 8N2 behind"),
-        ("[modbus]\nserial = '/dev/a#0'", "robot.toml:2: Expected a unit from 1 to 247 behind `#`, got `/dev/a#0`"),
+        (
+            "allow = ['10.0.0.1/24']",
+            "robot.toml:1: `allow[0]`: expected `10.0.0.0/24` (the network) or an address without `/`, got",
+        ),
+        (
+            "allow = ['::1', 'plc']",
+            "robot.toml:1: `allow[1]`: expected an address or a network such as 192.168.0.0/24, got `plc`",
+        ),
+        (
+            "[modbus]\nserial = 'ttyUSB1'",
+            "robot.toml:2: `modbus.serial`: expected a path with its line rate and our unit, as in",
+        ),
+        (
+            "[modbus]\nserial = '/dev/a@9601'",
+            "robot.toml:2: `modbus.serial`: expected a line rate of 1200, 2400, 4800, 9600, 19200, 38400, 57600,",
+        ),
+        (
+            "[modbus]\nserial = '/dev/a@9600,7E1'",
+            "robot.toml:2: `modbus.serial`: expected a format of 8E1, 8O1, 8N1, 8N2 behind the rate, got",
+        ),
+        (
+            "[modbus]\nserial = '/dev/a#0'",
+            "robot.toml:2: `modbus.serial`: expected a unit from 1 to 247 behind `#`, got `/dev/a#0`",
+        ),
         (
             "[lidar]\ndevice = '/dev/a@19200'\n[modbus]\nserial = '/dev/a#2'",
-            "Expected another line than the lidar's in `modbus.serial`, got `/dev/a#2`",
+            "robot.toml:4: `modbus.serial`: expected another line than the lidar's, got `/dev/a#2`",
         ),
-        ("[pose]\nreceivers = ['*:1', '*:2']", "robot.toml:2: Expected one port to subscribe on, `*:port`"),
-        ("[pose]\nreceivers = ['*:1502']", "Expected a port of its own in `pose.receivers`, got `*:1502`"),
-        ("bind = 'robot'", "robot.toml:1: Expected an IP address of this machine in `bind`, got `robot`"),
-        ("[pose]\nreceivers = ['plc']", "robot.toml:2: Expected `host:port`, `[ipv6]:port` or `*:port`, got `plc`"),
-        ("[pose]\nreceivers = ['a:1', 'plc:0']", "got `plc:0` in `receivers[1]` - at `$.pose`"),
-        ("[odometry]\nport = 1502", "robot.toml:2: Expected a port other than Modbus's in `odometry.port`, got 1502"),
+        (
+            "[pose]\nreceivers = ['*:1', '*:2']",
+            "robot.toml:2: `pose.receivers`: expected one port to subscribe on, `*:port`",
+        ),
+        (
+            "[pose]\nreceivers = ['*:1502']",
+            "robot.toml:2: `pose.receivers`: expected a port other than `modbus.port`, got `*:1502`",
+        ),
+        ("bind = 'robot'", "robot.toml:1: `bind`: expected an IP address of this machine, got `robot`"),
+        (
+            "[pose]\nreceivers = ['plc']",
+            "robot.toml:2: `pose.receivers[0]`: expected `host:port`, `[ipv6]:port` or `*:port`, got `plc`",
+        ),
+        (
+            "[pose]\nreceivers = ['a:1', 'plc:0']",
+            "robot.toml:2: `pose.receivers[1]`: expected a port from 1 to 65535, got `plc:0`",
+        ),
+        (
+            "[odometry]\nport = 1502",
+            "robot.toml:2: `odometry.port`: expected a port other than `modbus.port`, got 1502",
+        ),
         (
             "[photodiode]\nbus = 'i2c-1'",
-            "robot.toml:2: Expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port",
+            "robot.toml:2: `photodiode.bus`: expected /dev/i2c-1, adapter:NAME, unix:/path or tcp://host:port,",
         ),
-        ("[lidar]\ndevice = 'tcp://robot:lidar'", "robot.toml:2: Expected tcp://host or tcp://host:port in `device`"),
-        ("[lidar]\ndevice = 'tcp://:10940'", "robot.toml:2: Expected tcp://host or tcp://host:port in `device`"),
-        ("[photodiode]\nbus = 'tcp://robot:70000'", "robot.toml:2: Expected tcp://host or tcp://host:port in `bus`"),
+        (
+            "[lidar]\ndevice = 'tcp://robot:lidar'",
+            "robot.toml:2: `lidar.device`: expected tcp://host or tcp://host:port, got `tcp://robot:lidar`",
+        ),
+        (
+            "[lidar]\ndevice = 'tcp://:10940'",
+            "robot.toml:2: `lidar.device`: expected tcp://host or tcp://host:port, got `tcp://:10940`",
+        ),
+        (
+            "[photodiode]\nbus = 'tcp://robot:70000'",
+            "robot.toml:2: `photodiode.bus`: expected tcp://host or tcp://host:port, got `tcp://robot:70000`",
+        ),
         (
             "[photodiode]\nconverter = 'mcp3221'",
-            "robot.toml:2: Expected chip@address, as in mcp3221@0x4d, got `mcp3221`",
+            "robot.toml:2: `photodiode.converter`: expected chip@address, as in mcp3221@0x4d, got `mcp3221`",
         ),
         ("[photodiode]\nconverter = 'mcp3221@0x20'", "Expected mcp3221@ADDRESS in `converter`, one of 0x48, 0x49"),
-        ("[photodiode]\nconverter = 'ads1115@0x48'", "robot.toml:2: chip ads1115: samples by a clock of its own"),
+        (
+            "[photodiode]\nconverter = 'ads1115@0x48'",
+            "robot.toml:2: `photodiode.converter`: chip ads1115: samples by a clock of its own, so it tells",
+        ),
         ("[photodiode]\nconverter = 'mcp3221@0x4d/0'", "Expected mcp3221@ADDRESS in `converter`"),
         (
             "[photodiode]\nlevel = 'ads1115@0x48'",
-            "Expected chip@address/channel beside the converter, got `ads1115@0x48`",
+            "robot.toml:2: `photodiode.level`: expected chip@address/channel beside the converter, got",
         ),
-        ("[photodiode]\nlevel = 'ads1115@0x20/1'", "robot.toml:2: DC channel at 0x20: an ads1115 answers at 0x48"),
+        (
+            "[photodiode]\nlevel = 'ads1115@0x20/1'",
+            "robot.toml:2: `photodiode.level`: DC channel at 0x20: an ads1115 answers at 0x48 to 0x4b",
+        ),
         (
             "[photodiode]\nconverter='mcp3221@0x48'\nlevel='ads1115@0x48/1'",
-            "robot.toml:3: Expected chip@address/channel beside the converter",
+            "robot.toml:3: `photodiode.level`: expected chip@address/channel beside the converter, got",
         ),
-        ("[photodiode]\nprofile = 'C'", "robot.toml:2: Expected one of A, B, D in `profile`, got `C`"),
+        ("[photodiode]\nprofile = 'C'", "robot.toml:2: `photodiode.profile`: expected one of A, B, D, got `C`"),
         ("[lidar]\ndevice = 'none'", "Expected a lidar or a photodiode: `lidar.device` is none"),
-        ("name = ''", "robot.toml:1: Expected `str` matching regex"),
-        ("x y", "robot.toml: not valid TOML: Expected '=' after a key"),
+        ("name = ''", 'robot.toml:1: `name` = "": expected text'),
+        ("x y", "robot.toml:1: not valid TOML: Expected '=' after a key in a key/value pair (at line 1, column 3)"),
     ],
 )
 def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, text: str, expected: str) -> None:
@@ -183,7 +248,82 @@ def test_a_survey_is_looked_for_beside_the_file_that_names_it(tmp_path: Path) ->
 
 
 def test_a_refusal_says_what_the_key_is_for(tmp_path: Path) -> None:
-    assert refused(tmp_path, "[modbus]\nport = -1").endswith("(UDP and TCP port; 0: no Modbus)")
+    assert refused(tmp_path, "[modbus]\nport = -1").endswith("(UDP and TCP port; 0: no Modbus); as in port = 1502")
+
+
+def test_all_that_is_wrong_is_said_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+    text = """bind = "robot"
+qqq = 1
+allow = ["plc"]
+[lidar]
+device = "aut"
+mount = { x = "1", yaw = 400.0 }
+[photodiode]
+bus = "i2c-1"
+profile = "C"
+converter = "mcp3221"
+[modbus]
+port = "a"
+write = 1
+[pose]
+receivers = ["plc"]
+"""
+    said = refused(tmp_path, text, "odometry.port=x", "=3", "cycle.budget_ms=-1").splitlines()
+    keys = [line.split("`")[1] for line in said if line.startswith("robot.toml:")]
+    assert keys == [
+        *("bind", "qqq", "allow[0]", "lidar.device", "lidar.mount.x", "lidar.mount.yaw", "photodiode.bus"),
+        *("photodiode.profile", "photodiode.converter", "modbus.port", "modbus.write", "pose.receivers[0]"),
+    ]
+    assert [int(line.split(":")[1]) for line in said if line.startswith("robot.toml:")] == [
+        *(1, 2, 3, 5, 6, 6, 8, 9, 10, 12, 13, 15)
+    ]
+    assert [line.split(": ")[0] for line in said[12:]] == [
+        *("--set odometry.port=x", "--set =3", "--set cycle.budget_ms=-1")
+    ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lidar.device = 'none'\n[photodiode]\nbus = 'i2c-1'",
+        "[modbus]\nport = 'x'\n[odometry]\nport = 1502",
+        "[lidar]\ndevice = 3\n[modbus]\nserial = '/dev/a'",
+        "bind = 'x'\nallow = ['10.0.0.0/8']",
+    ],
+)
+def test_what_stands_in_for_a_wrong_value_is_no_error_of_its_own(tmp_path: Path, text: str) -> None:
+    assert len(refused(tmp_path, text).splitlines()) == 1
+
+
+def test_one_wrong_value_hides_no_other_that_names_it(tmp_path: Path) -> None:
+    """What `allow` is for says `bind`."""
+    assert len(refused(tmp_path, "bind = 'x'\nallow = ['plc']").splitlines()) == 2
+
+
+@pytest.mark.parametrize("wrong", [3, 2.5, "text", True, [1], ["a", {}], {"a": 1}, "1979-05-27", float("nan"), 10**30])
+def test_no_error_speaks_of_the_program(wrong: object) -> None:
+    """Whatever stands where it does not belong."""
+    spoken = re.compile(r"\b(str|int|float|bool|array|object|None|regex|tuple|dict|Expected|at `\$)\b")
+    for option in configfile.options():
+        *parents, key = option.path.split(".")
+        tree: dict[str, object] = {key: wrong}
+        for parent in reversed(parents):
+            tree = {parent: tree}
+        for line in problems(tree, "robot.toml"):
+            assert f"`{option.path}" in line
+            assert "; as in " in line
+            assert not spoken.search(line), line
+
+
+def test_the_example_of_each_option_is_one_that_is_taken() -> None:
+    for option in configfile.options():
+        *parents, key = option.path.split(".")
+        tree = {key: msgspec.to_builtins(option.example)}
+        for parent in reversed(parents):
+            tree = {parent: tree}
+        assert problems(tree, "example") == []
+        assert option.example != "", option.path
+        assert option.example != (), option.path
 
 
 @pytest.mark.parametrize(
@@ -226,7 +366,7 @@ def test_overrides_beat_the_file_and_take_bare_words(tmp_path: Path) -> None:
     [
         ("modbus.port", "--set modbus.port: expected KEY=VALUE"),
         ("=3", "--set =3: expected KEY=VALUE"),
-        ("modbus.port=x", "--set modbus.port=x: Expected `int`, got `str` - at `$.modbus.port`"),
+        ("modbus.port=x", '--set modbus.port=x: `modbus.port` = "x": expected a whole number, 0 to 65535'),
         ("name.x=1", "--set name.x=1: `name` is a value"),
         ("modbus.prot=1", "--set modbus.prot=1: unknown key `modbus.prot`; did you mean `modbus.port`?"),
     ],
@@ -295,5 +435,5 @@ def test_wrong_endpoints(text: str) -> None:
 
 def test_a_character_that_no_name_can_have_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('[lights]\nsurvey = "a\\u0000b"\n')
-    with pytest.raises(ConfigError, match=r"a\.toml: `lights\.survey` holds the character"):
+    with pytest.raises(ConfigError, match=r"a\.toml:2: `lights\.survey` holds the character"):
         load(tmp_path / "a.toml")

@@ -15,7 +15,7 @@ import pytest
 
 from daemon.budget import FixedBudget
 from daemon.config import Config, LidarConfig, MapConfig, ModbusConfig, Mount
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot, State
 from daemon.reasons import Reason

@@ -7,7 +7,7 @@ import pytest
 from daemon.cli import FAILED, OK, main
 from daemon.configfile import options
 from daemon.explain import entries, find
-from daemon.health import FAULTS
+from daemon.faults import FAULTS
 from daemon.publish import holding
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State

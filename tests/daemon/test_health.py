@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
 from daemon import heartbeat as module
 from daemon.condition import NAMES
-from daemon.health import FAULTS, PUBLISHERS, Fault, Vitals, assess, describe
+from daemon.faults import FAULTS, Fault
+from daemon.health import PUBLISHERS, Vitals, assess, describe
 from daemon.heartbeat import Heartbeat
 from hal.clock import run_virtual
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused
@@ -100,6 +103,22 @@ def test_every_fault_has_a_meaning_and_a_remedy() -> None:
     assert describe(Fault.OVERRUNS).startswith("fault 302: more than 5 % of the cycles")
 
 
+@pytest.mark.parametrize("fault", [Fault.LIDAR_LATE, Fault.ODOMETRY_GAPS])
+def test_what_is_stamped_late_may_be_stamped_at_arrival(fault: Fault) -> None:
+    text, remedy = FAULTS[fault]
+    assert "stamped late" in text
+    assert "at arrival" in remedy
+
+
+def test_what_cannot_publish_is_named() -> None:
+    now = replace(WELL, failed=frozenset(["stream", "map", "odometry"]))
+    assert describe(Fault.PUBLISHER_FAILED, now).endswith("): stream")
+    assert describe(Fault.PART_FAILED, now).endswith("): odometry")
+    both = replace(WELL, failed=frozenset(["stream", "modbus"]))
+    assert describe(Fault.PUBLISHER_FAILED, both).endswith("): modbus, stream")
+    assert "stream's socket" in FAULTS[Fault.PUBLISHER_FAILED][1]
+
+
 class Patient:
     """Vitals that a test sets."""
 
@@ -133,8 +152,22 @@ def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: py
     assert heart.fault() == 0
     assert [record.message.split(" (")[0] for record in caplog.records] == [
         "fault 105: more than 5 % of the lidar's frames are damaged",
-        "over: fault 105: more than 5 % of the lidar's frames are damaged",
+        "over: fault 105: more than 5 % of the lidar's frames are damaged; it lasted 10 s",
     ]
+
+
+def test_what_is_over_is_said_with_how_long_it_lasted_and_nothing_is_to_be_done(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    gone = DeviceMissing("/dev/ttyACM0", "no such device", "plug it in")
+    for beat in range(30):
+        lost = 5 <= beat < 12 and beat != 8  # once back for a second: one fault all the same
+        patient.now = replace(patient.now, link=Link.WAITING if lost else Link.STREAMING, error=gone)
+        heart.beat(0.0)
+    assert caplog.messages[1:] == ["over: fault 101: the lidar is not there; it lasted 7 s"]
 
 
 def test_a_lag_between_laser_and_wheels_is_said_once_each_way_with_its_seconds(
@@ -161,6 +194,27 @@ def test_a_stall_is_said_once_and_over_when_none_has_come_for_a_while(caplog: py
         heart.beat(0.5 if beat in (5, 8, 12) else 0.001)
         assert (Fault.LOOP_STALLED in heart.faults) == (5 <= beat <= 22)
     assert len(caplog.records) == 2
+
+
+def test_a_beat_that_comes_late_names_no_device_before_it_has_been_heard(caplog: pytest.LogCaptureFixture) -> None:
+    """When a stopped process wakes, nobody has taken what has arrived; what is wrong still, the next beat names."""
+    caplog.set_level(logging.INFO)
+    patient = Patient()
+    heart = Heartbeat(patient.sample, str)
+    seen: list[tuple[Fault, ...]] = []
+    for beat in range(12):
+        woken = beat == 3
+        silent = woken or 6 <= beat <= 8
+        patient.now = replace(patient.now, silent=silent, odometry=not woken)
+        heart.beat(3.0 if woken or beat == 7 else 0.0)
+        seen.append(heart.faults)
+    assert seen[3] == (Fault.LOOP_STALLED,)
+    assert seen[6:9] == [(Fault.LIDAR_SILENT, Fault.LOOP_STALLED)] * 3, "what has been named is not taken back"
+    for _ in range(2):
+        patient.now = replace(patient.now, silent=True)
+        heart.beat(3.0)
+    assert Fault.LIDAR_SILENT in heart.faults, "a loop that is always late hides nothing"
+    assert [message[:10] for message in caplog.messages[:2]] == ["fault 301:", "fault 104:"]
 
 
 def test_a_fault_that_comes_and_goes_is_one_fault_and_said_in_the_devices_words(
@@ -236,6 +290,29 @@ def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
     run_virtual(go())
     assert len(seen) == 10
     assert max(seen) < 1e-6
+
+
+def test_after_a_beat_that_came_late_the_next_one_is_a_second_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once it would find nothing but what the late one has found."""
+    monkeypatch.setattr(module, "BEAT_S", 0.05)
+    beats: list[float] = []
+
+    async def go() -> None:
+        loop = asyncio.get_running_loop()
+
+        def sample(lateness: float) -> Vitals:
+            beats.append(loop.time())
+            return Vitals(loop.time())
+
+        beating = asyncio.create_task(Heartbeat(sample, str).run())
+        await asyncio.sleep(0.06)
+        time.sleep(0.23)  # noqa: ASYNC251  # the loop stands still: that is what is tested
+        await asyncio.sleep(0.2)
+        beating.cancel()
+
+    asyncio.run(go())
+    assert len(beats) >= 3
+    assert min(after - before for before, after in pairwise(beats)) > 0.045
 
 
 def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next_is_tried(

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.lampwatch import FORGOTTEN_S, LASTS_S, LampWatch
 from estimator.cdma_epoch import BlockFlag
 from estimator.result import Fix, LightsResult, Link, LinkState

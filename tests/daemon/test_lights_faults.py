@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from daemon.health import FAULTS, Fault
+from daemon.faults import FAULTS, Fault
 from daemon.publish.snapshot import State
 from estimator.cdma_profile import PROFILE_A
 from hal.fake.adc_faults import ERRORS

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.lights import Lights
 from daemon.publish import registers
 from daemon.sampleclock import FILE

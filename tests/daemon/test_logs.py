@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from daemon import logs
-from daemon.health import FAULTS, Fault, Vitals
+from daemon.faults import FAULTS, Fault
+from daemon.health import Vitals
 from daemon.heartbeat import OVER_S, Heartbeat
 
 CATALOG = Path(__file__).parents[2] / "systemd" / "lumiloop.catalog"
@@ -147,6 +148,8 @@ def test_the_heartbeat_tells_faults_with_their_fields(caplog: pytest.LogCaptureF
     came, over = (record.__dict__["fields"] for record in caplog.records)
     assert (came["MESSAGE_ID"], over["MESSAGE_ID"]) == (logs.FAULT_ID, logs.OVER_ID)
     assert came["LUMILOOP_FAULT_NAME"] == over["LUMILOOP_FAULT_NAME"] == "OVERRUNS"
+    assert "LUMILOOP_REMEDY" in came
+    assert "LUMILOOP_REMEDY" not in over
 
 
 def test_the_catalog_explains_every_message_id_with_fields_that_are_sent() -> None:

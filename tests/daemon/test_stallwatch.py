@@ -11,7 +11,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from daemon.pacemaker import IDLE_PERIODS
 from daemon.stallwatch import Caught, StallWatch, cause
+from tests.daemon.test_cycle import PERIOD, Bench, on_bench
 
 
 @pytest.fixture
@@ -111,3 +113,31 @@ def test_closed_it_gives_the_signal_back() -> None:
     watch.close()
     time.sleep(0.05)
     assert signal.getsignal(signal.SIGALRM) is before
+
+
+class Told:
+    """A watch that says of the cycles that begin what a test wants."""
+
+    def __init__(self, *lasted: float | None) -> None:
+        self._lasted = iter(lasted)
+
+    def arm(self, seconds: float) -> float | None:
+        return next(self._lasted, None)
+
+    def close(self) -> None:
+        return
+
+
+@pytest.mark.jit
+def test_how_late_the_loop_was_is_told_once_whenever_it_stood_still() -> None:
+    """The heartbeat alone, once a second, would see a stop of half a second now and then."""
+    told: list[float] = []
+
+    async def driven(bench: Bench) -> None:
+        bench.pacemaker.watch = Told(None, None, 0.6, 0.9, None)
+        for begin in range(0, 16, 8):
+            await bench.drive(begin, 8)
+            told.append(bench.pacemaker.latest())
+
+    on_bench(driven)
+    assert told == [pytest.approx(0.9 - IDLE_PERIODS * PERIOD), 0.0]

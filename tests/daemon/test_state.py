@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from random import Random
 
 import pytest
 from hypothesis import given
@@ -13,7 +14,7 @@ from daemon.publish.snapshot import State
 from daemon.reasons import REASONS, Reason
 from daemon.state import judge
 from daemon.state_evidence import SILENT_PERIODS, VAGUE_M, Evidence, Light, Match
-from daemon.state_memory import FAILED_SCANS, Memory
+from daemon.state_memory import AGAIN_S, FAILED_SCANS, Memory
 from tests.daemon.judged import ALL, BAD, CORRIDOR, LIT, PERIOD, run, said, scans, seen, tracking
 
 
@@ -219,6 +220,52 @@ def test_a_laser_that_comes_and_goes_does_not_forget_what_was_proved() -> None:
     failing = run(memory, scans(t, FAILED_SCANS, BAD, odometry=True))
     assert not failing.sure
     assert not failing.recalled
+
+
+def lossy(begin: float, period: float, loss: float, seed: int) -> list[Evidence]:
+    """Six seconds of a laser whose scans get lost by chance; without one there is a cycle after 1.5 periods."""
+    draw, last, cycle = Random(seed), begin, begin
+    told: list[Evidence] = []
+    for scan in range(1, round(6.0 / period) + 1):
+        t = begin + scan * period
+        while t - cycle > 1.5 * period + 1e-9:
+            cycle += 1.5 * period
+            told.append(seen(cycle, None, silence=(cycle - last) / period))
+        if draw.random() >= loss:
+            last = cycle = t
+            told.append(seen(t, NEAR, silence=0.0))
+    return told
+
+
+@pytest.mark.parametrize("period", [0.025, 0.1])
+@pytest.mark.parametrize("loss", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_laser_that_loses_many_scans_does_not_take_the_state_along(period: float, loss: float, seed: int) -> None:
+    memory = run(Memory(), [seen(period * i, NEAR) for i in range(round(4.0 / period))])
+    assert memory.state is State.TRACKING
+    changes = 0
+    for evidence in lossy(4.0, period, loss, seed):
+        before, memory = memory.state, judge(memory, evidence)
+        changes += memory.state is not before
+        if evidence.silence is not None and evidence.silence >= SILENT_PERIODS:
+            assert memory.state is State.NO_LIDAR, "bad news counts at once"
+    assert changes <= 12, "two a second"
+    after = 0
+    while memory.state is not State.TRACKING:
+        after += 1
+        memory = judge(memory, seen(10.0 + after * period, NEAR))
+    assert after * period <= 1.0
+
+
+def test_a_single_gap_is_over_with_the_first_scan() -> None:
+    memory = run(tracking(), gap(3.0, 2.0))
+    assert memory.state is State.NO_LIDAR
+    assert judge(memory, seen(5.0, NEAR)).state is not State.NO_LIDAR
+    again = run(memory, [*scans(5.0, 10, NEAR), *gap(6.0, 1.0)])
+    assert judge(again, seen(7.0, NEAR)).state is State.NO_LIDAR
+    assert run(again, scans(7.0, 10, NEAR)).state is State.TRACKING
+    later = run(again, [*scans(7.0, 10 + round(10.0 * AGAIN_S), NEAR), *gap(8.0 + AGAIN_S, 1.0)])
+    assert judge(later, seen(9.0 + AGAIN_S, NEAR)).state is not State.NO_LIDAR
 
 
 def test_after_the_start_a_pose_that_is_found_where_the_run_before_has_left_it_is_tracked_at_once() -> None:

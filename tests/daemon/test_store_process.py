@@ -11,7 +11,7 @@ from socket import create_connection
 
 import pytest
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.publish.holding import COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.publish.snapshot import State
 from tests.daemon.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.main import Daemon
 from daemon.publish.snapshot import Snapshot, State
 from daemon.store import Start

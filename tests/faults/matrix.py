@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.heartbeat import OVER_S
 from daemon.publish.snapshot import State
 from tests.faults.house import ROBOT, House, Line, Sight, live, surveyed, tracking

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.publish import client, document, integrity, lights, parts, pulse, registers
 from daemon.publish.requests import BLOCKS, Responder
 from daemon.publish.snapshot import Condition, Part, Thread

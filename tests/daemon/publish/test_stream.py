@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.publish import stream
+from daemon.publish import stream, stream_client
 from daemon.publish.snapshot import Snapshot, State
 from daemon.publish.stream import Client, StreamServer, scan_message
 from hal.clock import run_virtual
@@ -149,7 +149,7 @@ def test_who_asks_for_the_state_is_told_it_at_once(tmp_path: Path) -> None:
 
 def test_without_clients_nothing_is_encoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serve(tmp_path / "stream")
-    monkeypatch.setattr(stream, "_encode", lambda message: pytest.fail("encoded"))
+    monkeypatch.setattr(stream, "encode", lambda message: pytest.fail("encoded"))
     server.publish(SNAPSHOT)
     server.on_scan(raw_scan())
 
@@ -184,7 +184,7 @@ def test_a_slow_client_gets_the_latest_and_every_event_and_others_all(tmp_path: 
 
 
 def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "STUCK_S", 0.05)
+    monkeypatch.setattr(stream_client, "STUCK_S", 0.05)
 
     async def body(server: StreamServer) -> None:
         tap = await wanting(server, "pose")
@@ -244,20 +244,20 @@ def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.Mon
         client.connection_made(wire)
         for turn in (1, 2):
             client.data_received((stream.framed({"want": []}) + stream.framed({"want": ["map"]})) * 50)
-            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream.REQUESTS_PER_TURN, False)
+            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_client.REQUESTS_PER_TURN, False)
             await asyncio.sleep(2.0)
             assert (len(asked), wire.reading) == (100 * turn, True)
         assert asked == [frozenset(), frozenset({"map"})] * 100
         client.data_received(stream.framed({"want": []}) * 50)
         wire.close()
         await asyncio.sleep(2.0)
-        assert len(asked) == 200 + stream.REQUESTS_PER_TURN, "who has gone asks no more"
+        assert len(asked) == 200 + stream_client.REQUESTS_PER_TURN, "who has gone asks no more"
 
     run_virtual(body())
 
 
 def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "CLIENTS", 2)
+    monkeypatch.setattr(stream_client, "CLIENTS", 2)
 
     async def body(server: StreamServer) -> None:
         taps = [await connected(server) for _ in range(2)]
@@ -310,7 +310,7 @@ def test_any_bytes_from_a_client_do_no_harm(chunks: list[bytes]) -> None:
     for chunk in chunks:
         client.data_received(chunk)
     assert client.wants <= set(stream.TOPICS)
-    assert len(client._received) <= stream.LONGEST_REQUEST + 4 or client.wants == frozenset()
+    assert len(client._received) <= stream_client.LONGEST_REQUEST + 4 or client.wants == frozenset()
 
 
 def test_a_scan_message_names_everything_a_reader_needs() -> None:

@@ -13,8 +13,8 @@ import pytest
 from daemon import blackbox, checkpoint, cli, disk
 from daemon.config import Config
 from daemon.disk import SegmentWriter
+from daemon.faults import Fault
 from daemon.flight import ABOUT, DUMP, Flight
-from daemon.health import Fault
 from daemon.moment import CYCLE_PARTS
 from daemon.replay import replay
 from hal.clock import run_virtual

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from daemon import restore as reading
-from daemon.health import Fault
+from daemon.faults import Fault
 from daemon.publish.snapshot import State as Said
 from daemon.restore import ROOT, CannotRestore, Piece, function_within, restore
 from daemon.watch import Watch

@@ -68,6 +68,14 @@ def test_a_time_that_nobody_has_recorded_is_told_with_those_that_were() -> None:
         find([SPAN], "21:00:00Z", Path())
 
 
+def test_a_second_of_which_a_part_is_recorded_is_found_and_an_instant_is_not() -> None:
+    late = Span(Path("late"), AT + 5.4, AT + 60.0, 0.0)
+    assert find([late], "22:13:25Z", Path()) == (late, AT + 5.4)
+    assert find([SPAN], "23:13:20Z", Path())[1] - AT == 3600.0
+    with pytest.raises(NoMoment, match="not in what is recorded"):
+        find([late], "22:13:25.0Z", Path())
+
+
 @pytest.mark.parametrize(("wheels_m", "turn", "agree"), [(1.0, 0.0, True), (0.65, 0.0, False), (1.0, 0.4, False)])
 def test_witnesses_agree_within_slip(wheels_m: float, turn: float, agree: bool) -> None:
     told = Told(2.0, np.array((1.0, 0.0, 0.0)), np.array((wheels_m, 0.0, turn)))
@@ -98,6 +106,22 @@ def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]
     assert "x       UNKNOWN since" in said
     assert "TRACKING: the pose is confirmed" in said
     assert "NO_LIDAR: no valid scan" in said
+
+
+def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the journal says when it came; an instant is the cycle in force then."""
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
+    silent = next(line for line in asked("9", dump, capsys).splitlines() if "NO_LIDAR since" in line)
+    at = silent.split(" since ")[1].split(": ")[0]
+    second, fraction = at.split(".")
+    assert int(fraction) > 0, "else nothing is shown here"
+    head, state = asked(second, dump, capsys).splitlines()[:2]
+    assert f"{second}, the whole second: state, reason or fault first change in it, cycle of {at}" in head
+    assert state == silent
+    head, state = asked(f"{second}.0", dump, capsys).splitlines()[:2]
+    assert f"{second}.000, cycle of" in head
+    assert state.startswith("TRACKING since")
+    assert "the whole second: nothing changes, cycle of" in asked("9", dump, capsys).splitlines()[0]
 
 
 def test_a_run_where_all_is_well_from_a_folder_of_several(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,13 +13,14 @@ from pathlib import Path
 import msgspec
 
 from daemon.maptiles import MapTiles
-from daemon.publish.stream import BUFFER_BYTES, TOPICS, Client, StreamServer, framed
+from daemon.publish.stream import TOPICS, Client, StreamServer, framed
+from daemon.publish.stream_client import BUFFER_BYTES
 from hal.clock import VirtualLoop
 from hal.share import Share
 from tests.daemon.publish.test_registers import snapshot
 
 MEGABYTES = 10
-PARSERS = ("daemon/publish/stream.py",)
+PARSERS = ("daemon/publish/stream_client.py",)
 TILES, TILE_SIZE = 400, 600
 """Of the map: as many as of a large hall."""
 TURN_S = 0.02

@@ -10,7 +10,13 @@ from tests.daemon.mapmaker import SURVEY
 from tests.fuzz.targets import a_file, refused
 
 MEGABYTES = 3
-PARSERS = ("daemon/configfile.py", "daemon/config.py", "daemon/surveyfile.py", "daemon/mapserver.py")
+PARSERS = (
+    "daemon/configfile.py",
+    "daemon/configwords.py",
+    "daemon/config.py",
+    "daemon/surveyfile.py",
+    "daemon/mapserver.py",
+)
 
 DESCRIPTION = (
     b"image: a.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"

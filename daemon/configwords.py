@@ -1,0 +1,243 @@
+"""What is known of the keys of the configuration, and what is wrong with one, in words for who writes it.
+
+Each problem names the file, the line, the key, what was found, what is allowed, what the key is for and an example; an
+unknown key names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from daemon.config import Config
+
+if TYPE_CHECKING:
+    from msgspec import inspect
+
+MOVED: Final = {
+    "lidar.serial": 'write lidar.device = "auto:SERIAL", as in "auto:H0906091"',
+    "lidar.baud": 'write the rate behind the path, as in lidar.device = "/dev/ttyUSB0@115200", or leave it out: it is '
+    "found by itself",
+}
+"""Keys of earlier versions, and what to write instead."""
+LONGEST: Final = 60
+"""Characters of a value that are repeated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """One key of the tree, as people need to know it; ``example``: a value that means something."""
+
+    path: str
+    kind: str
+    default: Any
+    description: str
+    example: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """What is wrong: ``keys`` lead to it through the tree, empty where it is not one key; ``words`` say it.
+
+    ``beside``: what names the other keys that it is about.
+    """
+
+    keys: tuple[str, ...]
+    words: str
+    beside: str = ""
+
+
+def options() -> list[Option]:
+    """Every option of the tree in order of declaration."""
+    from msgspec import inspect  # costs 10 ms, and only explanations need it
+
+    kind = inspect.type_info(Config)
+    assert isinstance(kind, inspect.StructType)
+    return list(_walk(kind, ""))
+
+
+def problems(tree: dict[str, Any], name: str, text: str = "") -> list[str]:
+    """Everything that is wrong with a tree, a line each; what is wrong is taken out, so that the rest can be judged.
+
+    Args:
+        tree: as TOML holds it; good afterwards, where each problem is that of one key.
+        name: of the file or the option that it comes from.
+        text: of that file, for the numbers of lines.
+    """
+    found: list[tuple[int, str]] = []
+    gone: list[str] = []
+
+    def tell(problem: _Problem) -> None:
+        path = ".".join(problem.keys)
+        if not any(f"`{key}`" in problem.beside for key in gone):  # else it is about the value that stands in for that
+            found.append((_line_of(text, path), problem.words))
+        gone.append(path)
+
+    for nul in list(_nul(tree, ())):
+        tell(nul)
+        _take_out(tree, nul.keys)
+    while (problem := _first(tree)) is not None:
+        tell(problem)
+        if not _take_out(tree, problem.keys):
+            break
+    found.sort(key=lambda one: one[0])
+    return [f"{name}:{line}: {words}" if line else f"{name}: {words}" for line, words in found]
+
+
+def _first(tree: dict[str, Any]) -> _Problem | None:
+    """What is found wrong first; None where the tree is good."""
+    try:
+        msgspec.convert(tree, Config)
+    except msgspec.ValidationError as error:
+        return _explain(str(error), tree)
+    return None
+
+
+def _take_out(tree: dict[str, Any], keys: tuple[str, ...]) -> bool:
+    """Whether there was such a key."""
+    for key in keys[:-1]:
+        tree = tree.get(key, {})
+    return bool(keys) and tree.pop(keys[-1], None) is not None
+
+
+def _nul(tree: dict[str, Any], parents: tuple[str, ...]) -> Iterator[_Problem]:
+    """TOML can write the character that ends a name for the operating system; no path or address has it."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _nul(value, (*parents, key))
+        elif "\0" in str(value):
+            keys = (*parents, key)
+            yield _Problem(keys, f"`{'.'.join(keys)}` holds the character \\u0000; leave it out")
+
+
+def _explain(message: str, tree: dict[str, Any]) -> _Problem:
+    """What the library says, or a check of `daemon.config`, in words for who writes the file."""
+    at = re.search(r" - at `\$\.?([^`]*)`$", message)
+    place, message = (at[1], message[: at.start()]) if at else ("", message)
+    keys = _keys(place)
+    if unknown := re.search(r"contains unknown field `(.*)`$", message, re.DOTALL):
+        keys = (*keys, unknown[1])
+        path = ".".join(keys)
+        moved = f"`{path}` is now part of `lidar.device`: {MOVED.get(path)}"
+        return _Problem(keys, moved if path in MOVED else f"unknown key `{path}`{_nearest(path)}")
+    known = {option.path: option for option in options()}
+    if (option := known.get(".".join(keys))) is not None:
+        expected = re.sub("^(?=whole|number|list)", "a ", option.kind)
+        return _Problem(keys, f"`{place}` = {_found(tree, place)}: expected {expected}{_purpose(option)}")
+    if keys and not isinstance(_value(tree, place), dict):
+        inside = ", ".join(sorted({path[len(place) + 1 :].split(".")[0] for path in known if path.startswith(place)}))
+        return _Problem(keys, f"`{place}` = {_found(tree, place)}: expected a table, [{place}], of {inside}")
+    for inner in re.finditer(r"`([a-z_.]+)((?:\[\d+\])?)`(?=, got|$)", message):
+        path = f"{place}.{inner[1]}".lstrip(".")
+        if (option := known.get(path)) is not None:
+            said = re.sub(f",? in {re.escape(inner[0])}", "", message).replace("Expected", "expected", 1)
+            return _Problem(tuple(path.split(".")), f"`{path}{inner[2]}`: {said}{_purpose(option)}", said)
+    return _Problem(keys, message, message)
+
+
+def _keys(place: str) -> tuple[str, ...]:
+    """Keys of a place without what counts items of lists."""
+    return tuple(re.sub(r"\[\d+\]", "", place).split(".")) if place else ()
+
+
+def _value(tree: Any, place: str) -> Any:
+    """What the tree holds at a place such as ``lidar.mask.sectors[1]``."""
+    for key, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", place):
+        tree = tree[int(number)] if number else tree[key]
+    return tree
+
+
+def _found(tree: dict[str, Any], place: str) -> str:
+    text = value_text(_value(tree, place))
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def _purpose(option: Option) -> str:
+    key = option.path.rpartition(".")[2]
+    return f" ({option.description}); as in {key} = {value_text(option.example)}"
+
+
+def _nearest(path: str) -> str:
+    known = [option.path for option in options()]
+    last = path.rpartition(".")[2]
+    same_name = [other for other in known if other.rpartition(".")[2] == last]
+    near = same_name or difflib.get_close_matches(path, known, n=1, cutoff=0.6)
+    if not near:
+        return "; `lumiloop --print-config` lists all keys"
+    return "; did you mean " + " or ".join(f"`{other}`" for other in near[:3]) + "?"
+
+
+def _line_of(text: str, path: str) -> int:
+    """Line of the assignment that holds the key at ``path``, or of its table; 0 where neither is written out."""
+    table = ""
+    best, best_length = 0, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
+            table = _plain(header[1])
+            here = table
+        elif key := re.match(r"\s*([\w.\-\"' ]+?)\s*=", line):
+            here = f"{table}.{_plain(key[1])}".lstrip(".")
+        else:
+            continue
+        if (path == here or path.startswith(here + ".")) and len(here) > best_length:
+            best, best_length = number, len(here)
+    return best
+
+
+def _plain(key: str) -> str:
+    return re.sub(r"[\"' ]", "", key)
+
+
+def _walk(kind: inspect.StructType, prefix: str) -> Iterator[Option]:
+    from msgspec import inspect
+
+    for field in kind.fields:
+        path = prefix + field.name
+        if isinstance(field.type, inspect.StructType):
+            yield from _walk(field.type, path + ".")
+        else:
+            told = _told(field.type)
+            example = told.get("examples", [field.default])[0]
+            yield Option(path, _kind(field.type), field.default, told.get("description", ""), example)
+
+
+def _told(kind: inspect.Type) -> dict[str, Any]:
+    """What `daemon.config` says of a key."""
+    from msgspec import inspect
+
+    return dict(kind.extra_json_schema or {}) if isinstance(kind, inspect.Metadata) else {}
+
+
+def _kind(kind: inspect.Type) -> str:
+    from msgspec import inspect
+
+    if isinstance(kind, inspect.Metadata):
+        return _kind(kind.type)
+    if isinstance(kind, (inspect.IntType, inspect.FloatType)):
+        name = "whole number" if isinstance(kind, inspect.IntType) else "number"
+        return f"{name}, {kind.ge} to {kind.le}" if kind.ge is not None and kind.le is not None else name
+    if isinstance(kind, inspect.BoolType):
+        return "true or false"
+    if isinstance(kind, inspect.VarTupleType):
+        return f"list of {_kind(kind.item_type)}"
+    if isinstance(kind, inspect.TupleType):
+        items = [_kind(item).partition(", ") for item in kind.item_types]
+        return f"[{', '.join(name for name, _, _ in items)}]" + (f", each {items[0][2]}" if items[0][2] else "")
+    return "text"
+
+
+def value_text(value: object) -> str:
+    """A value of the tree as TOML writes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return repr(value)
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(value_text(item) for item in value) + "]"
+    # a JSON string is a TOML basic string, except that TOML wants DEL escaped too
+    return msgspec.json.encode(value).decode().replace("\x7f", "\\u007F")
