@@ -22,6 +22,9 @@ from estimator.result import SURPRISE
 from estimator.state import State
 from estimator.tied import UNTIED
 
+NARROWEST = 1e-12
+"""Share of the largest eigenvalue below which one of an information is taken for nothing but rounding."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Said:
@@ -75,7 +78,7 @@ def take(state: State, T_map_newest: Array, P_newest: Array) -> None:
     off[2] = se2.wrap(float(off[2]))
     R = se2.rotation(state.T_map_odom[2])
     off = R.T @ off
-    if not np.isfinite(P_map).all() or off @ invert3(P_map + tie.P + absolute.TOLERANCE) @ off > SURPRISE:
+    if not np.isfinite(P_map + tie.P).all() or off @ invert3(P_map + tie.P + absolute.TOLERANCE) @ off > SURPRISE:
         return  # light has the last word
     L_before = invert3(tie.P)
     G = surplus(invert3(P_map), L_before)
@@ -87,12 +90,13 @@ def take(state: State, T_map_newest: Array, P_newest: Array) -> None:
 
 
 def surplus(L: Array, than: Array) -> Array:
-    """By how much one information (3, 3) exceeds another, positive definite: the part of ``L - than`` that is positive.
+    """By how much one information (3, 3) exceeds another: the part of ``L - than`` that is positive.
 
     Positive as seen with ``than`` for a measure, so that it does not depend on units.
     """
-    C = np.linalg.cholesky(than)
-    K = np.linalg.solve(C, np.linalg.solve(C, L).T)
+    size, V = np.linalg.eigh(than)
+    size = np.sqrt(np.maximum(size, NARROWEST * size[-1]))  # never singular, whatever rounding has left
+    K = (V / size).T @ L @ (V / size)
     more, U = np.linalg.eigh(0.5 * (K + K.T))
-    V = C @ U
+    V = (V * size) @ U
     return np.asarray(V * np.maximum(more - 1.0, 0.0) @ V.T)

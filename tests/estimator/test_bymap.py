@@ -152,3 +152,11 @@ def test_surplus_is_what_exceeds_in_each_direction_in_whatever_units(
     np.testing.assert_allclose(
         surplus(scale @ L @ scale, scale @ than @ scale), scale @ G @ scale, rtol=1e-6, atol=1e-9
     )
+
+
+def test_surplus_over_an_information_that_rounding_has_made_indefinite_is_finite() -> None:
+    than = np.diag((1e10, 1e3, -1e-7))
+    G = surplus(np.diag((1.0, 1.0, 1e6)), than)
+    assert np.isfinite(G).all()
+    assert G[2, 2] == pytest.approx(1e6, rel=0.1)
+    assert abs(G[0, 0]) < 1.0
