@@ -77,6 +77,7 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             "mode": mode,
             f"{side}/endpoints": [locator(endpoint)],
             "scouting/multicast/enabled": False,
+            "transport/shared_memory/enabled": False,  # needs rights that a service does without
             "timestamping/enabled": True,  # the caches for those who come late need it
             "transport/link/rx/max_message_size": MOST_BYTES,
             "transport/link/tx/lease": round(1e3 * LEASE_S),
