@@ -72,3 +72,20 @@ def test_the_exports_of_the_documents(recording: Path, tmp_path: Path, monkeypat
             ran += 1
     assert ran == 2
     assert {path.name for path in tmp_path.iterdir()} >= {"drive.mcap", "drive.tum", "whole.mcap"}
+
+
+@pytest.mark.system
+def test_the_program_of_the_documents_reads_what_was_exported(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
+    (program,) = re.findall(
+        r"^```python\n(.*?)^```", (ROOT / "docs" / "formats.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["export", str(recording), "--mcap", "drive.mcap"]) == cli.OK
+    capsys.readouterr()
+    exec(compile(program, "formats.md", "exec"), {})
+    said = capsys.readouterr().out.splitlines()
+    assert len([line for line in said if len(line.split()) == 4]) > 70
+    assert any(line.split()[1] == "MAPPING" for line in said)
