@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,22 @@ def test_every_command_in_the_documents_is_understood(page: Path) -> None:
     for words in commands(page):
         if words != ["--help"]:
             assert cli.parser().parse_args(words).body is not None, f"{page.name}: {words}"
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A parser, and those of its commands and their verbs."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from parsers(below)
+
+
+def test_every_command_and_verb_has_help() -> None:
+    every = list(parsers(cli.parser()))
+    assert len(every) > 30
+    for parser in every:
+        assert parser.format_help().startswith("usage: ")
 
 
 def test_the_doctor_of_the_documents(
