@@ -26,7 +26,7 @@ from tests.taps.documented import ELSEWHERE, NOT_RUN, ROOT, RUN, all_documented,
 from tests.taps.routers import free_port
 
 AT = "%H:%M:%S"
-SHORTER = {"--seconds": "4", "--journal-at": "2"}
+SHORTER = {"--seconds": "2", "--journal-at": "2"}
 PROGRAMS = {"lumiloop": [sys.executable, "-m", "daemon"], "python": [sys.executable]}
 
 
