@@ -91,7 +91,7 @@ def _fleet(parser: argparse.ArgumentParser) -> None:
     cli.config_arguments(fetch)
     fetch.set_defaults(body=needing("zenoh", "taps.fleet.fetch", "main"))
     router = verbs.add_parser("router", help="be the router that they all meet at, until stopped")
-    router.add_argument("--listen", default="127.0.0.1:7447", metavar="HOST:PORT", help="default: %(default)s")
+    router.add_argument("--listen", default="127.0.0.1:7447", metavar="HOST:PORT", help="default: 127.0.0.1:7447")
     cli.config_arguments(router)
     router.set_defaults(body=needing("zenoh", "taps.fleet.share", "router"))
     for verb in (join, share, fetch, router):
@@ -103,7 +103,7 @@ def _fleet(parser: argparse.ArgumentParser) -> None:
 
 def _meeting(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--router", default="127.0.0.1:7447", metavar="HOST:PORT", help="Zenoh router; default: %(default)s"
+        "--router", default="127.0.0.1:7447", metavar="HOST:PORT", help="Zenoh router; default: 127.0.0.1:7447"
     )
     parser.add_argument("--zenoh", type=Path, metavar="FILE", help="Zenoh's own configuration: certificates, rights")
 

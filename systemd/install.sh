@@ -14,7 +14,8 @@ PYTHON=${PYTHON:-/usr/bin/python3}
 SOURCE=$(cd "$(dirname "$0")/.." && pwd)
 ROOT=${DESTDIR}${PREFIX}
 UNITS=/usr/lib/systemd/system
-UNIT_FILES="lumiloop.service lumiloop-warmup.service lumiloop-lamps.service lumiloop-lamps.timer"
+TAP_UNITS="lumiloop-view.service lumiloop-foxglove.service lumiloop-metrics.service lumiloop-record.service lumiloop-ros2.service lumiloop-fleet.service lumiloop-fleet-router.service"
+UNIT_FILES="lumiloop.service lumiloop-warmup.service lumiloop-lamps.service lumiloop-lamps.timer $TAP_UNITS"
 MARK=.lumiloop
 
 say() { echo "lumiloop: $*"; }
@@ -71,7 +72,9 @@ files() {
     put 644 systemd/lumiloop.sysusers /usr/lib/sysusers.d/lumiloop.conf
     put 644 README.md /usr/share/doc/lumiloop/README.md
     put 644 LICENSE /usr/share/doc/lumiloop/copyright
-    put 644 systemd/drop-ins/port-502.conf /usr/share/doc/lumiloop/examples/port-502.conf
+    for example in port-502 stream-group; do
+        put 644 systemd/drop-ins/$example.conf /usr/share/doc/lumiloop/examples/$example.conf
+    done
     recorder=$DESTDIR/usr/share/doc/lumiloop/examples/flight-recorder.conf
     sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/drop-ins/flight-recorder.conf" > "$recorder"
     chmod 644 "$recorder"

@@ -16,6 +16,7 @@ VERSION=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$SOURCE/pyproject.toml")
 MINOR=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 NEXT=$("$PYTHON" -c 'import sys; print("%d.%d" % (sys.version_info[0], sys.version_info[1] + 1))')
 ARCH=$(dpkg --print-architecture)
+TAP_UNITS=$(sed -n 's/^TAP_UNITS="\(.*\)"$/\1/p' "$SOURCE/systemd/install.sh")
 
 if [ -n "${TREE:-}" ]; then
     cp -a "$TREE/." "$MADE"
@@ -49,7 +50,7 @@ if [ "$1" = configure ]; then
         systemctl daemon-reload
         udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev || true
         systemctl stop lumiloop-warmup.service || true
-        systemctl try-restart lumiloop.service || true
+        systemctl try-restart lumiloop.service TAPS || true
     fi
 fi
 EOF
@@ -57,7 +58,7 @@ cat > "$TREE/DEBIAN/prerm" << 'EOF'
 #!/bin/sh
 set -e
 if [ -d /run/systemd/system ] && [ "$1" = remove ]; then
-    systemctl disable --now lumiloop.service lumiloop-warmup.service lumiloop-lamps.timer lumiloop-lamps.service || true
+    systemctl disable --now lumiloop.service lumiloop-warmup.service lumiloop-lamps.timer lumiloop-lamps.service TAPS || true
 fi
 EOF
 cat > "$TREE/DEBIAN/postrm" << 'EOF'
@@ -69,6 +70,7 @@ if [ "$1" = purge ]; then
 fi
 if [ -d /run/systemd/system ]; then systemctl daemon-reload; fi
 EOF
+sed -i "s/TAPS/$TAP_UNITS/" "$TREE"/DEBIAN/postinst "$TREE"/DEBIAN/prerm
 chmod 755 "$TREE"/DEBIAN/postinst "$TREE"/DEBIAN/prerm "$TREE"/DEBIAN/postrm
 dpkg-deb --root-owner-group -Zgzip -z1 --build "$TREE" "$OUT/lumiloop_${VERSION}_${ARCH}.deb" > /dev/null
 echo "$OUT/lumiloop_${VERSION}_${ARCH}.deb"

@@ -20,7 +20,7 @@ from taps import rostypes
 from taps.follow import follow
 from taps.frames import NotTheStream
 from taps.ros import TOPICS, Out
-from taps.stream import Stream, path_of
+from taps.stream import Stream
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -36,7 +36,7 @@ def main(args: argparse.Namespace) -> int:
         return cli.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
     cli.say(f"ws://{host}:{bridge.port}")
     try:
-        stream = Stream(args.stream or path_of(args.settings.name), WANTED)
+        stream = Stream(args.stream or args.settings.name, WANTED)
         asyncio.run(work_until_told(follow(stream, args.settings, bridge)))
     except NotTheStream as error:
         return cli.fail(str(error))

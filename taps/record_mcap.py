@@ -17,7 +17,7 @@ from hal.serving import work_until_told
 from taps.frames import Hello, NotTheStream
 from taps.mcapfile import FLUSH_S, McapFile
 from taps.ros import Translator
-from taps.stream import Lost, Stream, path_of
+from taps.stream import Lost, Stream
 
 TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -26,7 +26,7 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.out.exists() and not args.force:
         return cli.fail(f"{args.out} is there already; name another file, or replace it with --force", cli.USAGE)
-    stream = Stream(args.stream or path_of(args.settings.name), (*TOPICS, *(["raw"] if args.raw else [])))
+    stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
     try:
         with McapFile(args.out) as file:
             asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))

@@ -19,7 +19,7 @@ from taps import rmw, rostypes
 from taps.follow import follow
 from taps.frames import NotTheStream
 from taps.ros import TOPICS, Out
-from taps.stream import Stream, path_of
+from taps.stream import Stream
 from taps.zenohlink import BadEndpoint, joined, listed, watched, withdraw
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
@@ -36,7 +36,7 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     try:
         namespace = rmw.namespace_of(args.namespace)
-        stream = Stream(args.stream or path_of(args.settings.name), WANTED)
+        stream = Stream(args.stream or args.settings.name, WANTED)
         asyncio.run(work_until_told(serve(args, namespace, stream)))
     except ValueError as error:
         return cli.fail(f"--namespace: {error}", cli.USAGE)

@@ -18,7 +18,7 @@ from hal.serving import work_until_told
 from taps import vda5050
 from taps.frames import NotTheStream
 from taps.metrics import CONTENT_TYPE, Told, exposition
-from taps.stream import Stream, path_of
+from taps.stream import Stream
 
 LONGEST_REQUEST: Final = 8192
 PATIENCE_S: Final = 5.0
@@ -39,7 +39,7 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     try:
         host, port = parse_endpoint(args.listen)
-        stream = Stream(args.stream or path_of(args.settings.name), TOPICS)
+        stream = Stream(args.stream or args.settings.name, TOPICS)
         asyncio.run(work_until_told(serve(stream, host, port)))
     except ValueError as error:
         return cli.fail(f"--listen: {error}", cli.USAGE)

@@ -47,17 +47,23 @@ class Stream:
     """What a daemon tells, for as long as somebody asks.
 
     Args:
-        path: of the socket. topics: that are wanted.
+        path: of the socket; or the name of a daemon, whose socket is looked for at each try (:func:`path_of`).
+        topics: that are wanted.
         patient: whether to go on trying after a loss, and when nobody is there at first.
 
     Raises:
         ValueError: no such topic.
     """
 
-    def __init__(self, path: Path, topics: Sequence[str], patient: bool = True) -> None:
+    def __init__(self, path: Path | str, topics: Sequence[str], patient: bool = True) -> None:
         if unknown := sorted(set(topics) - set(TOPICS)):
             raise ValueError(f"no such topic: {', '.join(unknown)}; there are {', '.join(TOPICS)}")
-        self.path, self.topics, self.patient = path, tuple(topics), patient
+        self._of, self.topics, self.patient = path, tuple(topics), patient
+
+    @property
+    def path(self) -> Path:
+        """Of the socket, as far as is known now."""
+        return path_of(self._of) if isinstance(self._of, str) else self._of
 
     async def frames(self) -> AsyncGenerator[Frame | Lost, None]:
         """Every frame, from the greeting on; ends after :class:`Lost` where it is not patient. To be closed.
@@ -67,16 +73,17 @@ class Stream:
         """
         retry, told = FIRST_RETRY_S, False
         while True:
+            path = self.path
             try:
-                async with _connected(self.path) as (reader, writer):
+                async with _connected(path) as (reader, writer):
                     writer.write(frames.request(self.topics))
                     async with contextlib.aclosing(_frames(reader)) as heard:
                         async for frame in heard:
                             retry, told = FIRST_RETRY_S, False
                             yield frame
-                    lost = f"{self.path}: the daemon has closed the stream"
+                    lost = f"{path}: the daemon has closed the stream"
             except OSError as error:
-                lost = f"{self.path}: {_why(error)}"
+                lost = f"{path}: {_why(error)}"
             if not told:
                 told = True
                 yield Lost(lost)

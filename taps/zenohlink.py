@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import AsyncIterator, Callable
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -76,6 +77,7 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             "mode": mode,
             f"{side}/endpoints": [locator(endpoint)],
             "scouting/multicast/enabled": False,
+            "transport/shared_memory/enabled": False,  # needs rights that a service does without
             "timestamping/enabled": True,  # the caches for those who come late need it
             "transport/link/rx/max_message_size": MOST_BYTES,
             "transport/link/tx/lease": round(1e3 * LEASE_S),
@@ -158,14 +160,16 @@ async def listed(session: zenoh.Session, key: str) -> list[str]:
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
-async def answers(session: zenoh.Session, key: str, seconds: float = ASK_S) -> list[tuple[str, bytes, bytes]]:
-    """What everybody answers who is asked: key, content, attachment."""
+async def answers(
+    session: zenoh.Session, key: str, seconds: float = ASK_S, most: int | None = None
+) -> list[tuple[str, bytes, bytes]]:
+    """What everybody answers who is asked, the first ``most`` of it: key, content, attachment."""
 
     def ask() -> list[tuple[str, bytes, bytes]]:
         replies = session.get(
             key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=seconds
         )
-        return [parts(reply.ok) for reply in replies if reply.ok is not None]
+        return [parts(reply.ok) for reply in islice(replies, most) if reply.ok is not None]
 
     return await beside(ask, "zenoh")
 

@@ -9,17 +9,18 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from taps.fleet.messages import Cells, MapHead, printable
-from taps.fleet.roster import Member, number
+from taps.fleet.messages import Cells, printable
+from taps.fleet.roster import Chart, Member, number
 from taps.tiles import FREE, UNSEEN, WALL
 
-Chart = tuple[MapHead, Cells]
 LABELS: Final = "123456789abcdefghijklmnopqrstuvwxyz"
 TALL: Final = 2.0
 """A character is so many times taller than wide."""
 SMALLEST_SIDE: Final = 800
 """Cells are drawn larger until the longer side has about this many pixels."""
 DISC_PX: Final = 9
+WIDEST: Final = 200
+"""Characters of a cell of the table: who writes more has nothing to say."""
 SHADES: Final = {UNSEEN: (205, 211, 220), FREE: (255, 255, 255), WALL: (28, 34, 48)}
 COLOURS: Final = (
     ("blue", (37, 99, 235)),
@@ -36,7 +37,7 @@ HEADS: Final = ("", "robot", "state", "x m", "y m", "deg", "bound m", "map", "su
 def table(members: Sequence[Member], now: float) -> list[str]:
     """A line for each robot, and one above."""
     told = (_row(label_of(k), member, now) for k, member in enumerate(members))
-    rows = [HEADS, *(tuple(map(printable, row)) for row in told)]
+    rows = [HEADS, *(tuple(printable(cell[:WIDEST]) for cell in row) for row in told)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEADS))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
@@ -94,9 +95,11 @@ def plan(chart: Chart, members: Sequence[Member], wide: int = 100, high: int = 3
     step = max((right - left) / wide, (last - first) / (high * TALL), 1.0)
     rows, columns = math.ceil((last - first) / (TALL * step)), math.ceil((right - left) / step)
     text = np.full((rows, columns), " ")
+    at_row, first_row = _starts(last - first, TALL * step)
+    at_column, first_column = _starts(right - left, step)
     for shade, letter in ((FREE, "."), (WALL, "#")):  # a wall in a field counts more than much free floor
-        at_row, at_column = np.nonzero(cells == shade)
-        text[(at_row / (TALL * step)).astype(int), (at_column / step).astype(int)] = letter
+        there = np.logical_or.reduceat(np.logical_or.reduceat(cells == shade, first_row, 0), first_column, 1)
+        text[np.ix_(at_row, at_column)] = np.where(there, letter, text[np.ix_(at_row, at_column)])
     for k, _, row, column in robots:
         y, x = int((row - first) / (TALL * step)), int((column - left) / step)
         if 0 <= y < rows and 0 <= x < columns:
@@ -132,6 +135,12 @@ def _seen(cells: Cells) -> tuple[tuple[int, int], tuple[int, int]]:
     if rows.size == 0:
         return (0, cells.shape[0]), (0, cells.shape[1])
     return (int(rows[0]), int(rows[-1]) + 1), (int(columns[0]), int(columns[-1]) + 1)
+
+
+def _starts(cells: int, step: float) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Of fields that are ``step`` cells wide: those that any cell lies in, and the first cell of each."""
+    fields, first = np.unique((np.arange(cells) / step).astype(np.intp), return_index=True)
+    return fields, first
 
 
 def _disc(

@@ -22,6 +22,10 @@ TOPICS: Final = ("pose", "state", "loops", "map")
 SHARED: Final = f"{ROOT}/@shared"
 """No robot's name begins with @, and no ``*`` meets it."""
 MOST_CELLS: Final = 100_000_000
+LONGEST_NAME: Final = 32
+"""No robot's name is longer (key `name` of the configuration)."""
+LONGEST: Final = 1 << 16
+"""Bytes of a message, but for a map's cells."""
 Cells = npt.NDArray[np.int8]
 Told = TypeVar("Told", bound=msgspec.Struct)
 
@@ -184,6 +188,8 @@ def read(data: bytes, kind: type[Told]) -> Told:
     Raises:
         Unreadable: it is not one of that kind, or of another schema.
     """
+    if len(data) > LONGEST:
+        raise Unreadable(f"a message of {len(data)} bytes, and none has more than {LONGEST}")
     try:
         told = msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

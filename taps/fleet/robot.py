@@ -28,7 +28,7 @@ from taps.fleet.claim import Claim
 from taps.fleet.messages import MapHead, PoseTold, StateTold
 from taps.fleet.placing import Records
 from taps.frames import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
-from taps.stream import Lost, Stream, path_of
+from taps.stream import Lost, Stream
 from taps.tiles import Tiles, trinary
 from taps.vda5050 import position_v2
 from taps.zenohlink import BadEndpoint, joined, watched, withdraw
@@ -44,7 +44,7 @@ OLD_S: Final = 3.0
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
-    stream = Stream(args.stream or path_of(args.settings.name), WANTED)
+    stream = Stream(args.stream or args.settings.name, WANTED)
     try:
         asyncio.run(work_until_told(tell(args, stream)))
     except BadEndpoint as error:

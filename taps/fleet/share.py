@@ -13,7 +13,7 @@ from hal.serving import until_told, work_until_told
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, encode
 from taps.fleet.placing import MAP, SURVEY, Offer, Refused, offer_of
-from taps.zenohlink import BadEndpoint, config, joined, watched, words
+from taps.zenohlink import BadEndpoint, config, joined, watched, withdraw, words
 
 
 def main(args: argparse.Namespace) -> int:
@@ -51,10 +51,13 @@ async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> 
     async with joined(args.router, args.zenoh) as session:
         session.declare_queryable(f"{SHARED}/**", answer)
         instance = messages.instance_of(str(session.info.zid()), socket.gethostname(), messages.now_ms())
-        session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots ask when they see it
-        for offer, _ in offers:
-            cli.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
-        await watched(session, args.router, lambda there: None)
+        token = session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots ask when they see it
+        try:
+            for offer, _ in offers:
+                cli.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
+            await watched(session, args.router, lambda there: None)
+        finally:
+            withdraw(token)  # one to which no name leads any more is withdrawn by the library, unasked
 
 
 def key_of(kind: str, sha256: str = "") -> str:

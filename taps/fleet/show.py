@@ -8,6 +8,7 @@ import contextlib
 import shutil
 import sys
 import time
+from threading import Lock
 from typing import Final
 
 import msgspec
@@ -18,13 +19,21 @@ from daemon.png import encode_png
 from daemon.wholefile import reason_of, write_whole
 from hal.serving import work_until_told
 from taps.fleet import drawing, messages
-from taps.fleet.roster import Roster
+from taps.fleet.roster import MOST_MAPS, MOST_ROBOTS, Roster
 from taps.zenohlink import BadEndpoint, answers, joined, parts, watched
 
 ONCE_S: Final = 2.0
 """Who tells at all has told by then."""
 CLEAR: Final = "\x1b[H\x1b[2J"
 EVERY: Final = f"{messages.ROOT}/*/*"
+MOST_WAITING: Final = MOST_MAPS
+"""Bytes of messages that are not looked at yet; what comes beyond them is left out."""
+SMALLEST: Final = 1024
+"""What a message takes besides."""
+ASKED_AT_ONCE: Final = 8
+"""Robots; each takes a thread until it has answered."""
+MOST_ANSWERS: Final = 16
+"""Of one robot, which has four topics."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -56,6 +65,7 @@ async def show(args: argparse.Namespace, roster: Roster) -> None:
                 sys.stdout.flush()
                 if not args.watch:
                     return
+                roster.forget(time.monotonic(), listener.there)
                 await asyncio.sleep(1.0)
         finally:
             watching.cancel()
@@ -73,11 +83,11 @@ class Listener:
         self.there = True
         self._session, self._roster = session, roster
         self._loop = asyncio.get_running_loop()
-        self._asking: set[asyncio.Task[None]] = set()
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._may_ask = asyncio.Semaphore(ASKED_AT_ONCE)
+        self._waiting, self._lock = 0, Lock()
         # callbacks are the session's threads': the roster is touched in the loop's alone
-        session.declare_subscriber(
-            EVERY, lambda sample: self._call(self._roster.take, *parts(sample), time.monotonic())
-        )
+        session.declare_subscriber(EVERY, self._heard)
         for kind in ("alive", "waiting"):
             session.liveliness().declare_subscriber(f"{messages.ROOT}/*/{kind}/*", self._token, history=True)
 
@@ -91,19 +101,34 @@ class Listener:
         with contextlib.suppress(RuntimeError):  # the loop has closed: nobody looks any more
             self._loop.call_soon_threadsafe(function, *args)  # type: ignore[arg-type]  # both are ours
 
+    def _heard(self, sample: zenoh.Sample) -> None:
+        """Called by the session's threads, sooner than the loop can look at what comes, maybe."""
+        size = len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment)) + SMALLEST
+        with self._lock:
+            if self._waiting + size > MOST_WAITING:
+                return
+            self._waiting += size
+        self._call(self._take, parts(sample), size)
+
+    def _take(self, found: tuple[str, bytes, bytes], size: int) -> None:
+        with self._lock:
+            self._waiting -= size
+        self._roster.take(*found, time.monotonic())
+
     def _token(self, sample: zenoh.Sample) -> None:
         self._call(self._on_token, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
     def _on_token(self, key: str, there: bool) -> None:
-        if robot := self._roster.token(key, there):
-            task = asyncio.create_task(self._ask(robot))
-            self._asking.add(task)
-            task.add_done_callback(self._asking.discard)
+        robot = self._roster.token(key, there)
+        if robot and robot not in self._asking and len(self._asking) < MOST_ROBOTS:
+            self._asking[robot] = task = asyncio.create_task(self._ask(robot))
+            task.add_done_callback(lambda _: self._asking.pop(robot))
 
     async def _ask(self, robot: str) -> None:
         """What it has told before we came."""
-        for found in await answers(self._session, messages.key(robot, "*")):
-            self._roster.take(*found, time.monotonic())
+        async with self._may_ask:
+            for found in await answers(self._session, messages.key(robot, "*"), most=MOST_ANSWERS):
+                self._roster.take(*found, time.monotonic())
 
 
 def told(args: argparse.Namespace, roster: Roster, there: bool) -> str:

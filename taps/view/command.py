@@ -25,7 +25,7 @@ from daemon.lights import SurveyError
 from daemon.logs import to_journal
 from daemon.publish.client import NoAnswer, address_of
 from hal.serving import stopping
-from taps.stream import Stream, path_of
+from taps.stream import Stream
 from taps.view.film import Film
 from taps.view.guard import Guard, TokenRefused, token_for
 from taps.view.server import TOPICS, View
@@ -57,7 +57,7 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
     settings: Config = args.settings
     if args.log is None:
         modbus = address_of(None, settings) if settings.modbus.port else ("127.0.0.1", 0)
-        view = View(guard, scene_of(settings), Stream(args.stream or path_of(settings.name), TOPICS), modbus=modbus)
+        view = View(guard, scene_of(settings), Stream(args.stream or settings.name, TOPICS), modbus=modbus)
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:
         return cli.fail("a recording takes no orders: leave --write out", cli.USAGE)

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,7 +22,7 @@ from tests.systemd.container import Container
 from tools.bench.vm.places import workspace
 
 ROOT = Path(__file__).parents[2]
-UNIT, WARM_UP = "lumiloop.service", "lumiloop-warmup.service"
+UNIT, WARM_UP, METRICS = "lumiloop.service", "lumiloop-warmup.service", "lumiloop-metrics.service"
 READY_S = 12.0
 """Four times the three seconds that a warm start may take from kill to READY."""
 COMPILE_S = 600.0
@@ -171,6 +171,27 @@ def test_it_runs_as_nobody_in_particular_with_its_two_groups(machine: Container)
     assert fields["NoNewPrivs"].strip() == "1"
 
 
+def test_what_listens_to_the_daemon_reaches_it_by_its_group_and_others_do_not(machine: Container) -> None:
+    """The unit of the metrics, which needs no extra; it is started first, and waits for the stream."""
+    shutil.copy(ROOT / "systemd/drop-ins/stream-group.conf", machine.root / "etc/systemd/system/lumiloop.service.d")
+    ask = "from urllib.request import urlopen as get; print(get('http://127.0.0.1:9464/metrics').read().decode())"
+    assert machine.show(METRICS, "UnitFileState") == {"UnitFileState": "disabled"}
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "stop", UNIT)
+    machine.run("systemctl", "start", METRICS)
+    try:
+        _until(lambda: "\nlumiloop_up 0\n" in machine.run("python3", "-c", ask, check=False))
+        machine.run("systemctl", "start", UNIT)
+        machine.until(UNIT, READY_S, ActiveState="active", SubState="running")
+        _until(lambda: "\nlumiloop_up 1\n" in machine.run("python3", "-c", ask))
+        assert "Permission denied" in machine.run("su", "nobody", "-s", "/bin/ls", "/run/lumiloop", check=False)
+        status = machine.run("cat", f"/proc/{machine.show(METRICS, 'MainPID')['MainPID']}/status")
+        assert "CapEff:\t0000000000000000\n" in status
+        assert machine.show(METRICS, "NRestarts") == {"NRestarts": "0"}
+    finally:
+        machine.run("systemctl", "stop", METRICS)
+
+
 def test_it_reads_the_lidar_and_publishes_a_pose(machine: Container) -> None:
     end = time.monotonic() + 20.0
     while True:
@@ -251,6 +272,13 @@ def _main(machine: Container) -> int:
         except OSError:
             continue
     return 0
+
+
+def _until(what: Callable[[], bool], seconds: float = READY_S) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, f"it has not come about within {seconds} s"
+        time.sleep(0.1)
 
 
 def _restarted(machine: Container, before: int, seconds: float) -> None:

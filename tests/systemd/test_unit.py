@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -11,12 +12,18 @@ from pathlib import Path
 
 import pytest
 
+from daemon import cli
 from daemon.cli import USAGE
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "lumiloop.service"
 UNITS = sorted(path.name for path in (*SYSTEMD.glob("*.service"), *SYSTEMD.glob("*.timer")))
 MOST_EXPOSED = 2.0
+TAPS = {
+    "view": "view", "foxglove": "foxglove", "metrics": "metrics", "record": "record-mcap", "ros2": "ros2",
+    "fleet": "fleet join", "fleet-router": "fleet router",
+}  # fmt: skip
+"""Units of what listens to the daemon, and the commands that they start."""
 
 needs_analyze = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 
@@ -63,11 +70,13 @@ def test_a_drop_in_starts_the_unit_s_own_program() -> None:
 
 
 @needs_analyze
-def test_it_is_hardened() -> None:
+@pytest.mark.parametrize("name", [name for name in UNITS if name.endswith(".service")])
+def test_it_is_hardened(name: str) -> None:
     done = subprocess.run(
-        ["systemd-analyze", "security", "--offline=true", "--no-pager", str(UNIT)], capture_output=True, text=True
-    )
-    exposure = re.search(r"exposure level for lumiloop\.service: ([\d.]+)", done.stdout)
+        ["systemd-analyze", "security", "--offline=true", "--no-pager", str(SYSTEMD / name)],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    exposure = re.search(rf"exposure level for {re.escape(name)}: ([\d.]+)", done.stdout)
     assert exposure is not None, done.stderr
     assert float(exposure.group(1)) <= MOST_EXPOSED
 
@@ -95,9 +104,81 @@ def test_lamps_are_looked_at_where_the_daemon_has_its_maps_and_its_stream() -> N
     assert dict(settings(SYSTEMD / "lumiloop-lamps.timer"))["OnCalendar"] == "daily"
 
 
+def tap(name: str) -> list[tuple[str, str]]:
+    return settings(SYSTEMD / f"lumiloop-{name}.service")
+
+
+@pytest.mark.parametrize(("name", "command"), TAPS.items())
+def test_what_listens_to_the_daemon_is_started_again_but_not_with_what_cannot_be(name: str, command: str) -> None:
+    told = dict(tap(name))
+    program = told["ExecStart"].replace("$$", "$")
+    words = re.search(r"/opt/lumiloop/bin/lumiloop ([^']+)", program)
+    assert words is not None
+    given = [word for word in words[1].split() if word != "$OPTIONS"]
+    assert " ".join(given).startswith(command)
+    if name != "record":  # whose words are the shell's
+        assert cli.parser().parse_args(given).config == Path("/etc/lumiloop/lumiloop.toml")
+    assert program.rstrip("'").endswith("--config /etc/lumiloop/lumiloop.toml $OPTIONS")
+    assert (told["Restart"], told["RestartPreventExitStatus"]) == ("always", str(USAGE))
+
+
+@pytest.mark.parametrize("name", TAPS)
+def test_what_listens_to_the_daemon_may_reach_its_stream_and_little_else(name: str) -> None:
+    told, daemon = dict(tap(name)), dict(settings(UNIT))
+    assert ("Environment", f"RUNTIME_DIRECTORY=/run/{daemon['RuntimeDirectory']}") in tap(name)
+    assert "RuntimeDirectory" not in told  # it would be removed at the end of this
+    assert told["SupplementaryGroups"] == "lumiloop-stream"
+    assert (told["DynamicUser"], told["MemoryDenyWriteExecute"], told["PrivateDevices"]) == 3 * ("yes",)
+    if name == "fleet":
+        assert (told["User"], told["ReadOnlyPaths"]) == (daemon["User"], "/var/lib/private/lumiloop")
+    else:
+        assert told.get("User") is None
+
+
+def test_what_listens_to_the_daemon_is_protected_alike() -> None:
+    alike = [
+        {
+            pair
+            for pair in tap(name)
+            if re.match(r"Protect|Private|Restrict(?!Addr)|SystemCall|.*Cap|Lock|Proc", pair[0])
+        }
+        for name in TAPS
+    ]
+    assert len(alike[0]) > 20
+    assert all(one == alike[0] for one in alike)
+
+
+def test_nothing_is_switched_on_by_the_installation() -> None:
+    for script in ("install.sh", "package.sh"):
+        orders = re.findall(r"^\s*systemctl (\S+)", (SYSTEMD / script).read_text(), re.MULTILINE)
+        assert set(orders) <= {"daemon-reload", "stop", "try-restart", "disable"}, script
+
+
+def test_files_of_an_hour_are_kept_so_many(tmp_path: Path) -> None:
+    """The shell's words before a recording, as the service manager would have them said."""
+    told = dict(tap("record"))
+    environment = dict(
+        word.split("=") for word in dict(pair for pair in tap("record") if "KEEP" in pair[1])["Environment"].split()
+    )
+    assert environment == {"KEEP": "24", "SECONDS": "3600"}
+    for hour in range(30):
+        (tmp_path / f"20260101T{hour:02d}0000Z.mcap").touch()
+    (tmp_path / "other").touch()
+    words = shlex.split(told["ExecStartPre"].replace("$$", "$"))
+    for _ in range(2):
+        subprocess.run(words, env={**os.environ, **environment, "STATE_DIRECTORY": str(tmp_path)}, check=True)
+        kept = sorted(path.name for path in tmp_path.glob("*.mcap"))
+        assert (len(kept), kept[0]) == (24, "20260101T060000Z.mcap")
+    (tmp_path / "empty").mkdir()
+    subprocess.run(words, env={**os.environ, **environment, "STATE_DIRECTORY": str(tmp_path / "empty")}, check=True)
+
+
 def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
     script = (SYSTEMD / "install.sh").read_text()
+    (taps,) = re.findall(r'^TAP_UNITS="(.*)"$', script, re.MULTILINE)
+    assert taps.split() == [f"lumiloop-{name}.service" for name in TAPS]
     (told,) = re.findall(r'^UNIT_FILES="(.*)"$', script, re.MULTILINE)
+    told = told.replace("$TAP_UNITS", taps)
     assert sorted(told.split()) == UNITS
     for name in told.split():
         unit = tmp_path / "usr/lib/systemd/system" / name
@@ -107,7 +188,7 @@ def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
     subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
     assert not list(unit.parent.iterdir())
     (stopped,) = re.findall(r"disable --now (.*) \|\|", (SYSTEMD / "package.sh").read_text())
-    assert sorted(stopped.split()) == UNITS
+    assert sorted(stopped.replace("TAPS", taps).split()) == UNITS
 
 
 def test_it_is_started_again_for_ever_but_not_with_a_configuration_that_is_wrong() -> None:
@@ -122,7 +203,8 @@ def test_devices_are_named_by_what_they_are() -> None:
     assert 'ENV{ID_MM_DEVICE_IGNORE}="1"' in rules
     groups = set(re.findall(r'GROUP="(\w+)"', rules))
     assert groups == set(dict(settings(UNIT))["SupplementaryGroups"].split())
-    assert groups == set(re.findall(r"^g (\w+)", (SYSTEMD / "lumiloop.sysusers").read_text(), re.MULTILINE))
+    made = set(re.findall(r"^g (\S+)", (SYSTEMD / "lumiloop.sysusers").read_text(), re.MULTILINE))
+    assert made == groups | {dict(tap("view"))["SupplementaryGroups"]}
 
 
 @pytest.mark.parametrize("order", ["install", "uninstall"])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,22 @@ def test_every_command_in_the_documents_is_understood(page: Path) -> None:
     for words in commands(page):
         if words != ["--help"]:
             assert cli.parser().parse_args(words).body is not None, f"{page.name}: {words}"
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A parser, and those of its commands and their verbs."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from parsers(below)
+
+
+def test_every_command_and_verb_has_help() -> None:
+    every = list(parsers(cli.parser()))
+    assert len(every) > 30
+    for parser in every:
+        assert parser.format_help().startswith("usage: ")
 
 
 def test_the_doctor_of_the_documents(
@@ -72,3 +90,20 @@ def test_the_exports_of_the_documents(recording: Path, tmp_path: Path, monkeypat
             ran += 1
     assert ran == 2
     assert {path.name for path in tmp_path.iterdir()} >= {"drive.mcap", "drive.tum", "whole.mcap"}
+
+
+@pytest.mark.system
+def test_the_program_of_the_documents_reads_what_was_exported(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
+    (program,) = re.findall(
+        r"^```python\n(.*?)^```", (ROOT / "docs" / "formats.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["export", str(recording), "--mcap", "drive.mcap"]) == cli.OK
+    capsys.readouterr()
+    exec(compile(program, "formats.md", "exec"), {})
+    said = capsys.readouterr().out.splitlines()
+    assert len([line for line in said if len(line.split()) == 4]) > 70
+    assert any(line.split()[1] == "MAPPING" for line in said)

@@ -33,6 +33,7 @@ from taps import frames, stream
 from taps.frames import TYPES, Frame, Hello, NotTheStream
 from taps.stream import Lost, Stream, path_of
 from tests.daemon.publish.test_stream import raw_scan, run
+from tests.taps.serving import served
 
 LINK = LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01)
 FULL = Snapshot(
@@ -229,3 +230,19 @@ def test_the_path_is_the_daemons(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 def test_types_stand_for_every_topic() -> None:
     assert set(TYPES) == set(TOPICS)
+
+
+def test_a_daemon_of_a_name_is_found_wherever_it_comes_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A person starts to listen, and the system's service is started later."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "own"))
+    monkeypatch.setattr("taps.stream.SERVICE", tmp_path)
+
+    async def body() -> None:
+        async with asyncio.timeout(10.0), contextlib.aclosing(Stream("agv", ("pose",)).frames()) as frames:
+            first = await anext(frames)
+            assert isinstance(first, Lost)
+            assert str(tmp_path / "own" / "agv.stream") in first.text
+            with served(tmp_path / "agv.stream"):
+                assert isinstance(await anext(frames), Hello)
+
+    asyncio.run(body())

@@ -5,7 +5,7 @@
 When the drive is over it says so and waits for a line, or the end, of standard input: who asks it ends before it does.
 
 It is the whole of `daemon.main.Daemon`, publishers and threads included; only the sensors' wires are left out. In turn
-for a while it runs *alone*, and then *loaded*: readers and a stuck client (the parent's), and the graph of 1000 submaps
+for a while it runs *alone* and *loaded*: readers and a stuck client (the parent's), and the graph of 1000 submaps
 being solved without a pause (its own).
 """
 
@@ -53,7 +53,8 @@ SETTLE_S: Final = 8.0
 class Wanted:
     """What the parent asks for.
 
-    ``turns``: pairs of a stretch alone and one loaded, each of ``stretch_s``. ``solve``: loaded with the graph, too.
+    ``turns``: pairs of a stretch alone and one loaded, each of ``stretch_s``, every other pair the other way round.
+    ``solve``: loaded with the graph, too. ``change_s``: from each change so many seconds do not count.
     """
 
     drive: str
@@ -64,15 +65,17 @@ class Wanted:
     turns: int
     stretch_s: float
     solve: bool = True
+    change_s: float = 0.0
 
 
 @dataclass(slots=True)
 class Told:
-    """What comes back: microseconds, by stretch."""
+    """What comes back: microseconds, by stretch; ``pair``: of each cycle, the number of its pair of stretches."""
 
     late: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
     cycle: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
     share: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
+    pair: dict[str, list[int]] = field(default_factory=lambda: {"alone": [], "loaded": []})
     missed: int = 0
     scans: int = 0
     solved: int = 0
@@ -174,8 +177,12 @@ class Feeder:
         self._turn(self._stretch_now())
 
     def _stretch_now(self) -> str:
-        at = (self._number * PERIOD_S - SETTLE_S) / self._wanted.stretch_s
-        return "" if at < 0.0 else ("alone", "loaded")[int(at) % 2]
+        at = self._at()
+        return "" if at < 0.0 else ("alone", "loaded", "loaded", "alone")[int(at) % 4]
+
+    def _at(self) -> float:
+        """Stretches since the first one began."""
+        return (self._number * PERIOD_S - SETTLE_S) / self._wanted.stretch_s
 
     def _turn(self, stretch: str) -> None:
         """A stretch begins: tell the parent, and count the processor's time of the one that ends."""
@@ -194,7 +201,9 @@ class Feeder:
     def _timed(self, run: Callable[[], object]) -> object:
         late = time.monotonic() - self._taken
         snapshot = run()
-        if self.stretch and self.daemon is not None:
+        counts = time.monotonic() - self._begun[0] >= self._wanted.change_s
+        if self.stretch and counts and self.daemon is not None:
+            self.told.pair[self.stretch].append(int(self._at()) // 2)
             self.told.late[self.stretch].append(1e6 * late)
             self.told.cycle[self.stretch].append(float(self.daemon.cycle.cycle_us or 0))
         return snapshot

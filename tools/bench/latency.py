@@ -1,9 +1,10 @@
 """How late cycles begin at 40 Hz while other programs keep both cores busy, against a bare loop in C in the same run.
 
 The daemon (a process of its own, whole but for the sensors' wires: `tools.bench._paced`) is fed 1081 beams, wheels and
-16 lamps by a kernel timer. Two burners walk through memory meanwhile. Stretches of ten seconds take turns: *alone*, and
-*loaded* with 8 Modbus readers at 100 Hz each, a stream client that never reads, and the graph of 1000 submaps solved
-without a pause. Before and after, the C program (`_timerloop.c`) waits for the same timer at the same priority.
+16 lamps by a kernel timer. Two burners walk through memory meanwhile. Stretches of ten seconds take turns (A B B A):
+*alone*, and *loaded* with 8 Modbus readers at 100 Hz each, a stream client that never reads, and the graph of 1000
+submaps solved without a pause. Before and after, the C program (`_timerloop.c`) waits for the same timer at the same
+priority.
 
 ``make bench ARGS=latency`` takes a minute with SCHED_FIFO and one without; for figures that are statistically firm
 ``python -m tools.bench.latency --turns 30`` (11 minutes each).

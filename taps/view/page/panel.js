@@ -50,6 +50,7 @@ export class Panel {
     const meaning = gone || (pose ? pose.reason ? pose.meaning : table ? table[1] : "" : "waiting for the first pose");
     put("why", pose && !gone && pose.reason ? pose.meaning : "");
     worded("meaning", meaning || " ");
+    $("meaning").classList.toggle("path", meaning.startsWith("/")); // which has no capitals of ours
     worded("remedy", gone || !pose ? "" : pose.remedy || "");
     this.faults(gone ? [] : this.world.faults);
   }

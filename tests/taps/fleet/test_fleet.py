@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from taps.fleet import messages, robot, show
 from taps.fleet.claim import Claim
 from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
-from taps.fleet.roster import Roster
+from taps.fleet.roster import MOST_ROBOTS, Roster
 from taps.stream import Stream
 from taps.zenohlink import BadEndpoint, config, joined
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
@@ -276,6 +277,64 @@ def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.
             assert picture.read_bytes()[:4] == b"\x89PNG"
         assert cli.main(["fleet", "--router", made.address]) == cli.FAILED
         assert "no robot tells anything" in capsys.readouterr().err
+
+
+def test_whoever_makes_up_names_and_messages_does_not_fill_the_viewer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("taps.fleet.show.MOST_WAITING", 1 << 20)
+    monkeypatch.setattr("taps.fleet.roster.GONE_S", 0.2)
+    roster, asking = Roster(), []
+
+    async def body(made: Router) -> None:
+        await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
+        async with joined(made.address) as session:
+            tokens = []
+            for number in range(600):
+                tokens.append(session.liveliness().declare_token(messages.alive(f"forged{number}", "1.z.h")))
+                session.put(messages.key(f"forged{number}", "map"), bytes(50_000))
+            begun = time.monotonic()
+            while time.monotonic() - begun < 1.0:
+                await asyncio.sleep(0.02)
+                asking.append(sum(one.name == "lumiloop-zenoh" for one in threading.enumerate()))
+            assert len(roster.members) == MOST_ROBOTS
+            assert roster.members["agv"].localised
+            assert any("more than" in line for line in roster.problems())
+            assert len(tokens) == 600
+            assert 1 < max(asking) <= show.ASKED_AT_ONCE + 1
+        await until(lambda: not any(one.there for one in roster.members.values() if one.name != "agv"))
+        await asyncio.sleep(0.3)
+        roster.forget(time.monotonic(), router=True)
+        assert list(roster.members) == ["agv"]
+        old = roster.members["agv"].pose
+        await until(lambda: roster.members["agv"].pose is not old)
+
+    with served(tmp_path / "s"), router() as made:
+        asyncio.run(beside(body(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
+
+
+def test_messages_that_wait_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop stands while they come: what is beyond the bound is left out, and later ones are heard."""
+    monkeypatch.setattr("taps.fleet.show.MOST_WAITING", 100_000)
+    roster = Roster()
+
+    async def body(made: Router) -> None:
+        async with joined(made.address) as session:
+            await until(lambda: session.info.routers_zid())
+            listener = show.Listener(session, roster)
+            await asyncio.sleep(0.3)
+            with zenoh.open(config("client", made.address)) as other:
+                for number in range(20):
+                    other.put(messages.key(f"agv{number}", "state"), bytes(20_000))
+                time.sleep(1.0)  # noqa: ASYNC251  the loop stands
+                await until(lambda: roster.members)
+                assert 1 <= len(roster.members) <= 4
+                other.put(messages.key("late", "state"), bytes(20_000))
+                await until(lambda: "late" in roster.members)
+            assert listener.there
+
+    with router() as made:
+        asyncio.run(body(made))
 
 
 def in_a_loop_of_its_own(words: list[str]) -> int:

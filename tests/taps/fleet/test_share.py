@@ -19,7 +19,7 @@ from taps.fleet import messages
 from taps.fleet.fetch import Fetcher
 from taps.fleet.placing import MAP, SURVEY, Offer, Records, offer_of
 from taps.fleet.share import key_of, share
-from taps.zenohlink import config
+from taps.zenohlink import config, joined, listed
 from tests.daemon import mapmaker
 from tests.daemon.mapmaker import Shape
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
@@ -77,6 +77,18 @@ def test_robots_follow_what_is_shared_and_refuse_what_is_older(
 
     with router() as made:
         asyncio.run(beside(body(made), fetcher(made, folder, follow=True).run()))
+
+
+def test_who_shares_is_there_for_as_long_as_it_does(survey: Path) -> None:
+    async def body(made: Router) -> None:
+        alive = f"{messages.SHARED}/alive/*"
+        async with joined(made.address) as session:
+            await until(lambda: list(session.get(key_of(SURVEY), timeout=1.0)))  # declared before the token is
+            await asyncio.sleep(0.5)
+            assert len(await listed(session, alive)) == 1
+
+    with router() as made:
+        asyncio.run(beside(body(made), sharing(made, survey=survey, version=7)))
 
 
 def test_what_comes_damaged_is_refused(tmp_path: Path, survey: Path, capsys: pytest.CaptureFixture[str]) -> None:
