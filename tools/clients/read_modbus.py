@@ -75,12 +75,14 @@ def decode(answer: bytes) -> dict[str, float | int | str | None]:
     (age,) = struct.unpack_from(">H", block, 18)
     x, y, yaw = struct.unpack_from(">iii", block, 36)
     sigma_x, sigma_y, sigma_yaw = struct.unpack_from(">HHH", block, 72)
+    (jumps,), (loops,) = struct.unpack_from(">H", block, 90), struct.unpack_from(">H", block, 104)
     return {
         "seq": seq, "state": STATES[state] if state < len(STATES) else str(state), "reason": reason, "fault": fault,
         "x_known": flags >> 2 & 1, "y_known": flags >> 3 & 1, "yaw_known": flags >> 4 & 1, "age": scaled(age, 10_000),
         "bounded": flags >> 6 & 1, "alert": flags >> 7 & 1,
         "x": scaled(x, 10_000, INT32), "y": scaled(y, 10_000, INT32), "yaw": scaled(yaw, 1_000_000, INT32),
         "sigma_x": scaled(sigma_x, 10_000), "sigma_y": scaled(sigma_y, 10_000), "sigma_yaw": scaled(sigma_yaw, 10_000),
+        "jumps": jumps, "loops": loops,
     }  # fmt: skip
 
 

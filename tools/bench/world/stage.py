@@ -107,7 +107,10 @@ class Ears:
             self._t_pose = 0.5 * (before + now) - told["age"] if placed else math.nan
         pose = (told["x"], told["y"], told["yaw"]) if placed else None
         sigma = max(told["sigma_x"] or 0.0, told["sigma_y"] or 0.0)
-        return Read(now, told["state"], told["fault"], self._t_pose, pose, sigma, True, fresh and placed, lamps)
+        counts = told["jumps"], told["loops"]
+        return Read(
+            now, told["state"], told["fault"], self._t_pose, pose, sigma, True, fresh and placed, lamps, *counts
+        )
 
     def _heard(self) -> tuple[tuple[int, float], ...]:
         if self._lamps is None:
