@@ -20,6 +20,7 @@ import pytest
 
 from daemon.publish import registers
 from tools.bench.modbus import example
+from tools.bench.otherclock import OtherClock
 from tools.bench.vm import bench, common, guests, image, places, reference, world
 from tools.bench.vm.__main__ import chosen
 from tools.bench.vm.guest import agent
@@ -177,7 +178,7 @@ def test_an_inside_that_is_started_anew_fails_its_order_and_not_the_bench(tmp_pa
 
 def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_ones(tmp_path: Path) -> None:
     inside = Agent(b'{"id": 1, "code": 0, ', tmp_path)
-    with pytest.raises(Order, match="no answer to .*first.* within 0 s"):
+    with pytest.raises(Order, match=r"no answer to .*first.* within 0 s"):
         inside.order(0.05, run=["first"])
     inside.far.sendall(b'"out": "first"}\n{"id": 2, "code": 0, "out": "second"}\n')
     assert inside.order(5.0, run=["second"])["out"] == "second"
@@ -422,7 +423,7 @@ def test_a_pose_is_compared_where_the_map_begins() -> None:
 
 
 def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> None:
-    clock = bench.OtherClock()
+    clock = OtherClock()
     apart, age = 500.0, 0.02
     for k, delay in enumerate((0.003, 0.060, 0.001, 0.200)):
         t = 10.0 + k
@@ -433,7 +434,7 @@ def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> Non
 
 def test_a_pose_datagram_is_read_as_the_daemon_writes_it() -> None:
     one = replace(example(7), t_mono=12.5, t_sent=12.53)
-    read = bench.heard(registers.encode_datagram(one), 100.03, bench.OtherClock())
+    read = bench.heard(registers.encode_datagram(one), 100.03, OtherClock())
     assert read.t_pose == pytest.approx(100.0, abs=2e-4)
     assert one.pose is not None
     assert read.pose == pytest.approx(one.pose, abs=1e-4)

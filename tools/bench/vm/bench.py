@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from tools.bench.otherclock import OtherClock
 from tools.bench.vm.image import ROOT, Image
 from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
 from tools.bench.vm.places import LEASH, CannotBench
@@ -34,8 +35,6 @@ PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
 KEPT: Final = 30_000
 WORLD_S: Final = 240.0
 READS: Final = 4
-CLOCK_READS: Final = 300
-"""A minute at 5 Hz: two clocks of one computer do not drift apart in that time."""
 Pose = tuple[float, float, float]
 
 
@@ -48,25 +47,6 @@ class Heard:
     state: int
     pose: Pose | None
     sigma_m: float
-
-
-class OtherClock:
-    """The emulated computer's monotonic clock by this one's: the datagram tells that was under way the shortest.
-
-    On a busy computer one is under way for long, and a robot at 0.6 m/s drives on 6 mm in 10 ms.
-    """
-
-    def __init__(self) -> None:
-        self._apart: deque[float] = deque(maxlen=CLOCK_READS)
-        self._latest = -math.inf
-
-    def here(self, t_there: float, sent_there: float, now: float) -> float:
-        """An instant of a datagram that was sent ``sent_there`` and came ``now``."""
-        if sent_there < self._latest:  # it has been switched on anew
-            self._apart.clear()
-        self._latest = sent_there
-        self._apart.append(now - sent_there)
-        return t_there + min(self._apart)
 
 
 @dataclass(slots=True)
