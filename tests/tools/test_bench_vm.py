@@ -9,7 +9,9 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +20,13 @@ import pytest
 
 from daemon.publish import registers
 from tools.bench.modbus import example
-from tools.bench.vm import bench, image, places, world
-from tools.bench.vm.__main__ import tried
+from tools.bench.otherclock import OtherClock
+from tools.bench.vm import bench, common, guests, image, places, reference, world
+from tools.bench.vm.__main__ import chosen
 from tools.bench.vm.guest import agent
+from tools.bench.vm.guests import Guest, run_all, tried
 from tools.bench.vm.machine import Machine, Order, Ports, _words
-from tools.bench.vm.scenarios import PARTS, SCENARIOS, WRITTEN
+from tools.bench.vm.scenarios import PARTS, SCENARIOS, SHARES, WRITTEN
 from tools.bench.world import agreement
 from tools.bench.world.room import room
 from tools.sim.harness import run
@@ -35,7 +39,16 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) == len(set(SCENARIOS)) == len(WRITTEN)
     assert len(SCENARIOS) >= 25
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
-    assert [part.__name__.rpartition("_")[2] for part in PARTS] == ["system", "devices", "photodiode", "process"]
+    names = [[part.__name__.rpartition("_")[2] for part in parts] for parts in PARTS]
+    assert names == [["system", "devices", "process"], ["photodiode", "computer"]]
+
+
+def test_scenarios_up_to_the_named_ones_and_only_the_computers_that_they_take() -> None:
+    assert chosen([]) == SHARES
+    assert [[one.__name__ for one in share] for share in chosen(["boots"])] == [["boots"]]
+    assert [share[-1].__name__ for share in chosen(["hangs", "boots", "starts"])] == ["starts", "hangs"]
+    with pytest.raises(places.CannotBench, match="no such scenario: flies; there are boots"):
+        chosen(["flies"])
 
 
 def test_what_is_missing_is_said_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,17 +146,18 @@ def test_the_disk_is_never_written_to_and_only_loopback_is_listened_on(tmp_path:
 
 
 class Agent(Machine):
-    """A machine whose agent gives one answer to everything."""
+    """A machine whose agent says these things from the beginning."""
 
     def __init__(self, answer: bytes, folder: Path) -> None:
-        super().__init__(subprocess.Popen(["true"]), folder, Ports(1, 2, 3))
+        super().__init__(subprocess.Popen(["sleep", "60"]), folder, Ports(1, 2, 3), threading.Event())
+        (folder / "qemu").touch()
         self._agent, self.far = socket.socketpair()
-        self._lines = self._agent.makefile("rb")
         self.far.sendall(answer)
 
     def close(self) -> None:
         self._drop()
         self.far.close()
+        self.process.kill()
         self.process.wait()
 
 
@@ -152,7 +166,7 @@ def test_an_inside_that_is_started_anew_fails_its_order_and_not_the_bench(tmp_pa
     with pytest.raises(Order, match="started anew while"):
         inside.run("true")
     inside.close()
-    inside = Agent(b'{"code": 0, "out": ""}\n', tmp_path)
+    inside = Agent(b'{"id": 1, "code": 0, "out": ""}\n', tmp_path)
     inside.reboot()
     asked = json.loads(inside.far.recv(4096))["run"]
     begun = time.monotonic()
@@ -162,14 +176,209 @@ def test_an_inside_that_is_started_anew_fails_its_order_and_not_the_bench(tmp_pa
     inside.close()
 
 
-def test_a_scenario_that_builds_on_one_that_failed_fails_itself() -> None:
-    def needs_more(bench: object) -> str:
-        """It needs what has not been seen."""
-        raise KeyError("drive")
+def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_ones(tmp_path: Path) -> None:
+    inside = Agent(b'{"id": 1, "code": 0, ', tmp_path)
+    with pytest.raises(Order, match=r"no answer to .*first.* within 0 s"):
+        inside.order(0.05, run=["first"])
+    inside.far.sendall(b'"out": "first"}\n{"id": 2, "code": 0, "out": "second"}\n')
+    assert inside.order(5.0, run=["second"])["out"] == "second"
+    inside.far.sendall(b'{"id": 3, "co\n{"id": 3, "code": 0, "out": "third"}\n')
+    assert inside.run("third") == "third", "half a line of an agent that was ended"
+    inside.far.close()
+    inside.process.kill()
+    for _ in range(2):
+        with pytest.raises(places.CannotBench, match="QEMU has ended with -9"):
+            inside.run("fourth")
+    inside.close()
 
-    result = tried(needs_more, object())  # type: ignore[arg-type]  # it looks at nothing of it
+
+def test_a_long_answer_comes_whole_through_a_port_that_takes_little_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = b""
+
+    def write(port: int, data: bytes) -> int:
+        nonlocal taken
+        taken += data[:32768]
+        return min(len(data), 32768)
+
+    monkeypatch.setattr(agent.os, "write", write)
+    agent.write_all(3, bytes(100_000))
+    assert taken == bytes(100_000)
+
+
+def test_a_command_that_takes_too_long_ends_with_all_that_it_has_started() -> None:
+    begun = time.monotonic()
+    assert agent.obey({"run": ["sh", "-c", "sleep 20; true"], "seconds": 0.2})["code"] == 127
+    assert time.monotonic() - begun < 5.0, "it waits for the sleep, which holds the line that it writes to"
+
+
+class Lived:
+    """A bench whose daemon has these lives, one after the other; the last one stays."""
+
+    def __init__(self, *lives: tuple[int, int], life: tuple[int, int] = (0, 0)) -> None:
+        self.left, self.life = list(lives), life
+
+    def lives(self) -> tuple[int, int]:
+        return self.left.pop(0) if len(self.left) > 1 else self.left[0]
+
+    def log(self, lines: int) -> str:
+        return "its log"
+
+
+def like(function: Callable[[bench.Bench], str], daemon: common.Daemon = "same") -> common.Scenario:
+    """A scenario outside the list."""
+    common.AFTER[function] = daemon
+    return function
+
+
+@pytest.fixture(autouse=True)
+def _only_the_lists_own_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(common, "AFTER", dict(common.AFTER))
+    monkeypatch.setattr(guests, "AFTER", common.AFTER)
+
+
+def passes(bench: bench.Bench) -> str:
+    """It passes."""
+    return "seen"
+
+
+def needs_more(bench: bench.Bench) -> str:
+    """It needs what has not been seen."""
+    raise KeyError("drive")
+
+
+def test_a_scenario_that_builds_on_one_that_failed_fails_itself() -> None:
+    result = tried(like(needs_more), Lived((0, 0)))  # type: ignore[arg-type]  # all that is looked at
     assert not result.passed
     assert result.said == "what it builds on has not been seen: KeyError('drive')"
+
+
+@pytest.mark.parametrize(
+    ("daemon", "before", "after", "as_wanted"),
+    [
+        ("same", (7, 0), (7, 0), True),
+        ("same", (7, 0), (8, 1), False),
+        ("same", (7, 0), (7, 1), False),
+        ("same", (7, 0), (0, 0), False),
+        ("same", (0, 0), (0, 0), True),
+        ("anew", (0, 0), (7, 0), True),
+        ("anew", (7, 0), (7, 0), True),
+        ("anew", (0, 0), (8, 1), False),
+        ("anew", (0, 0), (0, 0), False),
+        ("restarted", (7, 0), (8, 1), True),
+        ("restarted", (7, 0), (7, 0), False),
+        ("restarted", (7, 0), (9, 2), False),
+        ("gone", (7, 0), (0, 0), True),
+        ("gone", (7, 0), (7, 0), False),
+    ],
+)
+def test_a_daemon_that_dies_unnoticed_fails_the_scenario(
+    daemon: common.Daemon, before: tuple[int, int], after: tuple[int, int], as_wanted: bool
+) -> None:
+    lived = Lived(after, life=before)
+    result = tried(like(passes, daemon), lived)  # type: ignore[arg-type]  # all that is looked at
+    assert result.passed is as_wanted
+    assert as_wanted or result.said.startswith("the daemon has died unnoticed: process ")
+    assert lived.life == after
+
+
+class Playing:
+    """What a guest runs in, without a guest."""
+
+    def __init__(self, broken_off: threading.Event) -> None:
+        self.broken_off = broken_off
+        self.machine = self
+        self.life = (0, 0)
+
+    def __enter__(self) -> Playing:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def lives(self) -> tuple[int, int]:
+        return self.life
+
+    def run(self, *words: str, seconds: float) -> str:
+        return "the journal"
+
+
+def dies(bench: bench.Bench) -> str:
+    """QEMU ends in the middle of it."""
+    raise places.CannotBench("QEMU has ended with -9")
+
+
+def is_left(bench: bench.Bench) -> str:
+    """Somebody presses Ctrl-C in the middle of it."""
+    os.kill(os.getpid(), 2)
+    bench.machine.broken_off.wait(20.0)
+    raise places.BrokenOff
+
+
+def errs(bench: bench.Bench) -> str:
+    """There is a mistake in it."""
+    raise AttributeError("spelt wrongly")
+
+
+def played_by_two(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *shares: list[common.Scenario]
+) -> tuple[bool, list[list[str]], str]:
+    monkeypatch.setattr(guests, "bench", lambda image, folder, broken_off: Playing(broken_off))
+    both = [Guest(k + 1, share) for k, share in enumerate(shares)]
+    (tmp_path / "work").mkdir()
+    whole = run_all(both, image.Image(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    said = " ".join(one.skipped or one.said for guest in both for one in guest.results)
+    return whole, [[one.outcome for one in guest.results] for guest in both], said
+
+
+def test_a_computer_that_dies_leaves_a_report_of_what_was_and_what_was_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares = [like(passes), like(dies), passes, passes], [like(errs), passes]
+    whole, outcomes, said = played_by_two(monkeypatch, tmp_path, *shares)
+    assert whole
+    assert outcomes == [["passed", "FAILED", "skipped", "skipped"], ["FAILED", "passed"]]
+    assert "QEMU has ended with -9" in said
+    assert "not run: the emulated computer had ended" in said
+    assert "spelt wrongly" in said
+    assert (tmp_path / "journal-2.log").read_text() == "the journal"
+
+
+def test_a_run_that_is_broken_off_says_what_was_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, outcomes, said = played_by_two(monkeypatch, tmp_path, [like(passes), like(is_left), passes])
+    assert not whole
+    assert outcomes == [["passed", "skipped", "skipped"]]
+    assert said.count("not run: the run was broken off") == 2
+
+
+def test_what_is_waited_for_ends_when_the_run_is_broken_off(tmp_path: Path) -> None:
+    inside = Agent(b"", tmp_path)
+    threading.Timer(0.3, inside.broken_off.set).start()
+    begun = time.monotonic()
+    with pytest.raises(places.BrokenOff):
+        inside.run("sleep", "60", seconds=60.0)
+    assert time.monotonic() - begun < 5.0
+    inside.close()
+
+
+def test_the_drive_outside_is_driven_once_for_its_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    driven: list[int] = []
+
+    def drive() -> agreement.Trace:
+        driven.append(1)
+        return agreement.Trace(np.arange(3.0), np.ones((3, 2)))
+
+    monkeypatch.setattr(reference, "_driven", drive)
+    assert reference.outside().off.sum() == 6.0
+    assert driven == [1]
+    image.cache().mkdir(parents=True)
+    for _ in range(3):
+        assert reference.outside().off.sum() == 6.0
+    assert driven == [1, 1]
+    monkeypatch.setattr(reference, "SOURCES", ("daemon",))
+    reference.outside()
+    assert driven == [1, 1, 1]
+    assert len(list(image.cache().iterdir())) == 1
 
 
 def test_a_transaction_of_the_adapter_is_understood() -> None:
@@ -214,7 +423,7 @@ def test_a_pose_is_compared_where_the_map_begins() -> None:
 
 
 def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> None:
-    clock = bench.OtherClock()
+    clock = OtherClock()
     apart, age = 500.0, 0.02
     for k, delay in enumerate((0.003, 0.060, 0.001, 0.200)):
         t = 10.0 + k
@@ -225,7 +434,7 @@ def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> Non
 
 def test_a_pose_datagram_is_read_as_the_daemon_writes_it() -> None:
     one = replace(example(7), t_mono=12.5, t_sent=12.53)
-    read = bench.heard(registers.encode_datagram(one), 100.03, bench.OtherClock())
+    read = bench.heard(registers.encode_datagram(one), 100.03, OtherClock())
     assert read.t_pose == pytest.approx(100.0, abs=2e-4)
     assert one.pose is not None
     assert read.pose == pytest.approx(one.pose, abs=1e-4)

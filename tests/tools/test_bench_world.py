@@ -206,27 +206,41 @@ def test_two_runs_are_compared_at_equal_ways() -> None:
     _, gap = agreement.differences(agreement.trace(one), agreement.trace(other))
     assert gap == pytest.approx(0.004, abs=1e-6)
     assert agreement.differences(agreement.trace(one), agreement.trace(shifted))[1].max() > 0.01  # poses 31 ms too late
-    told, _ = agreement.figures(agreement.trace(one), agreement.trace(other), "x")
-    assert told[-1].value == pytest.approx(4.0, abs=1e-3)
+    seen, _ = agreement.figures(agreement.trace(one), agreement.trace(other), "x")
+    assert seen[-1].value == pytest.approx(4.0, abs=1e-3)
+    assert seen[0].value == pytest.approx(1.45, abs=0.06), "to the fault at 3 s"
+
+
+def told(off_m: float, again: float = math.inf, counted: bool = True) -> Played:
+    """The map lies in the survey from 4 s on, until ``again``, which jumps that are ``counted`` have done."""
+    run = replace(played(), lamps=frozenset({7}))
+    site = [(*xy, yaw) for *xy, yaw in way(np.array([max(one.t_pose, 0.0) for one in run.reads])).tolist()]
+    reads = [
+        replace(one, pose=(x + off_m, y, yaw), jumps=int(counted)) if 4.0 < one.t < again else one
+        for one, (x, y, yaw) in zip(run.reads, site, strict=True)
+    ]
+    return replace(run, reads=reads)
 
 
 def test_under_surveyed_lamps_the_map_lies_in_the_survey_once_light_has_told() -> None:
     """Until then where the robot said it was while it stood; a pose that is off is off in either frame."""
-
-    def told(off_m: float, again: float = math.inf) -> Played:
-        run = replace(played(), lamps=frozenset({7}))
-        site = [(*xy, yaw) for *xy, yaw in way(np.array([max(one.t_pose, 0.0) for one in run.reads])).tolist()]
-        poses = [
-            (x + off_m, y, yaw) if 4.0 < one.t < again else one.pose
-            for one, (x, y, yaw) in zip(run.reads, site, strict=True)
-        ]
-        return replace(run, reads=[replace(one, pose=pose) for one, pose in zip(run.reads, poses, strict=True)])
-
     assert errors_of(told(0.0)).metres.max() < 1e-9
     assert np.abs(errors_of(told(0.0)).off[:, 2]).max() < 1e-9
     assert errors_of(told(0.3)).metres.max() == pytest.approx(0.3)
     assert errors_of(told(0.0, again=6.0)).metres.max() > 1.0, "a map that goes back to where it lay is no place"
     assert errors_of(replace(told(0.0), lamps=frozenset())).metres.max() > 1.0
+    assert errors_of(told(0.0)).t_site == pytest.approx(4.05)
+
+
+def test_a_pose_that_is_wrong_does_not_choose_the_frame_it_is_judged_in() -> None:
+    """Without a jump that is counted the map is where it was; a survey that is never found is no place in it."""
+    assert errors_of(told(0.0, counted=False)).metres.max() > 1.0
+    never = replace(played(), lamps=frozenset({7}))
+    holds, seen = judged(Expectation("error", at_most=0.1), never)
+    assert not holds
+    assert "never told" in seen.said
+    assert judged(Expectation("error", at_most=0.1), replace(never, lamps=frozenset()))[0]
+    assert judged(Expectation("error", at_most=0.1), told(0.0))[0]
 
 
 def test_two_runs_are_compared_until_a_fault_strikes() -> None:
@@ -241,6 +255,19 @@ def test_two_runs_are_compared_until_a_fault_strikes() -> None:
     assert apart[1].max() == pytest.approx(0.5, abs=1e-6)
     early = replace(moved, scenario=replace(SCENARIO, faults=({"when": 1.0},)))
     assert "before it has driven" in twins(early.scenario, early).skipped
+
+
+def test_two_runs_are_compared_until_one_closes_a_loop() -> None:
+    """With which keyframe depends on the scans, and what that is good for is centimetres."""
+    moved = played(lambda t: 0.02 if t > 2.0 else 0.0)
+    closed = replace(moved, reads=[replace(one, loops=5 if one.t < 1.95 else 6) for one in moved.reads])
+    at, gap = agreement.differences(agreement.trace(played()), agreement.trace(closed))
+    assert gap.max() < 1e-9
+    assert at[-1] == pytest.approx(0.9, abs=0.1)
+    assert agreement.differences(agreement.trace(played()), agreement.trace(moved))[1].max() > 0.019
+    whole = replace(SCENARIO, faults=())
+    early = replace(moved, scenario=whole, reads=[replace(one, loops=int(one.t > 0.5)) for one in moved.reads])
+    assert "could be compared" in twins(whole, early).said
 
 
 def test_the_benchs_room_and_lidar_stand_beside_the_others() -> None:

@@ -52,7 +52,7 @@ def test_modbus_reader(tcp: bool) -> None:
         assert reading == {
             "seq": 70_000, "state": "TRACKING", "reason": 7, "fault": 9, "x_known": 1, "y_known": 0, "yaw_known": 1,
             "bounded": 0, "alert": 0, "age": 0.025, "x": 1.2345, "y": -2.3456, "yaw": 3.0,
-            "sigma_x": 0.02, "sigma_y": 0.01, "sigma_yaw": 0.01,
+            "sigma_x": 0.02, "sigma_y": 0.01, "sigma_yaw": 0.01, "jumps": 3, "loops": 2, "t_mono": 1234.5,
         }  # fmt: skip
 
 

@@ -1,26 +1,26 @@
 """``python -m tools.bench.vm``: the shipped package in an emulated computer, tried from outside.
 
-Ends with 0 if every scenario passed, 1 if one did not, 2 if this machine cannot run it (the text says what is missing).
+Ends with 0 if every scenario passed, 1 if one did not or was not run, 2 if this machine cannot run it (the text says
+what is missing).
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import signal
 import sys
 import time
 from pathlib import Path
 
-from tools.bench.report import About, CannotCompare, Result, Seen, facts, read, write
-from tools.bench.vm.bench import Bench, bench
+from tools.bench.report import About, CannotCompare, Result, facts, read, write
 from tools.bench.vm.common import Scenario
+from tools.bench.vm.guests import Guest, run_all
 from tools.bench.vm.image import Image, image
-from tools.bench.vm.machine import Order
 from tools.bench.vm.places import CannotBench, workspace
-from tools.bench.vm.scenarios import SCENARIOS
+from tools.bench.vm.reference import outside
+from tools.bench.vm.scenarios import SCENARIOS, SHARES
 
-ROOM = 2_000_000_000
+ROOM = 4_000_000_000
 CANNOT = 2
 CONFIGURATION = Path(__file__).parent / "guest" / "lumiloop.toml"
 
@@ -30,49 +30,25 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-def tried(scenario: Scenario, bench: Bench) -> Result:
-    """One scenario's result."""
-    title = (scenario.__doc__ or scenario.__name__).splitlines()[0].rstrip(".")
-    begun = time.monotonic()
-    try:
-        told, passed = scenario(bench), True
-        seen = told if isinstance(told, Seen) else Seen(told)
-    except LookupError as error:
-        seen, passed = Seen(f"what it builds on has not been seen: {error!r}"), False
-    except (Order, OSError, ValueError, StopIteration) as error:
-        seen, passed = Seen(f"{error}" or repr(error)), False
-    seconds = time.monotonic() - begun
-    result = Result(scenario.__name__, title, passed, seconds, seen.said, figures=seen.figures, plots=seen.plots)
-    say(f"{result.outcome} {seconds:6.1f} s  {title}\n{' ' * 17}{seen.said}")
-    return result
-
-
-def chosen(names: list[str]) -> list[Scenario]:
-    """All scenarios, or those up to the last that is named: each builds on the ones before."""
-    if not names:
-        return SCENARIOS
+def chosen(names: list[str]) -> list[list[Scenario]]:
+    """All shares; or of each what goes up to the last that is named: each scenario builds on the ones before."""
     known = [one.__name__ for one in SCENARIOS]
     unknown = [name for name in names if name not in known]
     if unknown:
         raise CannotBench(f"no such scenario: {', '.join(unknown)}; there are {', '.join(known)}")
-    return SCENARIOS[: max(known.index(name) for name in names) + 1]
+    if not names:
+        return SHARES
+    ends = [max((k + 1 for k, one in enumerate(share) if one.__name__ in names), default=0) for share in SHARES]
+    return [share[:end] for share, end in zip(SHARES, ends, strict=True) if end]
 
 
-def run(made: Image, scenarios: list[Scenario], out: Path) -> list[Result]:
-    """Try them; the console and the daemon's log stay in ``out``."""
+def run(made: Image, shares: list[list[Scenario]], out: Path) -> tuple[bool, list[Result]]:
+    """Try them; whether that went to its end, and the results."""
     out.mkdir(parents=True, exist_ok=True)
+    guests = [Guest(number, share) for number, share in enumerate(shares, 1)]
     with workspace("lumiloop-vm", ROOM) as folder:
-        try:
-            with bench(made, folder) as whole:
-                results = [tried(scenario, whole) for scenario in scenarios]
-                with contextlib.suppress(Order, OSError):
-                    words = ["journalctl", "--no-pager", "-o", "short-monotonic"]
-                    (out / "journal.log").write_text(whole.machine.run(*words, seconds=120))
-                return results
-        finally:
-            for name in ("console", "qemu", "world"):
-                if (folder / name).exists():
-                    (out / f"{name}.log").write_bytes((folder / name).read_bytes())
+        whole = run_all(guests, made, folder, out, say)
+    return whole, [one for guest in guests for one in guest.results]
 
 
 def main() -> int:
@@ -92,23 +68,29 @@ def main() -> int:
     try:
         if options.against is not None:
             read(options.against)  # what is wrong with it is told now, not in eight minutes
+        shares = chosen(options.scenario)
         made = image(say)
+        outside()
         if options.image_only:
             return 0
-        results = run(made, chosen(options.scenario), options.out)
+        whole, results = run(made, shares, options.out)
     except (CannotBench, CannotCompare) as reason:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT
     except KeyboardInterrupt:
-        say("ended before its end; nothing of it is left running")
+        say("ended before it began; nothing of it is left running")
         return CANNOT
     seconds = f"{time.monotonic() - begun:.0f}"
     told = facts(image=made.folder.name, configuration=CONFIGURATION.read_text(), **{"seconds in all": seconds})
+    if not whole:
+        told["broken off"] = "before its end; what was not run by then is named below"
     worse = write(options.out, results, About("bench-vm", "Virtual bench", told), options.against)
     failed = [one.name for one in results if not one.passed]
     for text in worse:
         say(f"worse than before: {text}")
-    say(f"{len(results) - len(failed)} of {len(results)} passed in {seconds} s; {options.out}/report.html")
+    left = sum(bool(one.skipped) for one in results)
+    count = f"{len(results) - len(failed)} of {len(results)} passed{f', {left} not run' if left else ''}"
+    say(f"{count} in {seconds} s; {options.out}/report.html")
     return int(bool(failed or worse))
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from tools.bench.otherclock import OtherClock
 from tools.bench.vm.image import ROOT, Image
 from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
 from tools.bench.vm.places import LEASH, CannotBench
@@ -34,8 +35,6 @@ PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
 KEPT: Final = 30_000
 WORLD_S: Final = 240.0
 READS: Final = 4
-CLOCK_READS: Final = 300
-"""A minute at 5 Hz: two clocks of one computer do not drift apart in that time."""
 Pose = tuple[float, float, float]
 
 
@@ -48,25 +47,6 @@ class Heard:
     state: int
     pose: Pose | None
     sigma_m: float
-
-
-class OtherClock:
-    """The emulated computer's monotonic clock by this one's: the datagram tells that was under way the shortest.
-
-    On a busy computer one is under way for long, and a robot at 0.6 m/s drives on 6 mm in 10 ms.
-    """
-
-    def __init__(self) -> None:
-        self._apart: deque[float] = deque(maxlen=CLOCK_READS)
-        self._latest = -math.inf
-
-    def here(self, t_there: float, sent_there: float, now: float) -> float:
-        """An instant of a datagram that was sent ``sent_there`` and came ``now``."""
-        if sent_there < self._latest:  # it has been switched on anew
-            self._apart.clear()
-        self._latest = sent_there
-        self._apart.append(now - sent_there)
-        return t_there + min(self._apart)
 
 
 @dataclass(slots=True)
@@ -127,6 +107,7 @@ class Bench:
         self.ears = Ears()
         self.start: Pose | None = None
         self.memory: dict[str, Any] = {}
+        self.life = (0, 0)
 
     def orders(self, text: str) -> str:
         """An order to the world's devices (`python -m hal.fake`'s control socket): ``order silence for=2``."""
@@ -183,7 +164,7 @@ class Bench:
             acknowledge, result = struct.unpack_from(">HH", self.registers(1008, 2, 3))
             if acknowledge == request:
                 return int(result)
-            time.sleep(0.1)
+            self.wait(0.1)
         raise Order(f"command {number} was not acknowledged within {seconds:.0f} s")
 
     def until(self, what: str, seconds: float, happens: Callable[[], object]) -> float:
@@ -192,9 +173,13 @@ class Bench:
         while not happens():
             if time.monotonic() - begun > seconds:
                 raise Order(f"not within {seconds:.0f} s: {what}; Modbus says {self.read()}\n{self.log(12)}")
-            self.machine.check()
-            time.sleep(0.1)
+            self.wait(0.1)
         return time.monotonic() - begun
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, while the machine runs."""
+        self.machine.broken_off.wait(seconds)
+        self.machine.check()
 
     def placed(self, seconds: float, states: tuple[str, ...] = ("TRACKING",)) -> float:
         """Wait until the pose may be used."""
@@ -213,7 +198,12 @@ class Bench:
 
     def main_pid(self) -> int:
         """The daemon's process inside."""
-        return int(self.machine.show(UNIT, "MainPID")["MainPID"])
+        return self.lives()[0]
+
+    def lives(self) -> tuple[int, int]:
+        """The daemon's process inside, 0: there is none; how often it was started anew without a person."""
+        seen = self.machine.show(UNIT, "MainPID", "NRestarts")
+        return int(seen["MainPID"]), int(seen["NRestarts"])
 
     def log(self, lines: int) -> str:
         """The end of the daemon's log."""
@@ -239,7 +229,7 @@ class Bench:
     def collect(self, seconds: float) -> list[Heard]:
         """The pose datagrams of the next seconds."""
         begun = time.monotonic()
-        time.sleep(seconds)
+        self.wait(seconds)
         return [one for one in list(self.ears.poses) if one.t_came >= begun]
 
 
@@ -267,7 +257,7 @@ def _end(child: subprocess.Popen[str]) -> None:
 
 
 @contextmanager
-def bench(image: Image, folder: Path) -> Iterator[Bench]:
+def bench(image: Image, folder: Path, broken_off: threading.Event) -> Iterator[Bench]:
     """Everything running, the emulated computer switched on; nothing of it is left at the end."""
     with ExitStack() as stack:
         truth, poses = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
@@ -277,7 +267,7 @@ def bench(image: Image, folder: Path) -> Iterator[Bench]:
         world, there = _start_world(folder, odometry, truth.getsockname()[1], stack)
         there["poses"] = poses.getsockname()[1]
         ports = Ports(free_for_both(), odometry, int(there["lidar"]))
-        machine = stack.enter_context(started(image, folder, ports))
+        machine = stack.enter_context(started(image, folder, ports, broken_off))
         made = Bench(machine, world, folder, there)
         stop = threading.Event()
         ears = threading.Thread(target=made.ears.listen, args=(truth, poses, stop))

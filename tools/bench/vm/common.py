@@ -1,26 +1,53 @@
-"""What scenarios share: how they are told apart from other functions, and what several of them ask."""
+"""What scenarios share: how they are told apart from other functions, and what several of them do and ask."""
 
 from __future__ import annotations
 
 import struct
+import time
 from collections.abc import Callable, Iterable
-from typing import Final
+from typing import Final, Literal
 
 from tools.bench.report import Seen
-from tools.bench.vm.bench import Bench, Heard
+from tools.bench.vm.bench import PLACED, UNIT, Bench, Heard
 from tools.bench.vm.machine import Order
 
 Scenario = Callable[[Bench], str | Seen]
 WRITTEN: Final[list[Scenario]] = []
 """All scenarios, module by module in the order of their lines."""
+Daemon = Literal["same", "anew", "restarted", "gone"]
+AFTER: Final[dict[Scenario, Daemon]] = {}
+"""What the daemon is after each: the same process as before; one that a person or the computer's start has started,
+and which has lived since; one that the service manager has restarted once; none."""
 TRACKING_S: Final = 60.0
 WORST_M: Final = 0.10
+RESTING_M: Final = 0.05
 
 
-def scenario(function: Scenario) -> Scenario:
-    """A decorator: it is one of the list."""
-    WRITTEN.append(function)
-    return function
+def scenario(daemon: Daemon = "same") -> Callable[[Scenario], Scenario]:
+    """A decorator: it is one of the list, and leaves the daemon so."""
+
+    def kept(function: Scenario) -> Scenario:
+        WRITTEN.append(function)
+        AFTER[function] = daemon
+        return function
+
+    return kept
+
+
+def unnoticed(bench: Bench, wanted: Daemon) -> str:
+    """What has become of the daemon's process that nobody had in mind; empty text: nothing. What it is now is kept."""
+    before, now = bench.life, bench.lives()
+    bench.life = now
+    as_wanted = {
+        "same": now == before,
+        "anew": now[0] != 0 and now[1] == 0,
+        "restarted": now[0] not in (0, before[0]) and now[1] == before[1] + 1,
+        "gone": now[0] == 0,
+    }[wanted]
+    if as_wanted:
+        return ""
+    told = " has become ".join(f"process {pid} with {count} restarts" for pid, count in (before, now))
+    return f"the daemon has died unnoticed: {told} ({wanted} was expected)\n{bench.log(20)}"
 
 
 def need(holds: object, text: str) -> None:
@@ -47,6 +74,37 @@ def right(bench: Bench, heard: Iterable[Heard], bound: float = WORST_M) -> list[
 def map_id(bench: Bench) -> int:
     """Identity of the map frame."""
     return int(struct.unpack(">I", bench.registers(46, 2))[0])
+
+
+def come_up(bench: Bench) -> str:
+    """Wait for the system inside; raises `Order` if a unit has failed."""
+    seconds = bench.machine.wait_until_up()
+    state = bench.machine.run("systemctl", "is-system-running", "--wait", check=False, seconds=120).strip()
+    failed = bench.machine.run("systemctl", "list-units", "--failed", "--no-legend", "--plain")
+    need(state == "running", f"the system is {state}: {failed}")
+    return f"up after {seconds:.0f} s"
+
+
+def start(bench: Bench, *tables: str) -> float:
+    """Configure the daemon and start it for the first time; s until READY."""
+    bench.configure(*tables)
+    bench.ears.poses.clear()
+    begun = time.monotonic()
+    bench.machine.run("systemctl", "enable", "--now", UNIT, seconds=300)
+    seconds = time.monotonic() - begun
+    need(bench.machine.show(UNIT, "ActiveState")["ActiveState"] == "active", bench.log(30))
+    return seconds
+
+
+def begin(bench: Bench) -> float:
+    """The robot has stood still since: its map begins where it stands. The largest error, m."""
+    bench.placed(TRACKING_S, PLACED)
+    true = bench.ears.true_pose(time.monotonic() - 0.5)
+    need(true is not None, "the world does not tell where the robot is")
+    bench.start = true
+    worst = max(right(bench, bench.collect(2.0), RESTING_M))
+    bench.memory["map"] = map_id(bench)
+    return worst
 
 
 def same_process(bench: Bench, pid: int) -> None:

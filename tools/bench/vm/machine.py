@@ -5,24 +5,36 @@ from __future__ import annotations
 import json
 import os
 import re
+import select
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from tools.bench.vm.image import Image
-from tools.bench.vm.places import LEASH, CannotBench
+from tools.bench.vm.places import LEASH, BrokenOff, CannotBench
 
-BOOT_S, QUIT_S = 400.0, 10.0
+BOOT_S, QUIT_S, LOOK_S = 400.0, 10.0, 0.5
 MODBUS, ODOMETRY = 1502, 5601
-UNUSED = ("serial-getty@ttyS0", "getty@tty1", "systemd-logind", "systemd-update-utmp", "systemd-update-utmp-runlevel")
+UNUSED = (
+    *(f"{unit}.service" for unit in ("serial-getty@ttyS0", "getty@tty1", "systemd-logind", "systemd-binfmt")),
+    *(f"{unit}.service" for unit in ("systemd-update-utmp", "systemd-update-utmp-runlevel")),
+    *(f"modprobe@{module}.service" for module in ("dm_mod", "efi_pstore", "fuse", "loop")),
+    "dev-hugepages.mount",
+    "proc-sys-fs-binfmt_misc.automount",
+)
+"""Of what a small Debian does at every boot."""
+NOBODYS = "ahci,libahci,libata,cfg80211,kvm,kvm_amd,iTCO_wdt,aesni_intel,ghash_clmulni_intel,powernow_k8,psmouse,pcspkr"
+"""Modules of devices that nothing here needs."""
 COMMAND_LINE = " ".join([
     "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off systemd.show_status=false",
-    *(f"systemd.mask={unit}.service" for unit in UNUSED),
+    f"modprobe.blacklist={NOBODYS}",
+    *(f"systemd.mask={unit}" for unit in UNUSED),
 ])  # fmt: skip
 OUTSIDE = "10.0.2.2"
 """This computer, as the emulated one sees it."""
@@ -64,10 +76,13 @@ class Order(Exception):
 class Machine:
     """A running one. Made by :func:`started`."""
 
-    def __init__(self, process: subprocess.Popen[bytes], folder: Path, ports: Ports) -> None:
-        self.process, self.folder, self.ports = process, folder, ports
+    def __init__(
+        self, process: subprocess.Popen[bytes], folder: Path, ports: Ports, broken_off: threading.Event
+    ) -> None:
+        self.process, self.folder, self.ports, self.broken_off = process, folder, ports, broken_off
         self._agent: socket.socket | None = None
-        self._lines: IO[bytes] | None = None
+        self._heard = b""
+        self._orders = 0
         self._qmp: tuple[socket.socket, IO[bytes]] | None = None
 
     def wait_until_up(self) -> float:
@@ -82,35 +97,65 @@ class Machine:
     def _greeted(self) -> bool:
         """Whether the agent has said that it is up, within a second."""
         if self._agent is None:
-            self._agent = _connected(self.folder / "agent")
-            self._lines = self._agent.makefile("rb")
-        self._agent.settimeout(1.0)
-        try:
-            assert self._lines is not None
-            return b'"up"' in self._lines.readline()
-        except TimeoutError:
+            self._agent, self._heard = _connected(self.folder / "agent"), b""
+        said = self._line(time.monotonic() + 1.0)
+        if said is None:
             self._drop()
-            return False
+        return b'"up"' in (said or b"")
 
     def _drop(self) -> None:
-        if self._agent is not None and self._lines is not None:
-            self._lines.close()
+        if self._agent is not None:
             self._agent.close()
-        self._agent = self._lines = None
+        self._agent = None
+
+    def _line(self, until: float) -> bytes | None:
+        """The agent's next line; None: there is none by then. What has come of one that is not whole is kept."""
+        assert self._agent is not None
+        while b"\n" not in self._heard:
+            self.check()
+            left = until - time.monotonic()
+            if left <= 0.0:
+                return None
+            if select.select([self._agent], [], [], min(left, LOOK_S))[0]:
+                piece = self._agent.recv(65536)
+                if not piece:
+                    raise self._cut()
+                self._heard += piece
+        line, _, self._heard = self._heard.partition(b"\n")
+        return line
+
+    def _cut(self) -> Order:
+        """What is wrong when the line to the agent has been cut; `CannotBench` instead if QEMU ends, as it will."""
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(QUIT_S)
+        self.check()
+        return Order("the line to the agent inside has been cut")
 
     def order(self, patience: float, **order: Any) -> dict[str, Any]:
-        """Have the agent do something; its answer."""
+        """Have the agent do something; its answer.
+
+        Orders are numbered: the answer to one that was waited for in vain may still come, before that to the next.
+
+        Raises:
+            Order: there was none in time, or the agent began anew.
+        """
         assert self._agent is not None
-        assert self._lines is not None
-        self._agent.settimeout(patience)
-        self._agent.sendall(json.dumps(order).encode() + b"\n")
+        self._orders += 1
         try:
-            answer: dict[str, Any] = json.loads(self._lines.readline())
-        except (TimeoutError, ValueError) as error:
-            raise Order(f"no answer to {order} within {patience:.0f} s") from error
-        if "code" not in answer:
-            raise Order(f"the agent inside was started anew while it was to do {order}")
-        return answer
+            self._agent.sendall(json.dumps({"id": self._orders, **order}).encode() + b"\n")
+        except OSError as error:
+            raise self._cut() from error
+        until = time.monotonic() + patience
+        while (line := self._line(until)) is not None:
+            try:
+                answer: dict[str, Any] = json.loads(line)
+            except ValueError:  # the rest of what an agent said that was ended in the middle of it
+                continue
+            if "up" in answer:
+                raise Order(f"the agent inside was started anew while it was to do {order}")
+            if answer["id"] == self._orders:
+                return answer
+        raise Order(f"no answer to {order} within {patience:.0f} s")
 
     def run(self, *words: str, check: bool = True, seconds: float = 60.0) -> str:
         """Run a command inside, as root; what it wrote, both streams.
@@ -143,7 +188,9 @@ class Machine:
         self._drop()
 
     def check(self) -> None:
-        """Raise `CannotBench` if it has ended."""
+        """Raise `CannotBench` if it has ended, `BrokenOff` if it is to."""
+        if self.broken_off.is_set():
+            raise BrokenOff
         if self.process.poll() is not None:
             said = (self.folder / "qemu").read_text(errors="replace")
             raise CannotBench(f"QEMU has ended with {self.process.returncode}:\n{said}{self.console()[-2000:]}")
@@ -204,7 +251,7 @@ def _words(image: Image, folder: Path, ports: Ports) -> list[str]:
     forwards = f"hostfwd=tcp:127.0.0.1:{ports.modbus}-:{MODBUS},hostfwd=udp:127.0.0.1:{ports.modbus}-:{MODBUS}"
     return [
         "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-machine", "q35",
-        "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "1536",
+        "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "1", "-m", "1536",
         "-kernel", str(image.kernel), "-initrd", str(image.initrd), "-append", COMMAND_LINE,
         "-drive", f"file={image.disk},if=none,id=disk,format=raw,snapshot=on,cache=unsafe",
         "-device", "virtio-blk-pci,drive=disk", "-device", "virtio-rng-pci",
@@ -221,13 +268,14 @@ def _words(image: Image, folder: Path, ports: Ports) -> list[str]:
 
 
 @contextmanager
-def started(image: Image, folder: Path, ports: Ports) -> Iterator[Machine]:
+def started(image: Image, folder: Path, ports: Ports, broken_off: threading.Event) -> Iterator[Machine]:
     """Switch it on; it is off at the end, whatever happens.
 
     Args:
         image: what it starts from.
         ports: where it can be reached, and where its lidar is.
         folder: for sockets and console; its disk's changes go there too, and are gone at the end.
+        broken_off: once set, whoever waits for it gets `BrokenOff`.
     """
     with ExitStack() as stack:
         said = stack.enter_context((folder / "qemu").open("wb"))
@@ -235,6 +283,6 @@ def started(image: Image, folder: Path, ports: Ports) -> Iterator[Machine]:
         process = subprocess.Popen(
             [*LEASH, *_words(image, folder, ports)], stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
         )
-        machine = Machine(process, folder, ports)
+        machine = Machine(process, folder, ports, broken_off)
         stack.callback(machine.stop)
         yield machine

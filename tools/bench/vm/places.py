@@ -30,6 +30,10 @@ class CannotBench(Exception):
     """The bench cannot run here; the text says what is missing and how to get it."""
 
 
+class BrokenOff(Exception):
+    """Somebody wants the run to end before its end."""
+
+
 def missing(build: bool = True) -> str:
     """What this machine lacks, with the remedy; empty if nothing."""
     path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"

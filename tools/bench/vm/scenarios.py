@@ -1,4 +1,7 @@
-"""What is tried, in this order, each building on the ones before: a function that raises where something is not so.
+"""What is tried: a function that raises where something is not so.
+
+Two emulated computers run side by side, each on one processor of this one. A scenario builds on those before it in the
+same computer; the first of each brings that computer up. They are shared out so that both take about as long.
 
 A scenario's first line is its title in the report; what it returns is what was seen. Times are the emulated computer's:
 some twenty times slower than the machine around it, so they are reported and bounded only as far as they must be.
@@ -6,9 +9,15 @@ some twenty times slower than the machine around it, so they are reported and bo
 
 from __future__ import annotations
 
-from tools.bench.vm import trying_devices, trying_photodiode, trying_process, trying_system
+from typing import Final
+
+from tools.bench.vm import trying_computer, trying_devices, trying_photodiode, trying_process, trying_system
 from tools.bench.vm.common import WRITTEN, Scenario
 
-PARTS = (trying_system, trying_devices, trying_photodiode, trying_process)
-SCENARIOS: list[Scenario] = [one for part in PARTS for one in WRITTEN if one.__module__ == part.__name__]
-"""All of them, in order."""
+PARTS: Final = ((trying_system, trying_devices, trying_process), (trying_photodiode, trying_computer))
+SHARES: Final[list[list[Scenario]]] = [
+    [one for part in parts for one in WRITTEN if one.__module__ == part.__name__] for parts in PARTS
+]
+"""Of each computer, in order."""
+SCENARIOS: Final[list[Scenario]] = [one for share in SHARES for one in share]
+"""All of them."""

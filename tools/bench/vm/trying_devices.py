@@ -12,7 +12,7 @@ PLUG: Final = "/sys/bus/usb/devices/usb1/1-0:1.0/usb1-port1/disable"
 """Of the hub that the lidar is plugged into: without power at its port there is nothing there."""
 
 
-@scenario
+@scenario()
 def is_unplugged(bench: Bench) -> str:
     """The USB cable is pulled while it drives: said so at once, carried on wheels, the same process."""
     pid = bench.main_pid()
@@ -27,7 +27,7 @@ def is_unplugged(bench: Bench) -> str:
     return f"shown after {seconds:.1f} s; {1e3 * max(found, default=0.0):.0f} mm off after 3 s on wheels"
 
 
-@scenario
+@scenario()
 def is_plugged_in_again(bench: Bench) -> str:
     """The cable is put back: TRACKING by itself."""
     pid = bench.main_pid()
@@ -35,7 +35,7 @@ def is_plugged_in_again(bench: Bench) -> str:
     return back(bench, pid)
 
 
-@scenario
+@scenario()
 def comes_back_under_another_name(bench: Bench) -> str:
     """Another program holds the old device node, so that the lidar comes back as ttyACM1."""
     pid = bench.main_pid()
@@ -52,7 +52,7 @@ def _lidar_node(bench: Bench) -> str:
     return bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar", check=False)
 
 
-@scenario
+@scenario()
 def falls_silent(bench: Bench) -> str:
     """The lidar says nothing for six seconds, its cable in place."""
     pid = bench.main_pid()
@@ -62,7 +62,7 @@ def falls_silent(bench: Bench) -> str:
     return f"shown after {seconds:.1f} s; {back(bench, pid)}"
 
 
-@scenario
+@scenario()
 def is_switched_off(bench: Bench) -> str:
     """The lidar loses its power for four seconds and starts up again."""
     pid = bench.main_pid()
@@ -71,10 +71,10 @@ def is_switched_off(bench: Bench) -> str:
     return back(bench, pid)
 
 
-@scenario
+@scenario()
 def talks_garbage(bench: Bench) -> str:
     """Every second scan is random bytes for five seconds."""
     pid = bench.main_pid()
     bench.orders("order garbage where=lidar on=scans share=0.5 for=5")
-    time.sleep(5.0)
+    bench.wait(5.0)
     return back(bench, pid)

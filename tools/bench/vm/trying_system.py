@@ -12,29 +12,24 @@ import numpy as np
 from tools.bench.plots import Plot, Series, histogram
 from tools.bench.report import Figure, Seen
 from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
-from tools.bench.vm.common import TRACKING_S, map_id, need, right, scenario
+from tools.bench.vm.common import TRACKING_S, begin, come_up, map_id, need, right, scenario, start
 from tools.bench.vm.machine import Order
+from tools.bench.vm.reference import DRIVE_S, outside
 
 FIFO: Final = 1
-RESTING_M: Final = 0.05
-DRIVE_S: Final = 30.0
 AGREE_M: Final = 0.01
 
 
 # the system as it comes up
 
 
-@scenario
+@scenario()
 def boots(bench: Bench) -> str:
     """Debian boots with the package installed, and no unit has failed."""
-    seconds = bench.machine.wait_until_up()
-    state = bench.machine.run("systemctl", "is-system-running", "--wait", check=False, seconds=120).strip()
-    failed = bench.machine.run("systemctl", "list-units", "--failed", "--no-legend", "--plain")
-    need(state == "running", f"the system is {state}: {failed}")
-    return f"up after {seconds:.0f} s; kernel {bench.machine.run('uname', '-r').strip()}"
+    return f"{come_up(bench)}; kernel {bench.machine.run('uname', '-r').strip()}"
 
 
-@scenario
+@scenario()
 def names_the_lidar(bench: Bench) -> str:
     """Udev gives the lidar its name and its group, and keeps ModemManager away."""
     link = bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar").strip()
@@ -46,7 +41,7 @@ def names_the_lidar(bench: Bench) -> str:
     return f"/dev/lumiloop/lidar is {link}, {group}"
 
 
-@scenario
+@scenario()
 def probes(bench: Bench) -> str:
     """`lumiloop probe` finds the lidar before anything is configured."""
     said = bench.machine.run("lumiloop", "probe", check=False, seconds=120)
@@ -55,22 +50,16 @@ def probes(bench: Bench) -> str:
     return found
 
 
-@scenario
+@scenario("anew")
 def starts(bench: Bench) -> str:
     """`systemctl enable --now lumiloop`: warmed up and READY."""
-    bench.configure()
-    bench.ears.poses.clear()
-    begun = time.monotonic()
-    bench.machine.run("systemctl", "enable", "--now", UNIT, seconds=300)
-    seconds = time.monotonic() - begun
-    need(bench.machine.show(UNIT, "ActiveState")["ActiveState"] == "active", bench.log(30))
+    seconds = start(bench)
     warm = bench.machine.run("journalctl", "-q", "--no-pager", "-o", "cat", "-u", "lumiloop-warmup.service")
-    bench.memory["ready"] = seconds
     told = re.search(r"kernels (compiled|found and loaded) in [\d.]+ s", warm)
     return f"READY after {seconds:.1f} s, the warm-up before it included: {told.group() if told else warm}"
 
 
-@scenario
+@scenario()
 def is_restricted(bench: Bench) -> str:
     """It runs as nobody in particular, without any capability, in its two groups, with its system calls filtered."""
     status = bench.machine.run("cat", f"/proc/{bench.main_pid()}/status")
@@ -85,7 +74,7 @@ def is_restricted(bench: Bench) -> str:
     return f"user {fields['Uid'].split()[0]}, exposure {level.group(1) if level else '?'}"
 
 
-@scenario
+@scenario()
 def takes_real_time(bench: Bench) -> str:
     """The loop's thread has SCHED_FIFO and memory is locked, as the unit's limits allow."""
     pid = bench.main_pid()
@@ -106,7 +95,7 @@ def _policy(bench: Bench, pid: int) -> int:
 # the pose, from outside
 
 
-@scenario
+@scenario()
 def answers_modbus(bench: Bench) -> str:
     """The same block over Modbus UDP and TCP, from another computer."""
     bench.placed(TRACKING_S, PLACED)
@@ -119,7 +108,7 @@ def answers_modbus(bench: Bench) -> str:
     return f"{count} of {count} reads answered, {1e3 * (time.monotonic() - begun) / count:.1f} ms each"
 
 
-@scenario
+@scenario()
 def sends_datagrams(bench: Bench) -> str:
     """Pose datagrams arrive at another computer."""
     heard = bench.collect(5.0)
@@ -129,18 +118,13 @@ def sends_datagrams(bench: Bench) -> str:
     return f"{rate:.1f} a second; the pose is {1e3 * delay:.0f} ms old when it is sent (median)"
 
 
-@scenario
+@scenario()
 def begins_where_it_stands(bench: Bench) -> str:
     """A robot that stands still at its first start is where the map begins."""
-    true = bench.ears.true_pose(time.monotonic() - 0.5)
-    need(true is not None, "the world does not tell where the robot is")
-    bench.start = true
-    worst = max(right(bench, bench.collect(2.0), RESTING_M))
-    bench.memory["map"] = map_id(bench)
-    return f"{1e3 * worst:.0f} mm at most"
+    return f"{1e3 * begin(bench):.0f} mm at most"
 
 
-@scenario
+@scenario()
 def drives(bench: Bench) -> Seen:
     """A lap of 17 m at 0.6 m/s: TRACKING, never further from the truth than 10 cm and three of its own sigma."""
     bench.drive()
@@ -162,14 +146,11 @@ def drives(bench: Bench) -> Seen:
     return Seen(f"{len(heard)} poses", figures, plots)
 
 
-@scenario
+@scenario()
 def agrees_with_outside(bench: Bench) -> Seen:
     """The same drive outside, in virtual time: poses agree to 1 cm."""
-    from tools.bench.vm import world  # here: with it comes the estimator, which takes long to load
-    from tools.bench.world.agreement import figures as apart
-    from tools.bench.world.agreement import reference_of, trace_of
-    from tools.bench.world.room import room
-    from tools.sim.scene import SimulatedScene
+    from tools.bench.world.agreement import figures as apart  # here: with it comes the estimator, which takes long
+    from tools.bench.world.agreement import trace_of
 
     placed = [one for one in bench.memory["drive"] if one.pose is not None]
     told = list(bench.ears.truth)
@@ -177,13 +158,12 @@ def agrees_with_outside(bench: Bench) -> Seen:
         np.array([one.t_pose for one in placed]), np.array([one.pose for one in placed]),
         np.array([t for t, _ in told]), np.array([pose for _, pose in told]),
     )  # fmt: skip
-    outside = reference_of(SimulatedScene(world.scenario(), room()), world.DWELL_S + DRIVE_S + 10.0)
-    figures, plots = apart(inside, outside, "inside and outside")
+    figures, plots = apart(inside, outside(), "inside and outside")
     need(figures[-1].value <= 1e3 * AGREE_M, "; ".join(map(str, figures)))
     return Seen(f"{len(placed)} poses", figures, plots)
 
 
-@scenario
+@scenario()
 def saves_its_map(bench: Bench) -> str:
     """Command SAVE_MAP over Modbus."""
     bench.placed(TRACKING_S)

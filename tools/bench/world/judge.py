@@ -30,6 +30,7 @@ class Read:
         pose: in the robot's map. sigma_m: the larger of x and y. answered: False: nobody has answered.
         fresh: not read before.
         lamps: (lamp ID, photocurrent in A), strongest first, where they were asked for.
+        jumps: how often the map pose has moved against the odom pose at once. loops: how many have been closed.
     """
 
     t: float
@@ -41,6 +42,8 @@ class Read:
     answered: bool = True
     fresh: bool = False
     lamps: tuple[tuple[int, float], ...] = ()
+    jumps: int = 0
+    loops: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +67,16 @@ class Played:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """Poses less the truth, both in the robot's map: (n,) times, (n, 3) errors in m and rad, (n, 3) poses, sigmas."""
+    """Poses less the truth, both in the robot's map: (n,) times, (n, 3) errors in m and rad, (n, 3) poses, sigmas.
+
+    ``t_site``: when its map began to lie where the lamps' survey does, inf: it never has.
+    """
 
     t: Array
     off: Array
     pose: Array
     sigma: Array
+    t_site: float = math.inf
 
     @property
     def metres(self) -> Array:
@@ -85,8 +92,9 @@ class Errors:
 def errors_of(played: Played) -> Errors:
     """Of every read that has a pose; the map lies where the robot said it was while it stood.
 
-    Under surveyed lamps it lies so until light has told where the survey lies, and there from then on. Nothing that is
-    read says when that was, so it is taken to be once, with the first pose that is nearer to the truth that way.
+    Under surveyed lamps it lies so until light has told where the survey lies, and there from then on: once, with a
+    jump that is counted, to where the pose is nearer to the truth that way. A pose that is wrong without one is judged
+    where the map was before.
     """
     kept = [one for one in played.reads if one.pose is not None and one.fresh]
     t = np.array([one.t_pose for one in kept])
@@ -95,12 +103,16 @@ def errors_of(played: Played) -> Errors:
     told = np.mean(np.array(played.standing, dtype=np.float64).reshape(-1, 3), axis=0)
     site = played.truth(t) if len(t) else np.zeros((0, 3))
     truth = seen_from(start, told, site)
-    if played.lamps:
+    t_site = math.inf
+    if played.lamps and len(t):
         nearer = np.hypot(*(pose - site)[:, :2].T) < np.hypot(*(pose - truth)[:, :2].T)
-        truth = np.where(np.logical_or.accumulate(nearer)[:, None], site, truth)
+        jumped = np.diff([one.jumps for one in kept], prepend=0) != 0
+        moved = np.logical_or.accumulate(nearer & jumped)
+        truth = np.where(moved[:, None], site, truth)
+        t_site = float(t[np.argmax(moved)]) if moved.any() else math.inf
     off = pose - truth
     off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    return Errors(t, off, pose, np.array([one.sigma_m for one in kept]))
+    return Errors(t, off, pose, np.array([one.sigma_m for one in kept]), t_site)
 
 
 def seen_from(at: Array, pose: Array, truth: Array) -> Array:
@@ -130,6 +142,8 @@ def _error(expected: Expectation, played: Played, window: list[Read]) -> Verdict
     within = (found.t >= window[0].t) & (found.t <= window[-1].t)
     if not within.any():
         return False, Seen("no pose was read in that time")
+    if played.lamps and found.t_site == math.inf:
+        return False, Seen("light has never told where the survey lies, so no pose is a place in it")
     metres, allowed = found.metres[within], expected.at_most + expected.sigmas * found.sigma[within]
     worst = int(np.argmax(metres - allowed))
     figures = (

@@ -27,6 +27,7 @@ from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.tcp_server import TcpServer
 from hal.i2c_server import BusServer
 from hal.input_codec import decode, encode
+from tools.bench.otherclock import OtherClock
 from tools.bench.world.dac import DacThread
 from tools.bench.world.judge import Played, Pose, Read
 from tools.bench.world.scenario import Scenario
@@ -39,7 +40,6 @@ from tools.sim.scene import SimulatedScene
 from tools.sim.serve_light import BUS, converter
 
 POLL_S: Final = 0.01
-"""The block says how old its pose was when it was made, not when it is read: a new one is seen this late at most."""
 WAIT_S: Final = 0.05
 STANDING_S: Final = 2.0
 """Poses of so long, read while it stands, say where the map lies."""
@@ -84,7 +84,7 @@ class Ears:
         self._pose = Reader(host, port)
         self._lamps = LightReader(host, port) if lamps else None
         self.reads: list[Read] = []
-        self._seq, self._t_pose = -1, math.nan
+        self._seq, self._t_pose, self._clock = -1, math.nan, OtherClock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="modbus", daemon=True)
         self._thread.start()
@@ -94,7 +94,6 @@ class Ears:
             self.reads.append(self._one())
 
     def _one(self) -> Read:
-        before = self.reads[-1].t if self.reads else time.monotonic()
         try:
             told: dict[str, Any] = self._pose.read()
             lamps = self._heard()
@@ -103,11 +102,15 @@ class Ears:
         now = time.monotonic()
         fresh, self._seq = told["seq"] != self._seq, told["seq"]
         placed = told["x"] is not None and told["age"] is not None
-        if fresh:  # it was made between the read before and this one
-            self._t_pose = 0.5 * (before + now) - told["age"] if placed else math.nan
+        if fresh:  # it lay there unread for up to POLL_S, on a busy computer for longer
+            made, age = told["t_mono"], told["age"]
+            self._t_pose = self._clock.here(made, made + age, now) if placed else math.nan
         pose = (told["x"], told["y"], told["yaw"]) if placed else None
         sigma = max(told["sigma_x"] or 0.0, told["sigma_y"] or 0.0)
-        return Read(now, told["state"], told["fault"], self._t_pose, pose, sigma, True, fresh and placed, lamps)
+        counts = told["jumps"], told["loops"]
+        return Read(
+            now, told["state"], told["fault"], self._t_pose, pose, sigma, True, fresh and placed, lamps, *counts
+        )
 
     def _heard(self) -> tuple[tuple[int, float], ...]:
         if self._lamps is None:

@@ -6,8 +6,9 @@ Not part of the daemon, which meets only a real /dev/ttyACM0 and a real /dev/i2c
   line (/dev/ttyGS0), whose host side is /dev/ttyACM0;
 * transactions of the adapter `fakei2c` are carried out on the simulator's own bus, over TCP.
 
-Orders are JSON objects, one a line, on the virtio port `bench.agent`; each is answered by one line:
-{"run": [words], "seconds": 60} by {"code": 0, "out": "..."}; {"write": path, "text": "..."}; {"i2c": "tcp://host:port"}.
+Orders are JSON objects, one a line, on the virtio port `bench.agent`; each is answered by one line that has its number:
+{"id": 7, "run": [words], "seconds": 60} by {"id": 7, "code": 0, "out": "..."}; {"write": path, "text": "..."};
+{"i2c": "tcp://host:port"}.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import errno
 import json
 import os
 import select
+import signal
 import struct
 import subprocess
 import threading
@@ -115,18 +117,35 @@ def carry_i2c(name: str) -> None:
                 continue
 
 
+def run(words: list[str], seconds: float) -> dict[str, object]:
+    """A command with everything that it starts; all of that ends when its time is over, and so nobody waits for it."""
+    try:
+        child = subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            errors="replace", start_new_session=True,
+        )  # fmt: skip
+    except OSError as error:
+        return {"code": 127, "out": str(error)}
+    try:
+        said, _ = child.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired as error:
+        os.killpg(child.pid, signal.SIGKILL)
+        child.communicate()
+        return {"code": 127, "out": str(error)}
+    return {"code": child.returncode, "out": said}
+
+
+def write_all(port: int, data: bytes) -> None:
+    """A virtio port takes no more than 32 KB at once, and says how much of it."""
+    while data:
+        data = data[os.write(port, data) :]
+
+
 def obey(order: dict[str, object]) -> dict[str, object]:
     """Carry out one order."""
     if "run" in order:
         words = [str(word) for word in order["run"]]  # type: ignore[attr-defined]  # as the bench sends it
-        try:
-            done = subprocess.run(
-                words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                errors="replace", timeout=float(str(order.get("seconds", 60))),
-            )  # fmt: skip
-        except (OSError, subprocess.TimeoutExpired) as error:
-            return {"code": 127, "out": str(error)}
-        return {"code": done.returncode, "out": done.stdout}
+        return run(words, float(str(order.get("seconds", 60))))
     if "write" in order:
         path = Path(str(order["write"]))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -142,7 +161,7 @@ def main() -> None:
     """For ever: orders."""
     threading.Thread(target=carry_lidar, daemon=True).start()
     with (PORTS / "bench.agent").open("r+b", buffering=0) as port:
-        port.write(b'{"up": true}\n')
+        write_all(port.fileno(), b'{"up": true}\n')
         rest = b""
         while True:
             piece = port.read(PIECE)
@@ -151,7 +170,9 @@ def main() -> None:
                 continue
             *lines, rest = (rest + piece).split(b"\n")
             for line in lines:
-                port.write(json.dumps(obey(json.loads(line))).encode() + b"\n")
+                order = json.loads(line)
+                answer = {"id": order.get("id"), **obey(order)}
+                write_all(port.fileno(), json.dumps(answer).encode() + b"\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,131 @@
+"""Several emulated computers at once, each with its share of the scenarios, in a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+from tools.bench.report import Result, Seen
+from tools.bench.vm.bench import Bench, bench
+from tools.bench.vm.common import AFTER, Scenario, unnoticed
+from tools.bench.vm.image import Image
+from tools.bench.vm.machine import Order
+from tools.bench.vm.places import BrokenOff, CannotBench
+
+JOURNAL: Final = ("journalctl", "--no-pager", "-o", "short-monotonic", "-n", "3000")
+Say = Callable[[str], None]
+
+
+def title(scenario: Scenario) -> str:
+    """Its first line."""
+    return (scenario.__doc__ or scenario.__name__).splitlines()[0].rstrip(".")
+
+
+def not_run(scenario: Scenario, why: str) -> Result:
+    """One that has not been tried, which is not to have passed."""
+    return Result(scenario.__name__, title(scenario), False, 0.0, "", skipped=f"not run: {why}")
+
+
+def tried(scenario: Scenario, bench: Bench) -> Result:
+    """One scenario's result.
+
+    Raises:
+        CannotBench, BrokenOff: the emulated computer has ended, or is to.
+    """
+    begun = time.monotonic()
+    try:
+        told, passed = scenario(bench), True
+        seen = told if isinstance(told, Seen) else Seen(told)
+    except (CannotBench, BrokenOff):
+        raise
+    except LookupError as error:
+        seen, passed = Seen(f"what it builds on has not been seen: {error!r}"), False
+    except (Order, OSError, ValueError, StopIteration) as error:
+        seen, passed = Seen(f"{error}" or repr(error)), False
+    except Exception:  # noqa: BLE001  a mistake in one scenario is no reason to lose what the others have shown
+        seen, passed = Seen(traceback.format_exc()), False
+    lost = _lost(scenario, bench)
+    if lost:
+        seen, passed = replace(seen, said=f"{lost}\n{seen.said}"), False
+    seconds = time.monotonic() - begun
+    name = scenario.__name__
+    return Result(name, title(scenario), passed, seconds, seen.said, figures=seen.figures, plots=seen.plots)
+
+
+def _lost(scenario: Scenario, bench: Bench) -> str:
+    try:
+        return unnoticed(bench, AFTER[scenario])
+    except (Order, OSError, LookupError, ValueError) as error:
+        return f"what has become of the daemon is not known: {error}"
+
+
+@dataclass(slots=True)
+class Guest:
+    """One emulated computer, its share, and what has come of it so far."""
+
+    number: int
+    share: list[Scenario]
+    results: list[Result] = field(default_factory=list)
+    broken_off: threading.Event = field(default_factory=threading.Event)
+
+    def run(self, image: Image, folder: Path, out: Path, say: Say) -> None:
+        """Try them, until it ends or is broken off; its console and its journal stay in ``out``."""
+        folder.mkdir()
+        why = "the bench has met an error of its own, which it has written"
+        try:
+            with bench(image, folder, self.broken_off) as whole:
+                for scenario in self.share:
+                    self.results.append(tried(scenario, whole))
+                    self._tell(self.results[-1], say)
+                with contextlib.suppress(Order, OSError):
+                    (out / f"journal-{self.number}.log").write_text(whole.machine.run(*JOURNAL, seconds=120))
+        except BrokenOff:
+            why = "the run was broken off"
+        except CannotBench as reason:
+            if len(self.results) < len(self.share):
+                one = self.share[len(self.results)]
+                self.results.append(Result(one.__name__, title(one), False, 0.0, f"{reason}"))
+                self._tell(self.results[-1], say)
+            why = "the emulated computer had ended"
+        finally:
+            self._leave(why, say)
+            for name in ("console", "qemu", "world"):
+                if (folder / name).exists():
+                    (out / f"{name}-{self.number}.log").write_bytes((folder / name).read_bytes())
+
+    def _leave(self, why: str, say: Say) -> None:
+        for one in self.share[len(self.results) :]:
+            self.results.append(not_run(one, why))
+            self._tell(self.results[-1], say)
+
+    def _tell(self, one: Result, say: Say) -> None:
+        say(f"{self.number}: {one.outcome:7} {one.seconds:6.1f} s  {one.title}\n{' ' * 21}{one.skipped or one.said}")
+
+
+def run_all(guests: list[Guest], image: Image, folder: Path, out: Path, say: Say) -> bool:
+    """Run them side by side; what they show is in them. False: somebody has broken it off (SIGINT, SIGTERM)."""
+    broken_off = threading.Event()
+
+    def break_off(number: int, frame: object) -> None:
+        say("broken off: the emulated computers are switched off, and what they have shown is reported")
+        for event in (broken_off, *(one.broken_off for one in guests)):
+            event.set()
+
+    before = {number: signal.signal(number, break_off) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        threads = [threading.Thread(target=one.run, args=(image, folder / str(one.number), out, say)) for one in guests]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return not broken_off.is_set()

@@ -1,0 +1,77 @@
+"""Scenarios: what happens to the files and the computer; the package is removed at last."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tools.bench.vm.bench import CONFIG, DONE, REFUSED, SAVE_MAP, UNIT, Bench
+from tools.bench.vm.common import back, map_id, need, right, scenario
+
+
+@scenario()
+def meets_a_clock_step(bench: Bench) -> str:
+    """The computer's clock is set back by a day and on again."""
+    pid = bench.main_pid()
+    for step in ("-100000", "100000"):
+        bench.machine.run("sh", "-c", f"date -s @$(( $(date +%s) + {step} ))")
+        bench.wait(2.0)
+    return back(bench, pid)
+
+
+@scenario()
+def meets_a_full_disk(bench: Bench) -> str:
+    """No room for a map: refused and named, the pose goes on; room again: saved."""
+    pid = bench.main_pid()
+    fill = "fallocate -l $(df --output=avail -B1 / | tail -1) /full || dd if=/dev/zero of=/full bs=1M"
+    bench.machine.run("sh", "-c", fill, check=False, seconds=120)
+    result = bench.command(SAVE_MAP, 60.0)
+    bench.machine.run("rm", "-f", "/full")
+    need(result == REFUSED, f"saving said {result}:\n{bench.log(10)}")
+    need(bench.command(SAVE_MAP, 60.0) == DONE, bench.log(10))
+    return f"refused, then done; {back(bench, pid)}"
+
+
+def _up_again(bench: Bench) -> str:
+    boot = bench.machine.wait_until_up()
+    tracking = bench.placed(240.0)
+    need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
+    found = right(bench, bench.collect(3.0))
+    return f"up {boot:.0f} s later, TRACKING in the same map {tracking:.1f} s after that, {1e3 * max(found):.0f} mm off"
+
+
+@scenario("anew")
+def is_rebooted(bench: Bench) -> str:
+    """Reboot, the robot driving on: comes up by itself, in the same map."""
+    bench.machine.reboot()
+    return _up_again(bench)
+
+
+@scenario("anew")
+def loses_its_power(bench: Bench) -> str:
+    """The power is cut and comes back: comes up by itself, in the same map."""
+    need(bench.command(SAVE_MAP, 60.0) == DONE, bench.log(10))
+    bench.machine.run("sync")
+    bench.machine.power_cut()
+    return _up_again(bench)
+
+
+@scenario()
+def explains_itself(bench: Bench) -> str:
+    """The journal of the boots before is there, with explanations."""
+    boots = bench.machine.run("journalctl", "--list-boots", "--no-pager").strip().splitlines()
+    first = ("-b", "-2", "-n", "100")  # all of it takes minutes here
+    text = bench.machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT, *first, seconds=120)
+    need(len(boots) >= 3 and "What can be done" in text, f"{boots}\n{text[-500:]}")
+    return f"{len(boots)} boots"
+
+
+@scenario("gone")
+def is_removed(bench: Bench) -> str:
+    """`dpkg --remove` leaves configuration and maps, `--purge` nothing."""
+    bench.machine.run("dpkg", "--remove", "lumiloop", seconds=120)
+    need(bench.machine.run("systemctl", "is-active", UNIT, check=False).strip() != "active", "it still runs")
+    need(bench.machine.run("sh", "-c", f"ls {CONFIG} && ls -d /var/lib/lumiloop"), "configuration or maps have gone")
+    bench.machine.run("dpkg", "--purge", "lumiloop", seconds=120)
+    left = bench.machine.run("sh", "-c", "ls -d /etc/lumiloop /var/lib/lumiloop /opt/lumiloop 2>/dev/null", check=False)
+    need(not [line for line in left.splitlines() if Path(line).name == "lumiloop" and "opt" not in line], left)
+    return "nothing is left"
