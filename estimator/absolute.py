@@ -273,10 +273,14 @@ def virtual(state: State) -> Virtual | None:
         return None
     wheels = state.fused.odometry
     lights = across_the_row(state, state.light.result)
-    lights = lights if wheels else without_heading(lights)
     _, factor = doubted_covariance(tie, lights, wheels)
-    moved = se2.between(pose_at(state, max(lights.t_mono, lights.t_pose)), state.fused.T_odom_base)
-    return Virtual(se2.compose(lights.T_map_base, moved), factor / TRUST * lights.covariance, lights.accepted)
+    T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
+    T_map_base = lights.T_map_base.copy()
+    if not wheels:  # the pose's heading is the better guess, by which the submap's origin is found from here
+        lights = without_heading(lights)
+        T_map_base[2] = se2.compose(state.T_map_odom, T_odom_base)[2]
+    moved = se2.between(T_odom_base, state.fused.T_odom_base)
+    return Virtual(se2.compose(T_map_base, moved), factor / TRUST * lights.covariance, lights.accepted)
 
 
 def begun_anew(state: State, lights: LightsResult) -> bool:

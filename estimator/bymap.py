@@ -15,15 +15,24 @@ import numpy as np
 
 from estimator import absolute, se2
 from estimator.linear3 import invert3
+from estimator.mapframe import move_map, shift_map
 from estimator.moving import hang
 from estimator.posegraph import Graph, Solution, optimise
 from estimator.records import Array
 from estimator.result import SURPRISE
 from estimator.state import State
 from estimator.tied import UNTIED
+from estimator.trail import positive
 
 NARROWEST = 1e-12
 """Share of the largest eigenvalue below which one of an information is taken for nothing but rounding."""
+
+
+FAR_M, FAR_RAD = 0.15, 0.05
+"""A map that has moved the robot farther may have been wrong: light that contradicts it then is believed at once."""
+
+SETTLED_M = 0.01
+"""A robot (m, rad) that has been moved by more has the graph solved about its new place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +40,11 @@ class Said:
     """Where the map has its newest submap, were that not tied to the survey itself.
 
     Attributes:
-        T_newest_said: (3,) seen from where the graph's solution has it. P: (3, 3) covariance (m, m, rad) in the
-            submap's axes.
+        T_map_newest: (3,) as what light has said of the other submaps has it: it does not move along with them.
+        P: (3, 3) covariance (m, m, rad) in the submap's axes.
     """
 
-    T_newest_said: Array
+    T_map_newest: Array
     P: Array
 
 
@@ -54,31 +63,35 @@ def said(graph: Graph, solution: Solution, ties: Array, how: tuple[int, float, f
         return None
     alone = replace(graph, poses=solution.poses, anchored=others, at=graph.at[:-1], certainty=graph.certainty[:-1])
     freed = optimise(alone, *how, covariance_of=last)
+    if not positive(freed.covariance):
+        return None
     R = se2.rotation(-freed.poses[-1, 2])
-    return Said(se2.between(solution.poses[-1], freed.poses[-1]), R @ freed.covariance @ R.T)
+    return Said(freed.poses[-1], R @ freed.covariance @ R.T)
 
 
-def take(state: State, T_map_newest: Array, P_newest: Array) -> None:
-    """Add to the tie what the map knows more of the newest submap's place.
+def take(state: State, word: Said) -> None:
+    """Add to the tie what the map knows more of the newest submap's place; that moves the robot and this submap alone.
 
-    Args:
-        state: with a tie and a newest submap.
-        T_map_newest: where the map has it.
-        P_newest: its covariance in the submap's axes.
+    Nothing is taken while light and pose disagree, while the robot is adrift or its place is being watched: then it may
+    be the map that is wrong.
     """
     atlas, tie, moving = state.atlas, state.absolute, state.fused
     newest = atlas.newest
     assert newest is not None
     assert tie is not None
+    doubtful = tie.odd_since is not None or atlas.adrift is not None or atlas.watch is not None
+    if doubtful or not positive(tie.P):
+        return
     R = se2.rotation(newest.T_odom_submap[2])
-    P_anchor, P_map = atlas.reached(R @ P_newest @ R.T, state.T_odom_anchor), np.empty((3, 3))
+    P_anchor, P_map = atlas.reached(R @ word.P @ R.T, state.T_odom_anchor), np.empty((3, 3))
     hang(state.T_odom_anchor, moving.T_odom_base, P_anchor, moving.P, 0.0, P_map)
     T_map_base = se2.compose(state.T_map_odom, moving.T_odom_base)
-    off = se2.compose(se2.compose(T_map_newest, se2.inverse(newest.T_odom_submap)), moving.T_odom_base) - T_map_base
+    T_map_odom = se2.compose(word.T_map_newest, se2.inverse(newest.T_odom_submap))
+    off = se2.compose(T_map_odom, moving.T_odom_base) - T_map_base
     off[2] = se2.wrap(float(off[2]))
     R = se2.rotation(state.T_map_odom[2])
     off = R.T @ off
-    if not np.isfinite(P_map + tie.P).all() or off @ invert3(P_map + tie.P + absolute.TOLERANCE) @ off > SURPRISE:
+    if not (np.isfinite(P_map).all() and off @ invert3(P_map + tie.P + absolute.TOLERANCE) @ off <= SURPRISE):
         return  # light has the last word
     L_before = invert3(tie.P)
     G = surplus(invert3(P_map), L_before)
@@ -86,7 +99,13 @@ def take(state: State, T_map_newest: Array, P_newest: Array) -> None:
         return
     tie.P = invert3(L_before + G)
     absolute.leave(state, tie.P @ L_before)
-    absolute.correct(state, T_map_base + R @ (tie.P @ (G @ off)), moving.T_odom_base)
+    made = tie.P @ (G @ off)
+    T_map_odom = se2.compose(T_map_base + R @ made, se2.inverse(moving.T_odom_base))
+    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), newest.first)
+    move_map(state, T_map_odom)
+    way, turn = float(np.hypot(made[0], made[1])), abs(float(made[2]))
+    tie.broken |= way > FAR_M or turn > FAR_RAD
+    atlas.stale |= max(way, turn) > SETTLED_M
 
 
 def surplus(L: Array, than: Array) -> Array:

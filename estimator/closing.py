@@ -350,7 +350,7 @@ def correct(
     state.T_map_start = se2.compose(first, state.T_map_start)
     if held:
         if said is not None and newest is last:
-            bymap.take(state, se2.compose(solution.poses[-1], said.T_newest_said), said.P)
+            bymap.take(state, said)
         return True
     for submap in atlas.submaps.values():
         if submap.key > last.key:

@@ -124,9 +124,13 @@ def times(A: Array, B: Array, out: Array) -> None:
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
+MOST = 0.999
+"""Share of the tie's error that may be the pose's too; more is rounding's, and might leave a negative variance."""
+
+
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def no_more(P: Array, X: Array, K: Array) -> None:
-    """Scale the share ``K = X W^-1`` so that ``K W K' = X K'``, what it explains of ``P``, is no more than ``P``."""
+    """Scale the share ``K = X W^-1`` so that ``K W K' = X K'``, what it explains of ``P``, leaves something of it."""
     explained = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -134,10 +138,10 @@ def no_more(P: Array, X: Array, K: Array) -> None:
             for k in range(3):
                 explained[i, j] += 0.5 * (X[i, k] * K[j, k] + X[j, k] * K[i, k])
     most = largest_of(invert3(P), explained)
-    if most > 1.0:
+    if most > MOST:
         for i in range(3):
             for j in range(3):
-                K[i, j] /= np.sqrt(most)
+                K[i, j] *= np.sqrt(MOST / most)
 
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1])")

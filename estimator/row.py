@@ -29,7 +29,7 @@ def doubt(catalogue: Catalogue, lamps: frozenset[int]) -> Array:
     known = catalogue.doubts.get(lamps)
     if known is None:
         known = np.zeros((3, 3))
-        at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, lamps) if lamp is not None]
+        at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, sorted(lamps)) if lamp is not None]
         if at:
             along, across, angle = spread(at)  # one lamp is a row both ways
             wide, narrow = (math.exp(-variance / ROW_M**2) for variance in (along, across))

@@ -318,6 +318,19 @@ def test_what_light_says_of_a_keyframe_is_as_doubtful_across_a_row(driven: tuple
     assert told.accepted == {1, 2, 3, 4}
 
 
+def test_without_wheels_light_says_nothing_of_a_keyframes_heading(driven: tuple[State, Log]) -> None:
+    """It may have settled the wrong way round, and the submap's origin is found from here by that heading."""
+    state = copy.deepcopy(driven[0])
+    assert state.light is not None
+    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    state.fused.odometry = False
+    state.light.result = lights_at(T + np.array((0.02, -0.01, np.pi)), frozenset((1, 4, 13, 16)), state)
+    told = absolute.virtual(state)
+    assert told is not None
+    assert told.T_map_base == pytest.approx(T + np.array((0.02, -0.01, 0.0)), abs=1e-9)
+    assert told.covariance[2, 2] > 3.0
+
+
 def test_a_lamp_that_is_learned_anew_changes_what_its_row_does_not_tell(driven: tuple[State, Log]) -> None:
     catalogue = copy.deepcopy(driven[0].light.filter.catalogue)  # type: ignore[union-attr]  # lit
     row = frozenset((1, 2, 3))

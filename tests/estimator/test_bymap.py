@@ -10,14 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimator import se2
-from estimator.absolute import Absolute
-from estimator.bymap import said, surplus
+from estimator.absolute import Absolute, correct
+from estimator.bymap import Said, said, surplus, take
 from estimator.closing import take_answer
+from estimator.hypotheses import Watch
 from estimator.posegraph import UPPER, Graph, optimise
 from estimator.records import Answer, Array
 from estimator.state import State
 from estimator.tied import tied
-from tests.estimator.circuit import TOLD, driven, run_jobs
+from tests.estimator.circuit import TOLD, circuit, driven, run_jobs
 
 VAGUE = np.diag((0.4**2, 0.4**2, 0.1**2))
 SURE = np.diag((0.04**2, 0.04**2, 0.02**2))
@@ -55,6 +56,69 @@ def test_a_robot_that_light_hardly_holds_is_moved_by_what_the_map_knows() -> Non
     assert np.all(np.diag(state.absolute.P) < 0.25 * np.diag(VAGUE))
 
 
+@pytest.mark.parametrize("since", [0, 61])
+def test_hearing_the_map_does_not_move_the_map(since: int) -> None:
+    """The solution has put it where it belongs; moved with the robot once more, it tore where ``since`` lies."""
+    state, truth = lit(VAGUE)
+    assert state.absolute is not None
+    state.absolute.since = since
+    solve(state)
+    *older, newest = state.atlas.submaps.values()
+    places = circuit()
+    away = [np.hypot(*se2.between(places[piece.first - 1], piece.T_map_submap)[:2]) for piece in older]
+    assert max(away) < 0.08
+    T = se2.compose(newest.T_map_submap, se2.between(newest.T_odom_submap, state.fused.T_odom_base))
+    assert np.hypot(*se2.between(T, se2.compose(state.T_map_odom, state.fused.T_odom_base))[:2]) < 1e-9
+    assert off(state, truth) < 0.12
+
+
+def test_what_the_map_says_is_of_the_survey_even_if_light_moves_it_meanwhile() -> None:
+    """Light moves map and robot by 0.15 m while the graph is being solved; its anchors, and so its word, stay."""
+    ends = []
+    for moved in (0.0, 0.15):
+        state, truth = lit(VAGUE)
+        state.atlas.stale = True
+        take_answer(state, Answer(0.0, -1, None))
+        answers = [Answer(0.0, job.job_id, job.run()) for job in state.atlas.take_jobs()]
+        T_map_base = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+        correct(state, T_map_base + np.array((moved, 0.0, 0.0)), state.fused.T_odom_base)
+        for answer in answers:
+            take_answer(state, answer)
+        run_jobs(state)
+        ends.append(off(state, truth))
+    assert max(ends) < 0.15
+
+
+def test_a_map_that_was_wrong_is_given_up_for_light_that_comes_back() -> None:
+    """A pose that the map has moved far is held by nothing that light could not take back at once."""
+    state, _ = lit(VAGUE)
+    tie, newest = state.absolute, state.atlas.newest
+    assert tie is not None
+    assert newest is not None
+    tie.proved = True
+    take(state, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
+    assert not tie.broken
+    tie.P = VAGUE.copy()
+    take(state, Said(newest.T_map_submap + np.array((0.8, 0.0, 0.0)), SURE))
+    assert tie.broken
+
+
+@pytest.mark.parametrize("how", ["light disagrees", "adrift", "watched"])
+def test_a_map_that_may_be_wrong_is_not_heard(how: str) -> None:
+    state, _ = lit(VAGUE)
+    tie, newest = state.absolute, state.atlas.newest
+    assert tie is not None
+    assert newest is not None
+    if how == "light disagrees":
+        tie.odd_since = 1.0
+    elif how == "adrift":
+        state.atlas.adrift = 1
+    else:
+        state.atlas.watch = Watch(newest.key, 1.0, None)
+    take(state, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
+    np.testing.assert_array_equal(tie.P, VAGUE)
+
+
 def test_the_same_map_heard_again_tells_nothing_new() -> None:
     state, _ = lit(VAGUE)
     solve(state)
@@ -72,7 +136,7 @@ def test_what_is_mended_is_taken_off_what_the_tie_shares_with_the_pose() -> None
     state.absolute.X = 0.5 * VAGUE
     solve(state)
     assert np.all(np.diag(state.absolute.X) < 0.25 * np.diag(0.5 * VAGUE))
-    assert len(state.absolute.mended) == 1
+    assert len(state.absolute.mended) >= 1
 
 
 @pytest.mark.parametrize("tie", [np.diag((0.02**2, 0.02**2, 0.005**2)), 1e-4 * VAGUE])
@@ -128,7 +192,7 @@ def test_the_map_says_nothing_of_a_place_that_nothing_but_the_tie_anchors(
         assert x == pytest.approx(4e-4, rel=1e-3)
         assert yaw == pytest.approx(4e-5, rel=1e-3)
         assert y == pytest.approx(4e-4 + 1e-5 * (9.0 + 4.0 + 1.0), rel=1e-3)
-        np.testing.assert_allclose(word.T_newest_said, np.zeros(3), atol=1e-9)
+        np.testing.assert_allclose(word.T_map_newest, (3.0, 0.0, 0.0), atol=1e-9)
 
 
 sizes = st.floats(0.1, 10.0)

@@ -81,6 +81,7 @@ def test_no_match_takes_more_from_the_ties_error_than_there_is(rng: np.random.Ge
     size = np.sqrt(np.diag(joint))
     assert np.linalg.eigvalsh(joint / np.outer(size, size)).min() > -1e-6
     share = X @ invert3(before)
+    assert np.linalg.eigvalsh(out[0]).min() > 0.0, "something is always left"
     assert out[2] == pytest.approx(share * (out[2][0, 0] / share[0, 0]), rel=1e-6, abs=1e-9), "in the same directions"
 
 
