@@ -27,6 +27,8 @@ MOVED: Final = {
 """Keys of earlier versions, and what to write instead."""
 LONGEST: Final = 60
 """Characters of a value that are repeated."""
+UNKNOWN: Final = re.compile(r"contains unknown field `(.*)`$", re.DOTALL)
+"""How the library names a key that it does not know."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,14 +119,17 @@ def _nul(tree: dict[str, Any], parents: tuple[str, ...]) -> Iterator[_Problem]:
 
 def _explain(message: str, tree: dict[str, Any]) -> _Problem:
     """What the library says, or a check of `daemon.config`, in words for who writes the file."""
-    at = re.search(r" - at `\$\.?([^`]*)`$", message)
+    whole = UNKNOWN.search(message)
+    named = whole is not None and whole[1] in tree  # a key of the root may look as if it named a place, too
+    at = None if named else re.search(r" - at `\$\.?([^`]*)`$", message)
     place, message = (at[1], message[: at.start()]) if at else ("", message)
     keys = _keys(place)
-    if unknown := re.search(r"contains unknown field `(.*)`$", message, re.DOTALL):
+    if unknown := UNKNOWN.search(message):
         keys = (*keys, unknown[1])
         path = ".".join(keys)
         moved = f"`{path}` is now part of `lidar.device`: {MOVED.get(path)}"
-        return _Problem(keys, moved if path in MOVED else f"unknown key `{path}`{_nearest(path)}")
+        table = isinstance(_value(tree, place).get(unknown[1]), dict)
+        return _Problem(keys, moved if path in MOVED else f"unknown key `{_written(keys)}`{_nearest(path, table)}")
     known = {option.path: option for option in options()}
     if (option := known.get(".".join(keys))) is not None:
         expected = re.sub("^(?=whole|number|list)", "a ", option.kind)
@@ -162,8 +167,18 @@ def _purpose(option: Option) -> str:
     return f" ({option.description}); as in {key} = {value_text(option.example)}"
 
 
-def _nearest(path: str) -> str:
-    known = [option.path for option in options()]
+def _written(keys: tuple[str, ...]) -> str:
+    """A key as TOML writes it: quotes show that a dot within them divides nothing."""
+    return ".".join(key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else value_text(key) for key in keys)
+
+
+def _nearest(path: str, table: bool) -> str:
+    """What may be meant by an unknown key; ``table``: it holds others."""
+    values = [option.path for option in options()]
+    tables = sorted({path[: dot.start()] for path in values for dot in re.finditer(r"\.", path)})
+    if path in values or path in tables:
+        return f": quotes make one name of it; did you mean `{path}`?"
+    known = tables if table else values
     last = path.rpartition(".")[2]
     same_name = [other for other in known if other.rpartition(".")[2] == last]
     near = same_name or difflib.get_close_matches(path, known, n=1, cutoff=0.6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -30,9 +31,13 @@ THERE_RAD: Final = 0.06
 
 
 AGAIN_S: Final = 3.0
-"""A laser that falls silent again so soon after it has come back is one that comes and goes."""
+"""A laser that falls silent again so soon after it was said to be back is one that comes and goes."""
 STEADY_S: Final = 0.8
 """It is said to be back when no silence has come for this long: a pose that was sure is proved by then."""
+OFTEN: Final = 6
+"""So many times in a row are no bad moment but a loose plug."""
+STEADIEST_S: Final = 3.2
+"""Such a laser is said to be back only then; longer than `AGAIN_S`: gaps at a steady pace end with one word."""
 
 
 Streak = tuple[int, float]
@@ -55,8 +60,8 @@ class Memory:
         lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
         odd_since: since when light has contradicted the place; both None while it does not.
         led: light has moved the pose, and has not been sure of the place since.
-        gone: the laser is silent. back: when it last came back, None: it has not been away. fitful: it had fallen
-            silent again soon after it had come back, the last time that it did.
+        gone: the laser is silent. back: when it last came back, None: it has not been away. fitful: how often in a row
+            it has fallen silent again soon after it was said to be back.
     """
 
     state: State = State.STARTING
@@ -79,7 +84,7 @@ class Memory:
     led: bool = False
     gone: bool = False
     back: float | None = None
-    fitful: bool = False
+    fitful: int = 0
 
 
 def remember(memory: Memory, evidence: Evidence) -> Memory:
@@ -107,12 +112,25 @@ def remember(memory: Memory, evidence: Evidence) -> Memory:
 
 def steady(memory: Memory, now: float) -> bool:
     """Whether the laser can be said to be there: one that comes and goes must not take what is said along."""
-    return not memory.fitful or (not memory.gone and memory.back is not None and now - memory.back >= STEADY_S)
+    if not memory.fitful:
+        return True
+    return not memory.gone and memory.back is not None and now - memory.back >= _hold(memory)
+
+
+def _hold(memory: Memory) -> float:
+    """Seconds without a silence after which the laser is said to be back."""
+    if not memory.fitful:
+        return 0.0
+    return STEADY_S if memory.fitful < OFTEN else STEADIEST_S
 
 
 def _gone(memory: Memory, now: float) -> Memory:
     """The laser has fallen silent."""
-    return replace(memory, gone=True, fitful=memory.back is not None and now - memory.back < AGAIN_S)
+    there = math.inf if memory.back is None else now - memory.back - _hold(memory)
+    if there >= AGAIN_S:
+        return replace(memory, gone=True, fitful=0)
+    said = there >= 0.0  # else nobody has heard that it was back
+    return replace(memory, gone=True, fitful=memory.fitful + said)
 
 
 def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:

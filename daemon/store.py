@@ -302,8 +302,11 @@ class Store:
 
     def _use(self) -> None:
         """Make the folder and take it for this process; what a killed one has left half written goes."""
-        if self._lock is not None and self.folder.is_dir():
-            return
+        if self._lock is None or not self.folder.is_dir():
+            self._take()
+        self.trouble = ""
+
+    def _take(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
@@ -313,9 +316,12 @@ class Store:
             raise
         if self._lock is not None:
             os.close(self._lock)
-        self._lock, self.trouble = lock, ""
+        self._lock = lock
         for part in self.folder.glob(".map-*.part"):
-            part.unlink(missing_ok=True)
+            try:
+                part.unlink(missing_ok=True)
+            except OSError as error:  # in nobody's way: the next map has another name
+                log.warning("%s cannot be removed: %s; it is left there", part, said(error))
 
     def _next(self) -> int:
         """The number after all that were ever given, broken ones too."""

@@ -150,7 +150,7 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float]:
 
 def whole_second(words: str) -> bool:
     """Whether no fraction is named: then all that came in that second is meant, as where the journal says the time."""
-    return "." not in words
+    return not re.search("[.,]", words)
 
 
 def meant(words: str, span: Span) -> list[float]:
@@ -162,7 +162,7 @@ def meant(words: str, span: Span) -> list[float]:
     Raises:
         NoMoment: it is no time.
     """
-    text = words.strip()
+    text = words.strip().replace(",", ".")  # as half of the world writes a fraction, and ISO 8601 too
     if re.fullmatch(r"[0-9]+(\.[0-9]*)?", text):
         number = float(text)
         return [number if number > UNIX_S else span.begin + number]

@@ -336,6 +336,27 @@ def test_the_example_of_each_option_is_one_that_is_taken() -> None:
             "robot.toml:2: unknown key `lidar.inverted`; did you mean `lidar.mount.inverted`?",
         ),
         ("qqq = 1", "robot.toml:1: unknown key `qqq`; `lumiloop --print-config` lists all keys"),
+        (
+            '"lidar.device" = "a"',
+            'robot.toml:1: unknown key `"lidar.device"`: quotes make one name of it; did you mean `lidar.device`?',
+        ),
+        (
+            '[lidar]\n"mount.x" = 0.1',
+            'robot.toml:2: unknown key `lidar."mount.x"`: quotes make one name of it; did you mean `lidar.mount.x`?',
+        ),
+        (
+            '["lidar.mask"]\nnear = 0.1',
+            'robot.toml:1: unknown key `"lidar.mask"`: quotes make one name of it; did you mean `lidar.mask`?',
+        ),
+        ('"a.b" = 1', 'robot.toml:1: unknown key `"a.b"`; `lumiloop --print-config` lists all keys'),
+        (
+            '"x` - at `$.lidar" = 1',
+            'robot.toml: unknown key `"x` - at `$.lidar"`; `lumiloop --print-config` lists all keys',
+        ),
+        ('[lidr]\ndevice = "x"', "robot.toml:1: unknown key `lidr`; did you mean `lidar`?"),
+        ("[lidar.msk]\nnear = 0.1", "robot.toml:1: unknown key `lidar.msk`; did you mean `lidar.mask`?"),
+        ("[mask]\nnear = 0.1", "robot.toml:1: unknown key `mask`; did you mean `lidar.mask`?"),
+        ("[qqq]\nnear = 0.1", "robot.toml:1: unknown key `qqq`; `lumiloop --print-config` lists all keys"),
     ],
 )
 def test_an_unknown_key_names_its_path_and_the_nearest_known_one(tmp_path: Path, text: str, expected: str) -> None:

@@ -257,6 +257,29 @@ def test_a_laser_that_loses_many_scans_does_not_take_the_state_along(period: flo
     assert after * period <= 1.0
 
 
+@pytest.mark.parametrize("every", [12, 15, 20, 30])
+def test_a_laser_that_goes_on_coming_and_going_is_trusted_later_and_after_a_calm_time_as_ever(every: int) -> None:
+    """A loose plug: 0.45 s without scans, again and again for a minute."""
+    memory, last, changed = tracking(), 3.0, []
+    for i in range(600):
+        t = 3.0 + PERIOD * i
+        gone = i % every < 5
+        last = last if gone else t
+        before, memory = memory.state, judge(memory, seen(t, None if gone else NEAR, silence=(t - last) / PERIOD))
+        if memory.state is not before:
+            changed.append(i)
+        if t - last > SILENT_PERIODS * PERIOD:
+            assert memory.state is State.NO_LIDAR, "bad news counts at once"
+    assert len(changed) <= 14
+    assert changed[-1] < 300, "the second half minute says one thing"
+    back = run(memory, scans(63.0, 34, NEAR))
+    assert back.state is State.TRACKING
+    calm = run(back, [*scans(66.4, 31, NEAR), *gap(69.5, 1.0)])
+    assert calm.state is State.NO_LIDAR
+    assert run(calm, scans(70.5, 10, NEAR)).state is State.TRACKING
+    assert judge(calm, seen(70.5, NEAR)).state is not State.NO_LIDAR, "it is a single gap again"
+
+
 def test_a_single_gap_is_over_with_the_first_scan() -> None:
     memory = run(tracking(), gap(3.0, 2.0))
     assert memory.state is State.NO_LIDAR

@@ -309,6 +309,35 @@ def test_a_second_daemon_on_one_folder_is_told_at_its_start(tmp_path: Path, capl
     assert not caplog.messages
 
 
+def test_what_a_killed_run_has_left_and_cannot_be_removed_keeps_nobody_from_the_folder(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stuck, half = tmp_path / f".{name(1)}.part", tmp_path / f".{name(2)}.part"
+    stuck.mkdir()  # refuses to be unlinked, as another user's file in a sticky folder does
+    half.write_bytes(b"half")
+    store = Store(tmp_path)
+    store.claim()
+    assert store.trouble == ""
+    assert not half.exists()
+    assert caplog.text.count(f"{stuck} cannot be removed") == 1
+    store.claim()
+    assert caplog.text.count(f"{stuck} cannot be removed") == 1
+
+
+def test_a_folder_that_is_back_with_what_was_in_it_is_no_trouble_any_more(tmp_path: Path) -> None:
+    folder, away = tmp_path / "maps", tmp_path / "away"
+    store = Store(folder)
+    store.claim()
+    folder.rename(away)
+    folder.write_text("no folder")
+    store.claim()
+    assert store.trouble
+    folder.unlink()
+    away.rename(folder)
+    store.claim()
+    assert store.trouble == ""
+
+
 def test_a_folder_that_cannot_be_read_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "file"
     file.write_text("")

@@ -11,7 +11,7 @@ import pytest
 from daemon import blackbox, cli, disk
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
-from daemon.why import NoMoment, Span, find, meant
+from daemon.why import NoMoment, Span, find, meant, whole_second
 from daemon.witness import Told
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
@@ -28,6 +28,9 @@ SPAN = Span(Path("rec"), AT, AT + 3600.0, AT - 100.0)
         ("22:13:25Z", 5.0),
         ("22:14Z", 40.0),
         ("22:13:25.5Z", 5.5),
+        ("22:13:25,5Z", 5.5),
+        ("2023-11-14T22:13:25,5Z", 5.5),
+        ("5,25", 5.25),
         ("2023-11-14T22:13:25Z", 5.0),
         ("2023-11-14 23:13:25+01:00", 5.0),
         ("5", 5.0),
@@ -39,6 +42,11 @@ def test_times_are_understood(words: str, after: float) -> None:
     span, utc = find([SPAN], words, Path())
     assert span is SPAN
     assert utc - AT == pytest.approx(after, abs=1e-6)
+
+
+@pytest.mark.parametrize("words", ["22:13:25.5Z", "22:13:25,5Z", "2023-11-14T22:13:25,5Z", "5,0", "5.0"])
+def test_a_fraction_however_it_is_written_is_no_whole_second(words: str) -> None:
+    assert not whole_second(words)
 
 
 def test_a_time_of_the_day_may_be_of_the_next_day() -> None:
