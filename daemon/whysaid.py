@@ -14,7 +14,7 @@ import numpy as np
 
 from daemon.cycle import Cycle, CycleRecord
 from daemon.publish.meanings import USES
-from daemon.publish.snapshot import LinkUse, Snapshot, State
+from daemon.publish.snapshot import LightLink, LinkUse, Snapshot, State
 from daemon.reasons import REASONS, Reason
 from daemon.record import CycleEntry
 from daemon.witness import Told as Wheels
@@ -28,6 +28,10 @@ GAP: Final = 16.27
 SILENT_S: Final = 0.5
 MOST: Final = 12
 """Changes that are listed."""
+AGAINST: Final = (LinkUse.OCCLUDED, LinkUse.REJECTED)
+"""What is received of these lamps speaks against the place, or did a moment ago."""
+FITS: Final = 0.2
+"""Deviation (ln) below which what is received fits."""
 SECOND_S: Final = 1.0
 """A time without a fraction, as the journal writes it, is of all that came in this long."""
 
@@ -221,10 +225,12 @@ def _light(one: Moment) -> str:
     if away is None:
         return f"light   tells no place ({light.fix.name}, {light.used} lamps used)"
     far = f"its place is {away[0]:.2f} m, {math.degrees(away[1]):.1f} deg from the pose"
+    against = sum(link.use in AGAINST for link in light.links)
+    used = f"{light.fix.name}, {light.used} lamps used" + (f", {against} speak against the place" if against else "")
     if gap is None:
-        return f"light   {light.fix.name}, {light.used} lamps used; {far}"
-    word = "DISSENTS" if gap > GAP else "agrees"
-    return f"light   {word}: {far}, {math.sqrt(gap):.1f} deviations; {light.fix.name}, {light.used} lamps used"
+        return f"light   {used}; {far}"
+    word = "DISSENTS" if gap > GAP or against > light.used else "agrees"
+    return f"light   {word}: {far}, {math.sqrt(gap):.1f} deviations; {used}"
 
 
 def _axes(told: Sequence[Moment], k: int) -> Iterator[str]:
@@ -257,13 +263,16 @@ def _lamps(told: Sequence[Moment], k: int) -> Iterator[str]:
     for use in LinkUse:
         links = [link for link in light.links if link.use is use]
         if links:
-            said = ", ".join(_link(link.lamp_id, link.code, link.residual) for link in links)
+            said = ", ".join(map(_link, links))
             yield f"{len(links)} {use.name}: {USES[use]}: {said}"
 
 
-def _link(lamp_id: int | None, code: int, residual: float | None) -> str:
-    name = f"code {code}" if lamp_id is None else f"lamp {lamp_id}"
-    return name if residual is None else f"{name} ({math.exp(residual):.2f} of expected)"
+def _link(link: LightLink) -> str:
+    name = f"code {link.code}" if link.lamp_id is None else f"lamp {link.lamp_id}"
+    if link.residual is None:
+        return name
+    again = "; fits again, and is used when it goes on so" if link.use in AGAINST and abs(link.residual) < FITS else ""
+    return f"{name} ({math.exp(link.residual):.2f} of expected{again})"
 
 
 def _changes(told: Sequence[Moment]) -> Iterator[str]:

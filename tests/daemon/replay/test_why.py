@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,7 +12,10 @@ import pytest
 from daemon import blackbox, cli, disk
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
+from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
+from daemon.reasons import Reason
 from daemon.why import NoMoment, Span, find, meant, whole_second
+from daemon.whysaid import Moment, report
 from daemon.witness import Told
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
@@ -188,3 +192,26 @@ def test_wheels_that_slip_dissent(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "wheels  DISSENT: in" in said
     assert "the wheels begin to dissent" in said
     assert "odometry and laser disagree" in said
+
+
+NOTHING = Snapshot(1, 1.0, 1.0, 0.0, State.DEGRADED, Reason.NONE)
+
+
+@pytest.mark.parametrize(("against", "word"), [(0, "agrees"), (1, "agrees"), (3, "DISSENTS")])
+def test_lamps_that_do_not_fit_the_place_dissent_though_what_is_left_agrees(against: int, word: str) -> None:
+    links = tuple(LightLink(k, k, LinkUse.REJECTED if k < against else LinkUse.ACCEPTED, 1e-9, 0.5) for k in range(5))
+    picture = LightPicture(LightFix.GOOD, 5 - against, 1.0, (1.0, 2.0, 0.0), links=links)
+    shown = replace(NOTHING, pose=(1.0, 2.02, 0.0), light=picture, trust=Trust(gap=0.04))
+    moment = Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())
+    said = report([moment], 0.0, "here")
+    line = next(line for line in said.splitlines() if line.startswith("  light "))
+    assert f"light   {word}: its place is 0.02 m" in line
+    assert (f"{against} speak against the place" in line) is (against > 0)
+    assert "fits again" not in said
+
+
+def test_a_lamp_that_was_hidden_and_fits_again_is_said_to_wait() -> None:
+    links = (LightLink(7, 7, LinkUse.OCCLUDED, 1e-9, 0.1), LightLink(8, 8, LinkUse.OCCLUDED, 1e-9, -0.9))
+    shown = replace(NOTHING, pose=(1.0, 2.0, 0.0), light=LightPicture(links=links))
+    said = report([Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())], 0.0, "here")
+    assert "lamp 7 (1.11 of expected; fits again, and is used when it goes on so), lamp 8 (0.41 of expected)" in said
