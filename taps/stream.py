@@ -40,7 +40,15 @@ class Lost:
 def path_of(name: str) -> Path:
     """Where the daemon of that ``name`` (of the configuration) serves it: one of ours, else the system's service."""
     own, service = runtime_folder() / f"{name}.stream", SERVICE / f"{name}.stream"
-    return service if service.exists() and not own.exists() else own
+    return service if _there(service) and not _there(own) else own
+
+
+def _there(path: Path) -> bool:
+    """Whether it exists, or may: what lies in a folder that is not open to us is said when it is opened."""
+    try:
+        return path.exists()
+    except PermissionError:  # also for a moment while the service starts, until its folder belongs to our group
+        return True
 
 
 class Stream:

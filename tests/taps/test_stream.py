@@ -228,6 +228,24 @@ def test_the_path_is_the_daemons(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert path_of("agv") == tmp_path / "agv.stream"
 
 
+def test_a_folder_that_is_not_open_to_us_yet_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service's folder belongs to the group of its listeners a moment after it was made."""
+
+    def shut(path: Path) -> bool:
+        if path.parent == tmp_path / "run":
+            raise PermissionError(13, "Permission denied", str(path))
+        return False
+
+    monkeypatch.setattr("taps.stream.SERVICE", tmp_path / "run")
+    monkeypatch.setattr(Path, "exists", shut)
+    assert path_of("agv") == tmp_path / "run" / "agv.stream"
+
+    async def all_that_is_told() -> list[object]:
+        return [frame async for frame in Stream("agv", ("pose",), patient=False).frames()]
+
+    assert [type(frame) for frame in asyncio.run(all_that_is_told())] == [Lost]
+
+
 def test_types_stand_for_every_topic() -> None:
     assert set(TYPES) == set(TOPICS)
 
