@@ -171,6 +171,16 @@ def test_it_runs_as_nobody_in_particular_with_its_two_groups(machine: Container)
     assert fields["NoNewPrivs"].strip() == "1"
 
 
+def test_it_reads_the_lidar_and_publishes_a_pose(machine: Container) -> None:
+    end = time.monotonic() + 20.0
+    while True:
+        said = json.loads(machine.run("lumiloop", "status", "--json"))
+        if said.get("state") in ("MAPPING", "TRACKING", "DEGRADED"):
+            return
+        assert time.monotonic() < end, said
+        time.sleep(0.2)
+
+
 def test_what_listens_to_the_daemon_reaches_it_by_its_group_and_others_do_not(machine: Container) -> None:
     """The unit of the metrics, which needs no extra; it is started first, and waits for the stream."""
     shutil.copy(ROOT / "systemd/drop-ins/stream-group.conf", machine.root / "etc/systemd/system/lumiloop.service.d")
@@ -190,16 +200,6 @@ def test_what_listens_to_the_daemon_reaches_it_by_its_group_and_others_do_not(ma
         assert machine.show(METRICS, "NRestarts") == {"NRestarts": "0"}
     finally:
         machine.run("systemctl", "stop", METRICS)
-
-
-def test_it_reads_the_lidar_and_publishes_a_pose(machine: Container) -> None:
-    end = time.monotonic() + 20.0
-    while True:
-        said = json.loads(machine.run("lumiloop", "status", "--json"))
-        if said.get("state") in ("MAPPING", "TRACKING", "DEGRADED"):
-            return
-        assert time.monotonic() < end, said
-        time.sleep(0.2)
 
 
 def test_the_journal_has_fields(machine: Container) -> None:
