@@ -27,8 +27,7 @@ from estimator.trail import positive
 NARROWEST = 1e-12
 """Share of the largest eigenvalue below which one of an information is taken for nothing but rounding."""
 
-
-FAR_M, FAR_RAD = 0.15, 0.05
+LED_M, LED_RAD = 0.15, 0.05
 """A map that has moved the robot farther may have been wrong: light that contradicts it then is believed at once."""
 
 SETTLED_M = 0.01
@@ -104,7 +103,7 @@ def take(state: State, word: Said) -> None:
     shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), newest.first)
     move_map(state, T_map_odom)
     way, turn = float(np.hypot(made[0], made[1])), abs(float(made[2]))
-    tie.broken |= way > FAR_M or turn > FAR_RAD
+    tie.broken |= way > LED_M or turn > LED_RAD
     atlas.stale |= max(way, turn) > SETTLED_M
 
 

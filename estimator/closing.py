@@ -233,7 +233,9 @@ def solve_graph(state: State, atlas: Atlas) -> None:
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
         before, solution, ties = along(submaps, graph.poses, *payload[:2])
-        if correct(state, atlas, submaps, before, solution, payload[2]):
+        if correct(state, atlas, submaps, before, solution):
+            if payload[2] is not None and lit(state) and submaps[-1] is atlas.newest:
+                bymap.take(state, payload[2])
             R = se2.rotation(-state.T_map_odom[2])
             atlas.tied = submaps[-1]
             turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
@@ -317,17 +319,9 @@ def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: 
     return places, solution, np.asarray(R @ ties @ R.T)
 
 
-def correct(
-    state: State,
-    atlas: Atlas,
-    submaps: tuple[Submap, ...],
-    before: Array,
-    solution: Solution,
-    said: bymap.Said | None = None,
-) -> bool:
-    """Move the submaps to where the graph has them, and the robot with the newest one.
+def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:
+    """Move the submaps to where the graph has them, and the robot with the newest one, unless light holds it.
 
-    A robot that light holds is moved by what the map, as ``said``, knows better (`bymap`).
     Returns whether it did: a solution of what has been moved or forgotten meanwhile is thrown away, and the graph
     solved once more.
     """
@@ -349,8 +343,6 @@ def correct(
             submap.T_map_submap = T
     state.T_map_start = se2.compose(first, state.T_map_start)
     if held:
-        if said is not None and newest is last:
-            bymap.take(state, said)
         return True
     for submap in atlas.submaps.values():
         if submap.key > last.key:

@@ -8,62 +8,17 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
 from daemon import store_keeper
 from daemon.store import Start, Store
-from daemon.store_keeper import ADRIFT, EVERY_S, FIRST_S, FIXED, LOOK_S, NO_FOLDER, NO_MAP, RETRY_S, About, Keeper
+from daemon.store_keeper import ADRIFT, EVERY_S, FIRST_S, FIXED, NO_FOLDER, NO_MAP, RETRY_S, About
 from daemon.store_tables import read
-from estimator.mapimage import restored
-from estimator.state import State, new_state
-from tests.daemon.mapmaker import Shape, content, image
-
-
-@dataclass
-class Clock:
-    t: float = 100.0
-
-    def now(self) -> float:
-        return self.t
-
-    def utc(self) -> float:
-        return 1.5e9 + self.t
-
-
-@dataclass
-class Bench:
-    """A keeper with everything around it in hand."""
-
-    folder: Path
-    state: State | None = field(default_factory=lambda: restored(image(Shape())))
-    about: About = field(default_factory=lambda: About("robot", "digest"))
-    start: Start | None = None
-    map_id: int = 0x77
-    clock: Clock = field(default_factory=Clock)
-    told: list[str] = field(default_factory=list)
-    kept: bool = True
-
-    def __post_init__(self) -> None:
-        self.store = Store(self.folder) if self.kept else None
-        self.keeper = Keeper(self.store, self.start, lambda: self.state, lambda: self.map_id, self.about, self.clock)
-
-    async def turn(self, seconds: float = 0.0) -> None:
-        """Let so much time go by, one beat, and whatever save it has begun."""
-        self.clock.t += seconds
-        self.keeper._go_on()
-        await asyncio.wait_for(self.keeper._over.wait(), 20.0)
-
-    def drive(self) -> None:
-        assert self.state is not None
-        self.state.next_key += 1
-        self.state.atlas.adrift = None
-
-    @property
-    def files(self) -> int:
-        return len(list(self.folder.glob("*.lumimap"))) if self.folder.is_dir() else 0
+from estimator.state import new_state
+from tests.daemon.keeping import Bench
+from tests.daemon.mapmaker import content
 
 
 def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(tmp_path: Path) -> None:
@@ -321,142 +276,3 @@ def test_a_stop_does_not_wait_for_ever(
         await asyncio.sleep(0.7)
 
     asyncio.run(run())
-
-
-def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) -> None:
-    async def run() -> None:
-        tmp_path.joinpath("map-00000077-00000001.lumimap").write_bytes(b"x")
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.load()
-        assert bench.keeper.refused
-        bench.drive()
-        await bench.turn(FIRST_S)
-        assert not bench.keeper.refused
-
-    asyncio.run(run())
-
-
-def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_done(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    async def run() -> None:
-        other = Store(tmp_path)
-        other.claim()
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.claim()
-        keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
-        assert keeper.fault
-        bench.keeper = keeper
-        bench.drive()
-        await bench.turn(FIRST_S)
-        assert keeper.fault
-        assert caplog.text.count("another process keeps its maps there") == 1
-        await keeper.finish()
-        assert "it is tried again" not in caplog.text
-        other.close()
-        bench.drive()
-        await bench.turn(RETRY_S)
-        assert not keeper.fault
-        assert bench.files == 1
-
-    asyncio.run(run())
-
-
-@pytest.mark.parametrize("loaded", [True, False])
-def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_nothing_to_save(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, loaded: bool
-) -> None:
-    async def run() -> None:
-        other = Store(tmp_path)
-        other.claim()
-        bench = Bench(tmp_path, state=new_state() if loaded else None)
-        assert bench.store is not None
-        bench.store.claim()
-        bench.keeper = keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
-        for _ in range(3):
-            await bench.turn(LOOK_S)
-            assert keeper.fault
-        assert caplog.text.count("another process keeps its maps there") == 1
-        other.close()
-        await bench.turn(LOOK_S)
-        assert not keeper.fault
-        assert (bench.files, keeper.busy_since) == (0, None)
-        third = Store(tmp_path)
-        third.claim()
-        assert "another process" in third.trouble, "it is ours now"
-        await keeper.finish()
-
-    with caplog.at_level(logging.INFO):
-        asyncio.run(run())
-    assert f"maps can be kept in {tmp_path} from now on" in caplog.text
-
-
-def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:
-    async def run() -> None:
-        folder = tmp_path / "maps"
-        folder.write_text("no folder")
-        bench = Bench(folder)
-        assert bench.store is not None
-        bench.store.claim()
-        bench.keeper = Keeper(bench.store, None, lambda: None, lambda: 0x77, About(), bench.clock)
-        first = bench.keeper.error
-        folder.unlink()
-        other = Store(folder)
-        other.claim()
-        await bench.turn(LOOK_S)
-        assert bench.keeper.error not in ("", first)
-        assert "another process" in bench.keeper.error
-        other.close()
-        await bench.turn(LOOK_S)
-        assert bench.keeper.error == ""
-        await bench.keeper.finish()
-
-    asyncio.run(run())
-
-
-def test_a_save_that_was_asked_for_and_failed_is_tried_again_though_nothing_is_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.drive()
-        await bench.turn(FIRST_S)
-
-        def full(data: bytes, map_id: int) -> Path:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        with monkeypatch.context() as without:
-            without.setattr(bench.store, "save", full)
-            bench.keeper.ask(bench.told.append)
-            await bench.turn()
-            await bench.turn(RETRY_S)
-        assert bench.keeper.fault
-        await bench.turn(RETRY_S)
-        assert not bench.keeper.fault
-        assert bench.keeper.saves == 2
-        await bench.turn(10.0 * EVERY_S)
-        assert bench.keeper.saves == 2
-
-    asyncio.run(run())
-
-
-def test_at_the_stop_what_there_is_is_saved_though_the_folder_has_not_been_looked_at(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    async def run() -> None:
-        other = Store(tmp_path)
-        other.claim()
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.claim()
-        other.close()
-        bench.drive()
-        bench.clock.t += LOOK_S
-        await bench.keeper.finish()
-        assert bench.files == 1
-
-    asyncio.run(run())
-    assert "could not be saved" not in caplog.text

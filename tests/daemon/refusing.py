@@ -1,0 +1,18 @@
+"""A configuration that is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daemon.configfile import ConfigError, load
+
+
+def refused(tmp_path: Path, text: str, *overrides: str) -> str:
+    """What is said of it."""
+    file = tmp_path / "robot.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load(file, overrides)
+    return str(caught.value).replace(f"{tmp_path}/", "")

@@ -1,0 +1,152 @@
+"""Scenarios of the virtual bench shared out between computers: what fails, what is left out, and what is told of it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tools.bench.vm import bench, common, guests, image, places
+from tools.bench.vm.guests import Guest, run_all, tried
+
+
+class Lived:
+    """A bench whose daemon has these lives, one after the other; the last one stays."""
+
+    def __init__(self, *lives: tuple[int, int], life: tuple[int, int] = (0, 0)) -> None:
+        self.left, self.life = list(lives), life
+
+    def lives(self) -> tuple[int, int]:
+        return self.left.pop(0) if len(self.left) > 1 else self.left[0]
+
+    def log(self, lines: int) -> str:
+        return "its log"
+
+
+def like(function: Callable[[bench.Bench], str], daemon: common.Daemon = "same") -> common.Scenario:
+    """A scenario outside the list."""
+    common.AFTER[function] = daemon
+    return function
+
+
+@pytest.fixture(autouse=True)
+def _only_the_lists_own_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(common, "AFTER", dict(common.AFTER))
+    monkeypatch.setattr(guests, "AFTER", common.AFTER)
+
+
+def passes(bench: bench.Bench) -> str:
+    """It passes."""
+    return "seen"
+
+
+def needs_more(bench: bench.Bench) -> str:
+    """It needs what has not been seen."""
+    raise KeyError("drive")
+
+
+def test_a_scenario_that_builds_on_one_that_failed_fails_itself() -> None:
+    result = tried(like(needs_more), Lived((0, 0)))  # type: ignore[arg-type]  # all that is looked at
+    assert not result.passed
+    assert result.said == "what it builds on has not been seen: KeyError('drive')"
+
+
+@pytest.mark.parametrize(
+    ("daemon", "before", "after", "as_wanted"),
+    [
+        ("same", (7, 0), (7, 0), True),
+        ("same", (7, 0), (8, 1), False),
+        ("same", (7, 0), (7, 1), False),
+        ("same", (7, 0), (0, 0), False),
+        ("same", (0, 0), (0, 0), True),
+        ("anew", (0, 0), (7, 0), True),
+        ("anew", (7, 0), (7, 0), True),
+        ("anew", (0, 0), (8, 1), False),
+        ("anew", (0, 0), (0, 0), False),
+        ("restarted", (7, 0), (8, 1), True),
+        ("restarted", (7, 0), (7, 0), False),
+        ("restarted", (7, 0), (9, 2), False),
+        ("gone", (7, 0), (0, 0), True),
+        ("gone", (7, 0), (7, 0), False),
+    ],
+)
+def test_a_daemon_that_dies_unnoticed_fails_the_scenario(
+    daemon: common.Daemon, before: tuple[int, int], after: tuple[int, int], as_wanted: bool
+) -> None:
+    lived = Lived(after, life=before)
+    result = tried(like(passes, daemon), lived)  # type: ignore[arg-type]  # all that is looked at
+    assert result.passed is as_wanted
+    assert as_wanted or result.said.startswith("the daemon has died unnoticed: process ")
+    assert lived.life == after
+
+
+class Playing:
+    """What a guest runs in, without a guest."""
+
+    def __init__(self, broken_off: threading.Event) -> None:
+        self.broken_off = broken_off
+        self.machine = self
+        self.life = (0, 0)
+
+    def __enter__(self) -> Playing:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def lives(self) -> tuple[int, int]:
+        return self.life
+
+    def run(self, *words: str, seconds: float) -> str:
+        return "the journal"
+
+
+def dies(bench: bench.Bench) -> str:
+    """QEMU ends in the middle of it."""
+    raise places.CannotBench("QEMU has ended with -9")
+
+
+def is_left(bench: bench.Bench) -> str:
+    """Somebody presses Ctrl-C in the middle of it."""
+    os.kill(os.getpid(), 2)
+    bench.machine.broken_off.wait(20.0)
+    raise places.BrokenOff
+
+
+def errs(bench: bench.Bench) -> str:
+    """There is a mistake in it."""
+    raise AttributeError("spelt wrongly")
+
+
+def played_by_two(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *shares: list[common.Scenario]
+) -> tuple[bool, list[list[str]], str]:
+    monkeypatch.setattr(guests, "bench", lambda image, folder, broken_off: Playing(broken_off))
+    both = [Guest(k + 1, share) for k, share in enumerate(shares)]
+    (tmp_path / "work").mkdir()
+    whole = run_all(both, image.Image(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    said = " ".join(one.skipped or one.said for guest in both for one in guest.results)
+    return whole, [[one.outcome for one in guest.results] for guest in both], said
+
+
+def test_a_computer_that_dies_leaves_a_report_of_what_was_and_what_was_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares = [like(passes), like(dies), passes, passes], [like(errs), passes]
+    whole, outcomes, said = played_by_two(monkeypatch, tmp_path, *shares)
+    assert whole
+    assert outcomes == [["passed", "FAILED", "skipped", "skipped"], ["FAILED", "passed"]]
+    assert "QEMU has ended with -9" in said
+    assert "not run: the emulated computer had ended" in said
+    assert "spelt wrongly" in said
+    assert (tmp_path / "journal-2.log").read_text() == "the journal"
+
+
+def test_a_run_that_is_broken_off_says_what_was_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, outcomes, said = played_by_two(monkeypatch, tmp_path, [like(passes), like(is_left), passes])
+    assert not whole
+    assert outcomes == [["passed", "skipped", "skipped"]]
+    assert said.count("not run: the run was broken off") == 2
