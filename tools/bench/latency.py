@@ -22,7 +22,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -233,16 +233,16 @@ def run(turns: int = 2) -> list[Figure]:
     return figures(measure(turns, fifos))
 
 
-def main() -> None:
-    """The long form."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--turns", type=int, default=30, help="pairs of 10 s alone and 10 s loaded")
+def long_form(name: str, prog: str, other: str, run: Callable[[int], list[Figure]]) -> None:
+    """The command by itself, for figures that are firm; ``other``: what every second stretch is."""
+    parser = argparse.ArgumentParser(prog=prog)
+    parser.add_argument("--turns", type=int, default=30, help=f"pairs of 10 s alone and 10 s {other}")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
     rows = run(options.turns)
     print(table(rows))
-    print(f"written: {save('latency', rows, options.out)}")
+    print(f"written: {save(name, rows, options.out)}")
 
 
 if __name__ == "__main__":
-    main()
+    long_form("latency", COMMAND, "loaded", run)

@@ -13,7 +13,6 @@ worth.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -32,8 +31,8 @@ from daemon.warmup import load
 from estimator.cdma_profile import PROFILE_A
 from tools.bench._drive import EndlessDrive
 from tools.bench._paced import SETTLE_S
-from tools.bench.latency import CannotRun, prepared
-from tools.figures import Figure, bounded, save, table
+from tools.bench.latency import CannotRun, long_form, prepared
+from tools.figures import Figure, bounded
 
 COMMAND: Final = "python -m tools.bench viewers"
 ROOT: Final = Path(__file__).parents[2]
@@ -158,16 +157,5 @@ def run(turns: int = TURNS) -> list[Figure]:
         return figures(paced(Path(name), turns), turns)
 
 
-def main() -> None:
-    """The long form."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench.viewers", description=__doc__)
-    parser.add_argument("--turns", type=int, default=30, help="pairs of 10 s alone and 10 s watched")
-    parser.add_argument("--out", type=Path, default=Path("out/bench"))
-    options = parser.parse_args()
-    rows = run(options.turns)
-    print(table(rows))
-    print(f"written: {save('viewers', rows, options.out)}")
-
-
 if __name__ == "__main__":
-    main()
+    long_form("viewers", "python -m tools.bench.viewers", "watched", run)
