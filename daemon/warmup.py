@@ -12,6 +12,7 @@ import fcntl
 import gc
 import hashlib
 import logging
+import os
 import sys
 import threading
 import time
@@ -146,26 +147,62 @@ def _compiled() -> set[Path]:
 
 def mark_of(what: str) -> Path:
     """The file that says that an earlier start has compiled all that this one needs."""
+    from llvmlite.binding import get_host_cpu_name
+
     from estimator.kernel import CACHE_DIR
 
-    # the directory is named by the sources' content; numba also keys by the path they were loaded from
-    return CACHE_DIR / f"{what}-{hashlib.sha256(str(ROOM).encode()).hexdigest()[:16]}"
+    # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
+    # processor: a disk may be put into another computer
+    key = f"{ROOM} {os.environ.get('NUMBA_CPU_NAME') or get_host_cpu_name()}"
+    return CACHE_DIR / f"{what}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+
+
+def _mark(lights: bool) -> Path:
+    """Of what a start of the daemon needs, with lights or without."""
+    return mark_of("warm-lights" if lights else "warm")
+
+
+def is_warm(lights: bool) -> bool:
+    """Whether an earlier start has compiled all that one needs, with lights or without; loads none of it.
+
+    Raises:
+        CannotLoad: nowhere to keep compiled kernels.
+    """
+    try:
+        return _mark(lights).exists()
+    except (OSError, RuntimeError) as error:
+        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
 
 
 def _load_locked(begun: float, lights: Lights | None) -> Warmth:
-    from estimator.kernel import CACHE_DIR
+    with _uncollected(True):
+        from estimator.kernel import CACHE_DIR
 
     with (CACHE_DIR / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        mark = mark_of("warm" if lights is None else "warm-lights")
+        mark = _mark(lights is not None)
         cold = not mark.exists()
         if cold:
             count = kernel_count(lights is not None)
             log.info("first start of this version: compiling %d kernels, which takes a minute or two", count)
-        _exercise()
-        code_us = 0.0 if lights is None else _exercise_lights(lights)
+        with _uncollected(not cold):
+            _exercise()
+            code_us = 0.0 if lights is None else _exercise_lights(lights)
         mark.touch()
     return Warmth(cold, time.monotonic() - begun, code_us)
+
+
+@contextlib.contextmanager
+def _uncollected(wanted: bool) -> Iterator[None]:
+    """No look for garbage meanwhile: a fifth of what loading takes, which leaves little; compiling leaves much."""
+    collects = gc.isenabled()
+    if wanted:
+        gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def kernel_count(lights: bool = False) -> int:

@@ -229,3 +229,43 @@ def test_a_command_that_cannot_load_leaves_no_mark(tmp_path: Path, monkeypatch: 
     with pytest.raises(warmup.CannotLoad, match="No space left"):
         warmup.load_aloud(lambda text: None, "warm", full)
     assert not (tmp_path / "warm").exists()
+
+
+def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
+    """At every boot the daemon waits for it, and then loads the same itself."""
+    warmup.load()
+    code = (
+        "import sys; from daemon.cli import main\n"
+        "assert main(['warm', '--set', 'modbus.port=0']) == 0\n"
+        "print(sorted({'estimator.pipeline', 'estimator.matching'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+    assert done.stderr == "lumiloop: an earlier start has compiled the kernels\n"
+
+
+def test_another_processor_s_kernels_are_none_of_this_one_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = warmup.mark_of("warm")
+    assert warmup.mark_of("warm") == ours
+    monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: "another")
+    monkeypatch.delenv("NUMBA_CPU_NAME", raising=False)
+    assert warmup.mark_of("warm") != ours
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    assert warmup.mark_of("warm") != ours
+    monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: "a third")
+    generic = warmup.mark_of("warm")
+    monkeypatch.undo()
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    assert warmup.mark_of("warm") == generic
+
+
+def test_garbage_is_looked_for_while_kernels_are_compiled_and_not_while_they_are_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    collects: list[bool] = []
+    monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
+    monkeypatch.setattr(warmup, "_exercise", lambda: collects.append(gc.isenabled()))
+    for _ in range(2):
+        warmup.load()
+    assert collects == [True, False]
+    assert gc.isenabled()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 import os
 import socket
@@ -122,6 +123,15 @@ def test_an_image_that_is_not_whole_is_made_anew(tmp_path: Path, monkeypatch: py
     assert image.image(said.append) == half
 
 
+def test_the_kernel_is_taken_out_of_its_boot_image() -> None:
+    elf = b"\x7fELF" + bytes(range(256)) * 40
+    boot_image = b"\x1f\x8b\x08 setup" + lzma.compress(elf, check=lzma.CHECK_CRC32) + b"appended"
+    assert image.unpacked(boot_image) == elf
+    for wrong in (b"no kernel", lzma.compress(b"no ELF"), boot_image[:60]):
+        with pytest.raises(places.CannotBench, match="holds no kernel"):
+            image.unpacked(wrong)
+
+
 def test_what_was_published_inside_is_compared_with_outside() -> None:
     """The scenario's own arithmetic: a drive in virtual time against itself as the bench would hear it."""
     seconds = 14.0
@@ -133,6 +143,14 @@ def test_what_was_published_inside_is_compared_with_outside() -> None:
     assert agreement.differences(inside, outside)[1].max() < 2e-3
     off = agreement.trace_of(made.t_mono, made.pose + np.array((0.02, 0.0, 0.0)), fine, scene.truth(fine))
     assert agreement.differences(off, outside)[1].max() > 0.015
+
+    def traced(by: float) -> agreement.Trace:
+        return agreement.trace_of(made.t_mono + 0.012 - by, made.pose, fine, scene.truth(fine))
+
+    assert agreement.differences(traced(0.0), outside)[1].max() > 0.005
+    late = agreement.lateness(np.arange(0.0, 0.04, 0.001), traced, outside)
+    assert late == pytest.approx(0.012, abs=0.0011)
+    assert agreement.differences(traced(late), outside)[1].max() < 2e-3
 
 
 def test_the_disk_is_never_written_to_and_only_loopback_is_listened_on(tmp_path: Path) -> None:
@@ -188,6 +206,78 @@ def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_ones(tmp_path: 
         with pytest.raises(places.CannotBench, match="QEMU has ended with -9"):
             inside.run("fourth")
     inside.close()
+
+
+class Looked(bench.Bench):
+    """A bench in time of its own, which goes on by ``wait``; its processor is kept waiting for a share of it."""
+
+    def __init__(self, starved: float = 0.0) -> None:
+        self.now, self.starved, self.machine = 0.0, starved, self  # type: ignore[assignment]  # all that is asked
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def waited_s(self) -> float:
+        return 7.0 + self.starved * self.now
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+    def read(self, tcp: bool = False) -> dict[str, object]:
+        return {}
+
+    def log(self, lines: int) -> str:
+        return "its log"
+
+
+@pytest.mark.parametrize(("starved", "most"), [(0.0, 60.0), (0.5, 120.0), (0.95, 300.0)])
+def test_time_in_which_the_emulated_processor_could_not_run_does_not_count(
+    starved: float, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = Looked(starved)
+    monkeypatch.setattr(bench, "time", one)
+    assert one.until("READY", 60.0, lambda: one.now > most - 1.0) == pytest.approx(most, abs=1.5)
+    begun = one.now
+    with pytest.raises(Order, match=rf"not within 60 s of its own, {most:.0f} s in all: READY; .*\nits log"):
+        one.until("READY", 60.0, lambda: False)
+    assert one.now - begun == pytest.approx(most, abs=1.5)
+
+
+def test_what_a_computer_has_worked_and_waited_is_the_system_s_own_count(tmp_path: Path) -> None:
+    inside = Agent(b"", tmp_path)
+    inside.close()
+    code = "print(flush=True); import time\nwhile time.process_time() < 0.3: pass\nprint(flush=True); input()"
+    words = [sys.executable, "-c", code]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as inside.process:
+        assert inside.process.stdout is not None
+        inside.process.stdout.readline()
+        before = inside.worked_s()
+        inside.process.stdout.readline()
+        assert 0.2 < inside.worked_s() - before < 0.5
+        assert inside.waited_s() == pytest.approx(
+            int(Path(f"/proc/{inside.process.pid}/schedstat").read_text().split()[1]) / 1e9, abs=0.5
+        )
+        inside.process.communicate(b"\n")
+    assert inside.waited_s() == 0.0, "it has ended"
+
+
+def said_by(lines: list[dict[str, str]]) -> str:
+    return "\n".join(["-- Boot --", *map(json.dumps, lines)])
+
+
+def test_faults_that_have_come_and_not_gone_are_read_from_the_journal_at_one_go() -> None:
+    told = [
+        {"LUMILOOP_FAULT": "153", "MESSAGE_ID": bench.COME_ID},
+        {"LUMILOOP_FAULT": "155", "MESSAGE_ID": bench.COME_ID},
+        {"LUMILOOP_FAULT": "153", "MESSAGE_ID": bench.OVER_ID},
+        {"LUMILOOP_FAULT": "151", "MESSAGE_ID": bench.OVER_ID},
+    ]
+    asked: list[tuple[str, ...]] = []
+    one = Looked()
+    one.run = lambda *words, check: asked.append(words) or said_by(told)  # type: ignore[attr-defined]
+    assert one.present(151, 153, 155) == [155]
+    assert len(asked) == 1
+    assert [word for word in asked[0] if "FAULT=" in word] == [f"LUMILOOP_FAULT={code}" for code in (151, 153, 155)]
 
 
 def test_a_long_answer_comes_whole_through_a_port_that_takes_little_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,7 +387,7 @@ def test_a_pose_datagram_is_read_as_the_daemon_writes_it() -> None:
     assert read.t_pose == pytest.approx(100.0, abs=2e-4)
     assert one.pose is not None
     assert read.pose == pytest.approx(one.pose, abs=1e-4)
-    assert (read.t_came, read.state) == (100.03, one.state)
+    assert (read.t_came, read.state, read.loops) == (100.03, one.state, one.loop_counter)
 
 
 def test_the_truth_is_interpolated() -> None:

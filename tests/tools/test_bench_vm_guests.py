@@ -90,6 +90,7 @@ class Playing:
         self.broken_off = broken_off
         self.machine = self
         self.life = (0, 0)
+        self.worked = 0.0
 
     def __enter__(self) -> Playing:
         return self
@@ -99,6 +100,10 @@ class Playing:
 
     def lives(self) -> tuple[int, int]:
         return self.life
+
+    def worked_s(self) -> float:
+        self.worked += 1.5
+        return self.worked
 
     def run(self, *words: str, seconds: float) -> str:
         return "the journal"
@@ -143,6 +148,24 @@ def test_a_computer_that_dies_leaves_a_report_of_what_was_and_what_was_not_run(
     assert "not run: the emulated computer had ended" in said
     assert "spelt wrongly" in said
     assert (tmp_path / "journal-2.log").read_text() == "the journal"
+
+
+def test_what_the_emulation_has_worked_is_told_with_each_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guests, "bench", lambda image, folder, broken_off: Playing(broken_off))
+    (tmp_path / "work").mkdir()
+    guest = Guest(1, [like(passes), passes])
+    run_all([guest], image.Image(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    assert [str(figure) for one in guest.results for figure in one.figures] == 2 * ["work of the emulation: 1.5 CPU s"]
+
+
+def test_what_takes_time_to_ask_for_is_asked_for_where_it_is_told() -> None:
+    asked: list[int] = []
+    common.need(True, lambda: f"{asked.append(1)}")
+    assert asked == []
+    with pytest.raises(bench.Order, match="the log"):
+        common.need(False, lambda: "the log")
 
 
 def test_a_run_that_is_broken_off_says_what_was_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

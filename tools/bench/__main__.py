@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import pkgutil
+import signal
 import sys
 from pathlib import Path
 
@@ -39,6 +40,7 @@ def main() -> int:
     unknown = set(options.name) - set(names())
     if unknown:
         parser.error(f"no such benchmark: {', '.join(sorted(unknown))}; there are {', '.join(names())}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what a benchmark has started must not outlive it
     failed = False
     for name in options.name or names():
         print(f"\n== {name}", flush=True)

@@ -239,6 +239,7 @@ def long_form(name: str, prog: str, other: str, run: Callable[[int], list[Figure
     parser.add_argument("--turns", type=int, default=30, help=f"pairs of 10 s alone and 10 s {other}")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # daemon, readers and burners must not outlive this one
     rows = run(options.turns)
     print(table(rows))
     print(f"written: {save(name, rows, options.out)}")

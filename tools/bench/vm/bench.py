@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from bisect import bisect_left
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -35,18 +35,24 @@ PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
 KEPT: Final = 30_000
 WORLD_S: Final = 240.0
 READS: Final = 4
+BUSY: Final = 5.0
+"""No bound is stretched beyond so many times its seconds."""
 Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A pose datagram: when it came, when its pose was true (both this computer's clock), what it says."""
+    """A pose datagram: when it came, when its pose was true (both this computer's clock), what it says.
+
+    ``loops``: how many have been closed since the daemon's start.
+    """
 
     t_came: float
     t_pose: float
     state: int
     pose: Pose | None
     sigma_m: float
+    loops: int = 0
 
 
 @dataclass(slots=True)
@@ -86,10 +92,11 @@ def heard(data: bytes, now: float, clock: OtherClock) -> Heard:
     age, t_mono = struct.unpack_from("<HQ", data, 22)
     x, y, yaw = struct.unpack_from("<iii", data, 40)
     sigma = max(struct.unpack_from("<HH", data, 76)) / 1e4
+    (loops,) = struct.unpack_from("<H", data, 108)
     pose = None if x == -(2**31) else (x / 1e4, y / 1e4, yaw / 1e6)
     if pose is None:
-        return Heard(now, now, state, None, sigma)
-    return Heard(now, clock.here(t_mono / 1e6, t_mono / 1e6 + age / 1e4, now), state, pose, sigma)
+        return Heard(now, now, state, None, sigma, loops)
+    return Heard(now, clock.here(t_mono / 1e6, t_mono / 1e6 + age / 1e4, now), state, pose, sigma, loops)
 
 
 def inverse_then(frame: Pose, pose: Pose) -> Pose:
@@ -167,13 +174,19 @@ class Bench:
             self.wait(0.1)
         raise Order(f"command {number} was not acknowledged within {seconds:.0f} s")
 
-    def until(self, what: str, seconds: float, happens: Callable[[], object]) -> float:
-        """Wait until it happens; returns how long it took. Raises `Order` with the daemon's log."""
-        begun = time.monotonic()
+    def until(self, what: str, seconds: float, happens: Callable[[], object], every: float = 0.1) -> float:
+        """Wait until it happens; returns how long it took. Raises `Order` with the daemon's log.
+
+        While the emulated processor waits for one of this computer's, its time does not run: ``seconds`` are those in
+        which it could have done something. ``every``: between two looks, which cost it something where it is asked.
+        """
+        begun, waited = time.monotonic(), self.machine.waited_s()
         while not happens():
-            if time.monotonic() - begun > seconds:
-                raise Order(f"not within {seconds:.0f} s: {what}; Modbus says {self.read()}\n{self.log(12)}")
-            self.wait(0.1)
+            took = time.monotonic() - begun
+            if took - (self.machine.waited_s() - waited) > seconds or took > BUSY * seconds:
+                told = f"not within {seconds:.0f} s of its own, {took:.0f} s in all: {what}"
+                raise Order(f"{told}; Modbus says {self.read()}\n{self.log(12)}")
+            self.wait(every)
         return time.monotonic() - begun
 
     def wait(self, seconds: float) -> None:
@@ -185,12 +198,13 @@ class Bench:
         """Wait until the pose may be used."""
         return self.until(f"state {' or '.join(states)}", seconds, lambda: self.read().get("state") in states)
 
-    def faults(self, code: int) -> tuple[int, int]:
-        """How often a fault has come and gone, by this boot's journal."""
-        words = ["journalctl", "-q", "-b", "--no-pager", "-o", "json", "--output-fields=MESSAGE_ID"]
-        said = self.machine.run(*words, "-u", UNIT, f"LUMILOOP_FAULT={code}", check=False)
-        ids = [json.loads(line).get("MESSAGE_ID") for line in said.splitlines() if line.startswith("{")]
-        return ids.count(COME_ID), ids.count(OVER_ID)
+    def present(self, *codes: int) -> list[int]:
+        """Which of these faults have come more often than gone, by this boot's journal."""
+        words = ["journalctl", "-q", "-b", "--no-pager", "-o", "json", "--output-fields=MESSAGE_ID,LUMILOOP_FAULT"]
+        said = self.machine.run(*words, "-u", UNIT, *(f"LUMILOOP_FAULT={code}" for code in codes), check=False)
+        told = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+        seen = Counter((one.get("LUMILOOP_FAULT"), one.get("MESSAGE_ID")) for one in told)
+        return [code for code in codes if seen[f"{code}", COME_ID] > seen[f"{code}", OVER_ID]]
 
     def fault(self, *codes: int) -> None:
         """Wait until Modbus shows one of these faults as the gravest."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from tools.bench.report import Result, Seen
+from tools.bench.report import Figure, Result, Seen
 from tools.bench.vm.bench import Bench, bench
 from tools.bench.vm.common import AFTER, Scenario, unnoticed
 from tools.bench.vm.image import Image
@@ -82,7 +82,10 @@ class Guest:
         try:
             with bench(image, folder, self.broken_off) as whole:
                 for scenario in self.share:
-                    self.results.append(tried(scenario, whole))
+                    before = whole.machine.worked_s()
+                    one = tried(scenario, whole)
+                    worked = Figure("work of the emulation", whole.machine.worked_s() - before, "CPU s")
+                    self.results.append(replace(one, figures=(*one.figures, worked)))
                     self._tell(self.results[-1], say)
                 with contextlib.suppress(Order, OSError):
                     (out / f"journal-{self.number}.log").write_text(whole.machine.run(*JOURNAL, seconds=120))

@@ -177,6 +177,15 @@ class Machine:
         lines = self.run("systemctl", "show", unit, *(f"--property={name}" for name in names)).splitlines()
         return dict(line.split("=", 1) for line in lines if "=" in line)
 
+    def worked_s(self) -> float:
+        """Seconds of processor time that it has taken of this computer."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def waited_s(self) -> float:
+        """Seconds that its processor would have run and had to wait for one of this computer's."""
+        return max(map(_waited_s, Path(f"/proc/{self.process.pid}/task").glob("*/schedstat")), default=0.0)
+
     def power_cut(self) -> None:
         """Off and on again, without a word to the system inside; its disk keeps what had been written."""
         self._monitor("system_reset")
@@ -227,6 +236,12 @@ class Machine:
         if self._qmp is not None:
             self._qmp[1].close()
             self._qmp[0].close()
+
+
+def _waited_s(schedstat: Path) -> float:
+    with suppress(OSError, IndexError, ValueError):  # the thread has ended; or a kernel that does not tell
+        return 1e-9 * int(schedstat.read_text().split()[1])
+    return 0.0
 
 
 def _connected(path: Path) -> socket.socket:

@@ -1,6 +1,7 @@
 """The drive outside of the emulated computer, in virtual time: what its poses are compared with.
 
 It comes out the same each time, so it is driven once for the sources that it depends on, and kept beside the image.
+``python -m tools.bench.vm.reference`` drives it if it has not been.
 """
 
 from __future__ import annotations
@@ -46,3 +47,7 @@ def _driven() -> Trace:
     from tools.sim.scene import SimulatedScene
 
     return reference_of(SimulatedScene(world.scenario(), room()), world.DWELL_S + DRIVE_S + 10.0)
+
+
+if __name__ == "__main__":
+    outside()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tools.bench.vm.bench import CONFIG, DONE, REFUSED, SAVE_MAP, UNIT, Bench
-from tools.bench.vm.common import back, map_id, need, right, scenario
+from tools.bench.vm.common import RIGHT_S, back, map_id, need, right, scenario
 
 
 @scenario()
@@ -26,8 +26,8 @@ def meets_a_full_disk(bench: Bench) -> str:
     bench.machine.run("sh", "-c", fill, check=False, seconds=120)
     result = bench.command(SAVE_MAP, 60.0)
     bench.machine.run("rm", "-f", "/full")
-    need(result == REFUSED, f"saving said {result}:\n{bench.log(10)}")
-    need(bench.command(SAVE_MAP, 60.0) == DONE, bench.log(10))
+    need(result == REFUSED, lambda: f"saving said {result}:\n{bench.log(10)}")
+    need(bench.command(SAVE_MAP, 60.0) == DONE, lambda: bench.log(10))
     return f"refused, then done; {back(bench, pid)}"
 
 
@@ -35,7 +35,7 @@ def _up_again(bench: Bench) -> str:
     boot = bench.machine.wait_until_up()
     tracking = bench.placed(240.0)
     need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
-    found = right(bench, bench.collect(3.0))
+    found = right(bench, bench.collect(RIGHT_S))
     return f"up {boot:.0f} s later, TRACKING in the same map {tracking:.1f} s after that, {1e3 * max(found):.0f} mm off"
 
 
@@ -49,7 +49,7 @@ def is_rebooted(bench: Bench) -> str:
 @scenario("anew")
 def loses_its_power(bench: Bench) -> str:
     """The power is cut and comes back: comes up by itself, in the same map."""
-    need(bench.command(SAVE_MAP, 60.0) == DONE, bench.log(10))
+    need(bench.command(SAVE_MAP, 60.0) == DONE, lambda: bench.log(10))
     bench.machine.run("sync")
     bench.machine.power_cut()
     return _up_again(bench)

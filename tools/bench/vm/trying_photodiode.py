@@ -44,15 +44,9 @@ def reads_the_converter(bench: Bench) -> str:
     return f"{nodes}; {_blocks(bench)} blocks"
 
 
-def _present(bench: Bench, codes: tuple[int, ...]) -> list[int]:
-    """Which of the faults have come and not gone."""
-    seen = {code: bench.faults(code) for code in codes}
-    return [code for code, (came, gone) in seen.items() if came > gone]
-
-
 def _sound(bench: Bench) -> None:
     """Wait until samples come."""
-    bench.until(f"none of {GONE}", 40.0, lambda: not _present(bench, GONE))
+    bench.until(f"none of {GONE}", 40.0, lambda: not bench.present(*GONE), every=1.0)
     before = _blocks(bench)
     bench.until("blocks of samples", 20.0, lambda: (_blocks(bench) - before) % 2**32 >= ENOUGH)
     bench.placed(TRACKING_S, PLACED)
@@ -73,7 +67,7 @@ def _ordered(bench: Bench, order: str, code: int) -> str:
     _sound(bench)
     pid, begun = bench.main_pid(), time.monotonic()
     bench.orders(order)
-    bench.until(f"fault {code}", 30.0, lambda: _present(bench, (code,)))
+    bench.until(f"fault {code}", 30.0, lambda: bench.present(code), every=0.5)
     seconds = time.monotonic() - begun
     _sound(bench)
     same_process(bench, pid)
@@ -99,7 +93,7 @@ def stops_and_starts(bench: Bench) -> str:
     bench.machine.run("systemctl", "stop", UNIT)
     seconds = time.monotonic() - begun
     seen = bench.machine.show(UNIT, "Result", "ExecMainStatus")
-    need(seen == {"Result": "success", "ExecMainStatus": "0"}, f"{seen}\n{bench.log(20)}")
+    need(seen == {"Result": "success", "ExecMainStatus": "0"}, lambda: f"{seen}\n{bench.log(20)}")
     bench.configure()
     bench.machine.run("systemctl", "start", UNIT, seconds=300)
     said = back(bench, bench.main_pid(), PLACED)

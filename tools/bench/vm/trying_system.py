@@ -17,7 +17,11 @@ from tools.bench.vm.machine import Order
 from tools.bench.vm.reference import DRIVE_S, outside
 
 FIFO: Final = 1
+MARKS: Final = "/var/cache/private/lumiloop/kernels-*/warm-*"
+"""They say that an earlier start has compiled the kernels."""
 AGREE_M: Final = 0.01
+LATE_S: Final = 0.02
+LATER: Final = np.arange(0.0, 2.0 * LATE_S, 0.001)
 
 
 # the system as it comes up
@@ -53,10 +57,12 @@ def probes(bench: Bench) -> str:
 @scenario("anew")
 def starts(bench: Bench) -> str:
     """`systemctl enable --now lumiloop`: warmed up and READY."""
+    bench.machine.run("sh", "-c", f"rm {MARKS}")
     seconds = start(bench)
     warm = bench.machine.run("journalctl", "-q", "--no-pager", "-o", "cat", "-u", "lumiloop-warmup.service")
-    told = re.search(r"kernels (compiled|found and loaded) in [\d.]+ s", warm)
-    return f"READY after {seconds:.1f} s, the warm-up before it included: {told.group() if told else warm}"
+    told = re.search(r"kernels compiled in [\d.]+ s", warm)
+    need(told, f"it was not warmed up: {warm}")
+    return f"READY after {seconds:.1f} s, the warm-up before it included: {told.group() if told else ''}"
 
 
 @scenario()
@@ -148,18 +154,19 @@ def drives(bench: Bench) -> Seen:
 
 @scenario()
 def agrees_with_outside(bench: Bench) -> Seen:
-    """The same drive outside, in virtual time: poses agree to 1 cm."""
+    """The same drive outside, in virtual time: but for lateness, poses agree to 1 cm until a loop is closed."""
     from tools.bench.world.agreement import figures as apart  # here: with it comes the estimator, which takes long
-    from tools.bench.world.agreement import trace_of
+    from tools.bench.world.agreement import lateness, trace_of
 
-    placed = [one for one in bench.memory["drive"] if one.pose is not None]
+    drive = bench.memory["drive"]
+    placed = [one for one in drive if one.pose is not None and one.loops == drive[0].loops]
     told = list(bench.ears.truth)
-    inside = trace_of(
-        np.array([one.t_pose for one in placed]), np.array([one.pose for one in placed]),
-        np.array([t for t, _ in told]), np.array([pose for _, pose in told]),
-    )  # fmt: skip
-    figures, plots = apart(inside, outside(), "inside and outside")
-    need(figures[-1].value <= 1e3 * AGREE_M, "; ".join(map(str, figures)))
+    t, poses = np.array([one.t_pose for one in placed]), np.array([one.pose for one in placed])
+    truth_t, truth = np.array([t for t, _ in told]), np.array([pose for _, pose in told])
+    late = lateness(LATER, lambda by: trace_of(t - by, poses, truth_t, truth), outside())
+    figures, plots = apart(trace_of(t - late, poses, truth_t, truth), outside(), "inside and outside")
+    figures = (Figure("inside: late by", 1e3 * late, "ms", "more", 0.5, 5.0), *figures)
+    need(late <= LATE_S and figures[-1].value <= 1e3 * AGREE_M, "; ".join(map(str, figures)))
     return Seen(f"{len(placed)} poses", figures, plots)
 
 
@@ -167,7 +174,7 @@ def agrees_with_outside(bench: Bench) -> Seen:
 def saves_its_map(bench: Bench) -> str:
     """Command SAVE_MAP over Modbus."""
     bench.placed(TRACKING_S)
-    need(bench.command(SAVE_MAP) == DONE, bench.log(10))
+    need(bench.command(SAVE_MAP) == DONE, lambda: bench.log(10))
     need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
     return bench.machine.run("sh", "-c", "ls /var/lib/lumiloop/maps").replace("\n", " ")
 

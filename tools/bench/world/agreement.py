@@ -9,6 +9,7 @@ for, which is centimetres, and with which keyframe it is closed depends on the s
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -90,6 +91,21 @@ def differences(one: Trace, other: Trace) -> tuple[Array, Array]:
 def _at(one: Trace, driven: Array, axis: int) -> Array:
     order = np.argsort(one.driven, kind="stable")
     return np.asarray(np.interp(driven, one.driven[order], one.off[order, axis]))
+
+
+def lateness(tried: Array, traced: Callable[[float], Trace], other: Trace) -> float:
+    """By how many seconds of ``tried`` its stamps have to be set back for one trace to say most nearly the same.
+
+    A line on which every scan is under way for a while, the emulated computer's, makes all instants later by as much:
+    at 0.6 m/s 10 ms are 6 mm along the way, which are the line's and not what was made of the scans.
+
+    Args:
+        tried: seconds, ascending.
+        traced: the trace with stamps set back by so much.
+        other: the one to agree with.
+    """
+    medians = [float(np.median(differences(traced(float(by)), other)[1])) for by in tried]
+    return float(tried[int(np.argmin(medians))])
 
 
 def figures(one: Trace, other: Trace, names: str) -> tuple[tuple[Figure, ...], tuple[Plot, ...]]:
