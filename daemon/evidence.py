@@ -245,7 +245,7 @@ def _axes(known: Array) -> tuple[bool, bool, bool]:
 
 def _against(links: tuple[light.Link, ...]) -> int:
     """How many lamps are received that cannot be so at the place light is held to have told."""
-    return sum(link.state in (light.LinkState.OCCLUDED, light.LinkState.REJECTED) for link in links)
+    return sum(link.against for link in links)
 
 
 def _places(result: StepResult | None) -> int | None:

@@ -12,7 +12,6 @@ are kept apart from the rows that are searched, so no laser point can take one f
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +69,8 @@ def build_axis(points: Array, centre: Array, sectors: int = 0, lights: Array | N
     n = len(points)
     if 1 < sectors < FEWEST:
         raise ValueError(f"{sectors} sectors are too wide to be searched; use 1, {FEWEST} or more, or 0 to choose")
-    rays = ray_table(sectors or sector_count(n)).copy()
+    rays = np.empty(((sectors or sector_count(n)) + 1, 4))
+    bound_sectors(rays)
     rows, label, start = np.empty((n, 3)), np.empty(n, np.int64), np.zeros(len(rays), np.int64)
     order_points(np.ascontiguousarray(points), centre[0], centre[1], (rows, label, start, rays))
     if lights is None or not len(lights):
@@ -79,16 +79,18 @@ def build_axis(points: Array, centre: Array, sectors: int = 0, lights: Array | N
     return Axis(centre, rows, label, start, rays, np.column_stack((at, np.hypot(at[:, 0], at[:, 1]))))
 
 
-@lru_cache(maxsize=64)
-def ray_table(sectors: int) -> Array:
+@kernel("void(f8[:, ::1])")
+def bound_sectors(rays: Array) -> None:
     """Bounds of the sectors as ``Axis.rays``, with empty rings: turns (:func:`turn_of`) of equal size."""
-    turn = 4.0 * (np.arange(sectors + 1) % sectors) / sectors
-    f = turn % 1.0
-    quarter = turn.astype(np.int64)
-    x = np.choose(quarter, (1.0 - f, -f, f - 1.0, f))
-    y = np.choose(quarter, (f, 1.0 - f, -f, f - 1.0))
-    length = np.hypot(x, y)
-    return np.column_stack((x / length, y / length, np.full(len(f), np.inf), np.full(len(f), -np.inf)))
+    sectors = len(rays) - 1
+    for s in range(sectors + 1):
+        turn = 4.0 * (s % sectors) / sectors
+        quarter, f = int(turn), turn % 1.0
+        x = (1.0 - f, -f, f - 1.0, f)[quarter]
+        y = (f, 1.0 - f, -f, f - 1.0)[quarter]
+        length = np.sqrt(x * x + y * y)
+        rays[s, 0], rays[s, 1] = x / length, y / length
+        rays[s, 2], rays[s, 3] = np.inf, -np.inf
 
 
 @kernel("f8(f8, f8)", inline=True)

@@ -45,7 +45,7 @@ def fuse(state: State, match: MatchResult) -> None:
     elif match.reason is not Reason.NO_MAP:
         state.failures += match.reason not in BLIND  # who sees nothing contradicts nothing
         if not moving.odometry:
-            moving.velocity = 0.8 * moving.velocity  # a velocity that nothing confirms is let die
+            motion.slow_down(moving)
     state.t_scan, state.T_odom_scan = moving.t_mono, moving.T_odom_base
 
 

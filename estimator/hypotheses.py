@@ -57,7 +57,7 @@ class Hypothesis:
     Attributes:
         T_map_odom: where the odom frame then lies, by the latest look that held it. held: those looks, oldest first.
         looks: at it so far; idle: how many of them in a row have left it open. share: mean share of the beams.
-        latest: the latest look, whatever it said.
+        latest: the latest look, whatever it said. holds: how many looks held it.
     """
 
     T_map_odom: Array
@@ -66,6 +66,7 @@ class Hypothesis:
     idle: int = 0
     share: float = 0.0
     latest: tuple[Keyframe, Fit] | None = None
+    holds: int = 0
 
     def after(self, frame: Keyframe, fit: Fit) -> Hypothesis:
         """The hypothesis after one look more."""
@@ -73,7 +74,7 @@ class Hypothesis:
         if fit.verdict is not Verdict.HOLDS:
             return replace(self, looks=self.looks + 1, idle=self.idle + 1, share=share, latest=(frame, fit))
         held = (*self.held[:1], *self.held[1:][-HELD:], (frame, fit))
-        return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share, (frame, fit))
+        return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share, (frame, fit), self.holds + 1)
 
     def apart(self) -> float:
         """Metres between the places it was held from."""
@@ -150,7 +151,8 @@ class Seek:
         """
         if not self.complete or one.idle:
             return False
-        return witnessed or (len(self.alive) == 1 and len(one.held) >= HELD and one.apart() >= HELD_M)
+        most = 2 * one.holds > one.looks
+        return witnessed or (len(self.alive) == 1 and most and len(one.held) >= HELD and one.apart() >= HELD_M)
 
     def recalled(self) -> Hypothesis | None:
         """The place where the robot stood last, if the laser holds it, and no other one in the whole map.
@@ -199,6 +201,29 @@ class Watch:
     job: int = 0
     since: int = 0
     alone: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Suspicion:
+    """What is remembered from scan to scan of whether the robot was carried off (`estimator.suspicion`).
+
+    Attributes:
+        fitted: scans that have fitted since something else raised the suspicion, 0: nothing has. jumped: the pose did.
+        odd: a match has moved it by more than the prediction allowed. share: of the beams that fits usually.
+        still_s: how long the wheels have stood since the last match, unwatched_s: the longest time that they did.
+        period_s: usual time between two matches, 0 before it is known.
+        job: ID of the look under way, 0: none. t_asked: when it was asked for.
+    """
+
+    fitted: int = 0
+    jumped: bool = False
+    odd: bool = False
+    share: float = 0.0
+    still_s: float = 0.0
+    unwatched_s: float = 0.0
+    period_s: float = 0.0
+    job: int = 0
+    t_asked: float = -math.inf
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

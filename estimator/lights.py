@@ -24,7 +24,7 @@ from estimator.lights_start import Place, begin, decide, headings, mixture, new_
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3, positive_part
 from estimator.records import Array, Imu, Odometry
-from estimator.result import Fix, LightsResult, Link, LinkState
+from estimator.result import Fix, LightsResult, Link, LinkState, speaks_against
 
 __all__ = [
     "Lights",
@@ -51,6 +51,10 @@ PROOF_M = 3.0
 """Way without contradiction after which a place found anew is believed."""
 DRIFTED_M = 0.7
 """A place less certain than that is not corrected but looked for anew: the equations are too bent there."""
+ANEW_M = 0.02
+"""Way after which strengths say something new of the heading. Those of a robot that stands, or turns on the spot, say
+again what they have said: it sways, and errors of a percent would rule out the right heading within a second. Without
+wheels only what is faster than a crawl counts as way, and that is new."""
 ITERATE_M, ITERATE_RAD = 0.03, 0.03
 ITERATIONS = 4
 
@@ -111,7 +115,8 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
         return
     old = lights.tracks[0] if lights.tracks else lights.before
     keep_gains(lights)
-    lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old)]
+    zeros = np.zeros((ekf.SIZE, ekf.SIZE))
+    lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old, zeros)]
     lights.t_lost, lights.t_odd, lights.lost = math.inf, math.inf, False
 
 
@@ -196,6 +201,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
     back = lights_motion.back_to(lights, middle)
     way, dt = lights.course.way - lights.way_epoch, middle - lights.t_epoch
     lights.way_epoch = lights.course.way
+    news = min(way / ANEW_M, 1.0) if lights.course.wheels else float(way > 0.0)
     views: list[tuple[Track, list[Sight]]] = []
     for track in lights.tracks:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
@@ -203,7 +209,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         age(lights, track, way, dt)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
         likelihood = absorb(lights, track, seen, view_of(lights, back))
-        track.weight += likelihood if way > 0.0 else 0.0  # standing still, strengths say nothing of the heading
+        track.weight += likelihood * news
         views.append((track, seen))
     if len(lights.tracks) > 1:
         rule_out(lights, epoch)
@@ -263,8 +269,8 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
     if len(lights.tracks) != 1:
         return
     states = [sight.state for sight in seen]
-    used, against = (states.count(s) for s in (LinkState.ACCEPTED, LinkState.REJECTED))
-    against += states.count(LinkState.OCCLUDED)
+    doubtful = [sight.state for sight in seen if speaks_against(sight.state, sight.residual, sight.sigma)]
+    against, used = len(doubtful), states.count(LinkState.ACCEPTED) - doubtful.count(LinkState.ACCEPTED)
     now = lights.course.t_mono
     if used:
         lights.t_used = now

@@ -125,23 +125,32 @@ def grid(x: float, y: float, reach: float) -> Array:
 
 
 def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> None:
-    """Put up one hypothesis for every place and heading; what is known of gains and sensor errors is kept."""
+    """Put up one hypothesis for every place and heading; what is known of gains and sensor errors is kept.
+
+    Their covariances are one block, which the system gets back as a whole when the start has been decided: piece by
+    piece, each start left some of them in the heap, as holes among what is kept.
+    """
     old = lights.tracks[0] if lights.tracks else lights.before
     lights.tracks = []
+    block = np.zeros((len(found) * len(yaws), ekf.SIZE, ekf.SIZE))
     for place in found:
         for yaw in yaws.tolist():
             rx = lights.survey.receiver
             arm = se2.apply(np.array((0.0, 0.0, yaw)), np.array(((rx.x, rx.y),)))[0]
             T = np.array((place.x - arm[0], place.y - arm[1], se2.wrap(yaw)))
-            track = new_track(lights, T, np.diag((SIGMA_M**2, SIGMA_M**2, sigma_yaw**2)), old)
+            covariance = np.diag((SIGMA_M**2, SIGMA_M**2, sigma_yaw**2))
+            track = new_track(lights, T, covariance, old, block[len(lights.tracks)])
             track.weight = -0.5 * place.cost
             lights.tracks.append(track)
     lights.way_start = lights.course.way
 
 
-def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track | None) -> Track:
-    """A hypothesis at a pose, independent of everything else; motion errors and the floor as an old one knew them."""
-    track, motion, model = Track(), lights.settings.motion, lights.settings.model
+def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track | None, zeros: Array) -> Track:
+    """A hypothesis at a pose, independent of everything else; motion errors and the floor as an old one knew them.
+
+    ``zeros``: (SIZE, SIZE), becomes its covariance.
+    """
+    track, motion, model = Track(P=zeros), lights.settings.motion, lights.settings.model
     track.x[:3], track.P[:3, :3] = T_map_base, covariance
     if not lights.course.wheels:
         begun = (motion.speed, motion.sideways, 0.5)
@@ -190,6 +199,13 @@ def decide(lights: Lights) -> None:
     driven = lights.course.way - lights.way_start > MOVED_M
     if driven and chances[0] > lights.settings.decided and math.sqrt(kept[0].P[2, 2]) < 0.3:
         kept = kept[:1]
+    go_on(lights, kept)
+
+
+def go_on(lights: Lights, kept: list[Track]) -> None:
+    """Drop all other hypotheses, and, with one left, the block that they have shared."""
+    if len(kept) == 1 and kept[0].P.base is not None:
+        kept[0].P = kept[0].P.copy()
     lights.tracks = kept
 
 
@@ -208,7 +224,7 @@ def rule_out(lights: Lights, epoch: LightEpoch) -> None:
     unseen = [sum(out_of_sight(lights, track, lamp) for lamp in direct) for track in lights.tracks]
     kept = [track for track, count in zip(lights.tracks, unseen, strict=True) if count == 0]
     if kept or min(unseen) >= max(2.0, 0.5 * len(direct)):
-        lights.tracks = kept
+        go_on(lights, kept)
 
 
 def out_of_sight(lights: Lights, track: Track, lamp: Lamp) -> bool:

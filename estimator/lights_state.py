@@ -16,7 +16,7 @@ from estimator.lamps import Survey
 from estimator.lights_catalogue import Catalogue
 from estimator.optics import LAMP_COLUMNS
 from estimator.records import Array
-from estimator.result import LightsResult
+from estimator.result import STRONG, WEAK, LightsResult
 
 
 class Pause(Enum):
@@ -115,8 +115,8 @@ class LightsSettings:
     model: ModelErrors = field(default_factory=ModelErrors)
     link_n: int = 0
     pause: Pause = Pause.LINK
-    weak: float = 3.0
-    strong: float = 3.5
+    weak: float = WEAK
+    strong: float = STRONG
     wait_s: float = 0.5
     wait_m: float = 0.15
     rim_rad: float = 0.14

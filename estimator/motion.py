@@ -26,6 +26,9 @@ UNSEEN = np.array((0.5, 0.5, 0.5))
 LARGEST_TURN = math.pi
 """No heading is less certain than one that may be any."""
 
+DYING = 0.8
+"""Of a velocity that nothing confirms so much is left after each scan."""
+
 GYRO_RAD = 5e-4
 """Error of a gyro reading's turn: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
 BIAS_LEARNING = 0.02
@@ -99,6 +102,7 @@ class Motion:
         P: 3x3 covariance of the pose relative to the local map (odom-aligned axes).
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
         t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
+        t_told: when a match or wheels last told the pose; since then the velocity has carried it.
         ahead: motion already applied beyond the last odometry. odometry: whether any has arrived; t_odometry: its end.
         doubt: factor on the noise's variance, learned. gyro: sums and bias. trail: the way of the last two seconds.
     """
@@ -110,6 +114,7 @@ class Motion:
     velocity_variance: Array = field(default_factory=lambda: np.ones(3))
     t_felt: float = -math.inf
     t_gyro: float = -math.inf
+    t_told: float = -math.inf
     ahead: Array = field(default_factory=se2.identity)
     odometry: bool = False
     t_odometry: float = -math.inf
@@ -180,6 +185,7 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
     A mean over the interval is taken for its end, which adds half the interval's worth of unknown acceleration.
     """
     begin, end = interval
+    motion.t_told = max(motion.t_told, end)
     dt = end - begin
     if not 1e-3 < dt < LONGEST_CARRY_S:
         return
@@ -218,8 +224,7 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
     if math.isfinite(dt):
         unseen, dt = max(0.0, dt - LONGEST_CARRY_S), min(dt, LONGEST_CARRY_S)
         delta = se2.exp(motion.velocity * dt)
-        square = dt * dt
-        variance = (motion.velocity_variance + noise.acceleration_variance() * square) * (motion.doubt * square)
+        variance = carried_variance(motion, dt, noise)
         move(motion, delta, variance)
         motion.trail.add(motion.t_mono, t_mono, delta, variance)
         if unseen > 0.0:
@@ -227,6 +232,27 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
             motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono
+
+
+def slow_down(motion: Motion) -> None:
+    """A velocity that nothing confirms is let die; what is taken from its square, it may be wrong by."""
+    square = motion.velocity * motion.velocity
+    motion.velocity = DYING * motion.velocity
+    motion.velocity_variance = motion.velocity_variance + (1.0 - DYING * DYING) * square
+
+
+def carried_variance(motion: Motion, dt: float, noise: MotionNoise) -> Array:
+    """Variance (x, y, yaw) that carrying the pose on for ``dt`` seconds adds.
+
+    What the velocity is wrong by stays the same from one carry to the next, so that errors add up, and not variances:
+    a robot that hears of its lamps between two scans knows no better how it moves than one that does not. Only a gyro
+    says anew how it turns.
+    """
+    since = (motion.t_told, motion.t_told, max(motion.t_told, motion.t_gyro))
+    before = np.array([min(max(0.0, motion.t_mono - t), LONGEST_CARRY_S) if math.isfinite(t) else 0.0 for t in since])
+    begin, end = before * before, (before + dt) ** 2
+    unknown = noise.acceleration_variance() * (end * end - begin * begin)
+    return np.asarray(motion.doubt * (motion.velocity_variance * (end - begin) + unknown))
 
 
 def learn(motion: Motion, correction: Array, H: Array, known: bool) -> Array:

@@ -7,7 +7,20 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import absolute, adrift, closing, lateness, livemap, matchers, matching, motion, protection, se2, timelag
+from estimator import (
+    absolute,
+    adrift,
+    closing,
+    lateness,
+    livemap,
+    matchers,
+    matching,
+    motion,
+    protection,
+    se2,
+    suspicion,
+    timelag,
+)
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
@@ -83,9 +96,14 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
     points = nothing_of(scan) if why else virtual_frame(state, scan)
     walk(state)
     match = match_scan(state, scan, points, limits, why)
+    carried = suspicion.raised(state, match)
     fuse(state, match)
     timelag.on_match(state.lag, scan, match)
+    if carried:
+        suspicion.look(state, scan, points, match)
     lap("match")
+    if match.ok and suspicion.waits(state):
+        return match, -1
     if not (limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match)):
         return match, -1
     if match.ok:
@@ -121,6 +139,7 @@ def predict(state: State, record: Record) -> None:
         case Odometry():
             motion.on_odometry(state.fused, record, noise)
             timelag.on_odometry(state.lag, record)
+            suspicion.on_odometry(state, record)
         case Imu():
             motion.on_imu(state.fused, record, noise)
         case Scan() | SampleBlock() | LightEpoch():

@@ -108,7 +108,7 @@ class Query:
         frame: keyframe to look for. pieces: where. before: terrain of an earlier look.
         guesses: where it should be by what was found earlier: T_map_keyframe each.
         past: earlier keyframes, of which a new place has to be true as well.
-        search: whether new places are searched for. windows: where; everywhere if None.
+        search: whether new places are searched for. windows: where; everywhere if None. nodes: most that are opened.
     """
 
     frame: Keyframe
@@ -118,6 +118,7 @@ class Query:
     past: tuple[Keyframe, ...]
     search: bool = True
     windows: tuple[Around, ...] | None = None
+    nodes: int = NODES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +204,7 @@ def searched(query: Query, terrain: Terrain, view: View) -> tuple[list[Array], b
     hits: list[Array] = []
     complete, nodes = True, 0
     for window in around:
-        asked = SearchSettings(LEAST, RATIO, HITS, NODES - nodes, points=POINTS, around=window)
+        asked = SearchSettings(LEAST, RATIO, HITS, query.nodes - nodes, points=POINTS, around=window)
         found = search(terrain.field, seen, asked)
         hits += [se2.compose(hit.T_map_lidar, lidar_base) for hit in found.hits]
         complete &= found.complete and len(found.hits) < HITS

@@ -268,7 +268,6 @@ def witness(state: State, T_map_base: Array) -> bool:
         return place.of - place.fits <= AGAINST * place.of
     if lights.result is None:
         return False
-    states = [link.state for link in lights.result.links]
-    used = states.count(LinkState.ACCEPTED)
-    against = states.count(LinkState.OCCLUDED) + states.count(LinkState.REJECTED)
+    links = lights.result.links
+    used, against = sum(link.state is LinkState.ACCEPTED for link in links), sum(link.against for link in links)
     return used >= LEAST and against <= AGAINST * (used + against)

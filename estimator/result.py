@@ -104,6 +104,10 @@ class Loop:
     reason: LoopReason = LoopReason.NEAR
 
 
+WEAK, STRONG = 3.0, 3.5
+"""Deviations below and above which a lamp is too weak, or too strong, for the place."""
+
+
 class LinkState(Enum):
     """What one received lamp is used for, or why it is not."""
 
@@ -139,6 +143,22 @@ class Link:
     gain: float = 0.0
     sigma_gain: float = 0.0
     contradicted: bool = False
+
+    @property
+    def against(self) -> bool:
+        """Whether it speaks against the place, see :func:`speaks_against`."""
+        return speaks_against(self.state, self.residual, self.sigma)
+
+
+def speaks_against(state: LinkState, residual: float | None, sigma: float | None) -> bool:
+    """Whether what is received of a lamp speaks against the place.
+
+    One that only waits to be used again does not. One that is used may: a place that has become vague because nothing
+    fitted it is no more likely than before.
+    """
+    if state not in (LinkState.ACCEPTED, LinkState.OCCLUDED) or residual is None or sigma is None:
+        return state in (LinkState.OCCLUDED, LinkState.REJECTED)
+    return residual < -WEAK * sigma or (state is LinkState.ACCEPTED and residual > STRONG * sigma)
 
 
 class Fix(Enum):

@@ -12,6 +12,7 @@ import numpy as np
 from estimator import se2
 from estimator.atlas import Atlas
 from estimator.frozen import Frozen
+from estimator.hypotheses import Suspicion
 from estimator.keyframe import Keyframe, Submap
 from estimator.livemap import LiveMap
 from estimator.localmap import LocalMap, MapSettings
@@ -93,7 +94,7 @@ class State:
         t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
         t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
         anew: how often the local map was begun anew because nothing fitted the old one.
-        lag: between the stamps of scans and wheels.
+        lag: between the stamps of scans and wheels. suspicion: whether the robot was carried off.
         journal: is told of every match before it is fused, None: nobody asks.
     """
 
@@ -130,6 +131,7 @@ class State:
     t_newest_scan: float = -math.inf
     bearing_rad: Array | None = None
     lag: TimeLag = field(default_factory=TimeLag)
+    suspicion: Suspicion = field(default_factory=Suspicion)
     journal: Journal | None = None
 
 

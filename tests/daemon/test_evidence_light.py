@@ -89,6 +89,14 @@ def test_a_contradiction_is_a_gap_or_lamps_that_do_not_fit(
     assert Watch().light(result(lights, gap=gap), EPOCH).agrees is agrees
 
 
+def test_lamps_that_fit_again_and_wait_to_be_used_do_not_contradict() -> None:
+    fits = replace(links(LinkState.OCCLUDED)[0], residual=0.01, sigma=0.01)
+    hidden, strange = replace(fits, residual=-0.5), replace(fits, state=LinkState.REJECTED)
+    for first, agrees in ((fits, True), (hidden, False), (strange, False)):
+        seen = (*links(LinkState.ACCEPTED, LinkState.ACCEPTED), *[first] * 3)
+        assert Watch().light(result(lit(seen=seen)), EPOCH).agrees is agrees
+
+
 def test_a_jump_after_a_contradiction_has_moved_the_pose_and_another_has_not() -> None:
     watch = Watch()
     assert not watch.light(result(lit(), jumps=1), EPOCH).moved

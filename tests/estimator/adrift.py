@@ -12,7 +12,7 @@ from estimator import se2
 from estimator.atlas import Atlas
 from estimator.keyframe import Submap, keep
 from estimator.pipeline import Settings, new_state, step
-from estimator.records import UNLIMITED, Answer, Array, Command, Job, Odometry, Record
+from estimator.records import UNLIMITED, Answer, Array, Beam, Command, Job, Odometry, Record
 from estimator.result import StepResult
 from estimator.state import State
 from estimator.submap import SIZE, Settled, settle
@@ -97,8 +97,8 @@ class Robot:
     due: list[tuple[int, Job]] = field(default_factory=list)
     scans: int = 0
 
-    def at(self, T: Array, *orders: Command, carried: bool = False) -> StepResult:
-        """One scan at a true pose; the wheels do not see that a robot is carried."""
+    def at(self, T: Array, *orders: Command, carried: bool = False, covered: bool = False) -> StepResult:
+        """One scan at a true pose; the wheels do not see that a robot is carried, nor the lidar while it is covered."""
         self.scans += 1
         ready = [job for scan, job in self.due if scan <= self.scans]
         self.due = [(scan, job) for scan, job in self.due if scan > self.scans]
@@ -108,7 +108,10 @@ class Robot:
         delta = np.zeros(3) if self.T is None or carried else se2.between(self.T, T)
         records.append(Odometry(t, self.t, delta * (1.01, 1.0, 1.0) + self.rng.normal(0.0, 5e-4, 3)))
         self.T = T
-        result = step(self.state, [*records, scan_in(self.scene, T, BEAMS, self.rng, t=self.t)], UNLIMITED)
+        seen = scan_in(self.scene, T, BEAMS, self.rng, t=self.t)
+        if covered:
+            seen.range_m[:], seen.beam[:] = 0.0, Beam.NONE
+        result = step(self.state, [*records, seen], UNLIMITED)
         self.due += [(self.scans + self.late, job) for job in result.jobs]
         return result
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
@@ -143,6 +144,18 @@ def test_every_point_is_on_the_axis_once_and_in_order(n: int) -> None:
     np.testing.assert_allclose(axis.rows[:, :2], points[axis.label] - centre)
     for low, high in zip(axis.start[:-1], axis.start[1:], strict=True):
         assert (np.diff(axis.rows[low:high, 2]) >= 0.0).all()
+
+
+def test_axes_that_are_gone_leave_nothing() -> None:
+    cloud = np.random.default_rng(0).normal(0.0, 5.0, (4000, 2))
+    build_axis(cloud[:100], np.zeros(2))
+    tracemalloc.start()
+    try:
+        for n in range(100, 4000, 24):  # a number of sectors for each
+            build_axis(cloud[:n], np.zeros(2))
+        assert tracemalloc.get_traced_memory()[0] < 50_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_turn_grows_with_the_angle() -> None:

@@ -12,7 +12,7 @@ from estimator.cdma_epoch import BlockFlag
 from estimator.lamps import Survey
 from estimator.records import Array, Imu
 from estimator.result import Fix, LightsResult, LinkState
-from tests.estimator.light_room import LAMPS, SURVEY, Room, circle, drive, wheels
+from tests.estimator.light_room import LAMPS, RECEIVER, SURVEY, Room, circle, drive, wheels
 from tools.sim.lightrun import room_run
 
 pytestmark = pytest.mark.jit
@@ -55,6 +55,19 @@ def test_it_starts_by_itself_and_finds_place_and_heading() -> None:
     assert heading < math.radians(3.0)
     assert results[-1].accepted
     assert results[-1].accepted <= {lamp.lamp_id for lamp in LAMPS}
+
+
+def test_a_start_that_is_decided_keeps_nothing_of_the_other_hypotheses() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    shared = set()
+    for _, odometry, epoch in drive(Room(), circle, 10.0):
+        lf.predict(filter_, odometry)
+        if lf.update(filter_, epoch).fix is Fix.GOOD:
+            break
+        shared |= {id(track.P.base) for track in filter_.tracks if len(filter_.tracks) > 1}
+    assert len(shared) == 1
+    assert len(filter_.tracks) == 1
+    assert filter_.tracks[0].P.base is None
 
 
 def test_standing_still_it_says_that_it_does_not_know_the_heading() -> None:
@@ -173,6 +186,64 @@ def test_without_odometry_it_follows_by_constant_velocity() -> None:
     assert result.fix is Fix.GOOD
     assert np.median([e for e, _ in errors[200:]]) < 0.08
     assert np.median([h for _, h in errors[200:]]) < math.radians(8.0)
+
+
+def test_without_odometry_a_lamp_that_somebody_hides_is_paused_too() -> None:
+    filter_, during, worst = lf.new_lights(SURVEY), set[LinkState | None](), 0.0
+    for k in range(1, 500):
+        t = 0.05 * k
+        room = Room(seed=k, cover=lambda lamp, t: 0.03 if 15.0 < t < 19.0 and lamp == 6 else 1.0)
+        result = lf.update(filter_, room.epoch(t, circle(t)))
+        if t > 15.0:
+            worst = max(worst, off(result, circle(t))[0])
+        if 15.1 < t < 18.9:
+            during.add(states(result).get(6))
+    assert during == {LinkState.OCCLUDED}
+    assert worst < 0.03
+
+
+def test_without_odometry_a_robot_that_was_carried_off_finds_itself_as_soon() -> None:
+    filter_ = lf.new_lights(SURVEY)
+    for k in range(1, 360):
+        t = 0.05 * k
+        pose = circle(
+            t if t < 15.0 else t + 15.0
+        )  # its place grows vague while nothing fits it, and is no better for that
+        result = lf.update(filter_, Room(seed=k).epoch(t, pose))
+    assert off(result, pose)[0] < 0.15
+
+
+def on_the_spot(t: float) -> Array:
+    """Stands for a second, then turns by a radian a second, 2 cm beside its middle."""
+    turned = max(t - 1.0, 0.0)
+    away = 0.02 * np.array((math.sin(turned), 1.0 - math.cos(turned)))
+    return np.array((4.2 + away[0], 5.6 + away[1], se2.wrap(0.3 + turned)))
+
+
+@pytest.mark.parametrize("seed", [2, 4, 5])
+def test_a_robot_that_sways_and_turns_on_the_spot_rules_no_heading_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lamps = [
+        dataclasses.replace(
+            lamp,
+            power_w=lamp.power_w * math.exp(0.05 * rng.standard_normal()),
+            slope_x=0.03 * rng.standard_normal(),
+            slope_y=0.03 * rng.standard_normal(),
+        )
+        for lamp in LAMPS
+    ]
+    begun, filter_ = rng.uniform(0.0, 6.0, 2).tolist(), lf.new_lights(SURVEY)
+    for k in range(1, 80):
+        t = 0.05 * k
+        pitch, roll = 0.01 * math.sin(10.7 * t + begun[0]), 0.01 * math.sin(8.2 * t + begun[1])
+        receiver = dataclasses.replace(RECEIVER, slope_x=pitch, slope_y=roll)
+        room = Room(lamps, dataclasses.replace(SURVEY, receiver=receiver), seed=100 * seed + k)
+        lf.predict(filter_, wheels(on_the_spot, t, 0.05))
+        result = lf.update(filter_, room.epoch(t, on_the_spot(t)))
+    assert result.fix is not Fix.GOOD
+    headings = [float(track.x[ekf.YAW]) for track in filter_.tracks]
+    assert len(headings) > 1
+    assert min(abs(se2.wrap(yaw - float(on_the_spot(t)[2]))) for yaw in headings) < math.radians(20.0)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

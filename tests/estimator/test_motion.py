@@ -99,3 +99,26 @@ def test_an_increment_may_be_a_view_that_cannot_be_written() -> None:
     moving = Motion(t_mono=0.0)
     motion.on_odometry(moving, Odometry(0.0, 1.0, table[:, 0]), NOISE)
     assert moving.T_odom_base.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_what_a_velocity_is_wrong_by_does_not_average_out_over_many_short_carries() -> None:
+    once, often = (driving((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) for _ in range(2))
+    for moving in (once, often):
+        moving.t_told, moving.velocity_variance = 10.0, np.array((0.01, 0.01, 0.04))
+    motion.carry_to(once, 10.1, NOISE)
+    for t in np.linspace(10.0, 10.1, 11)[1:]:  # lamps, IMU readings, the scan
+        motion.carry_to(often, float(t), NOISE)
+    np.testing.assert_allclose(np.diag(often.P), np.diag(once.P), rtol=1e-6)
+    assert np.sqrt(once.P[2, 2]) == pytest.approx(np.hypot(0.2 * 0.1, 2.0 * 0.1**2), rel=1e-6)
+
+
+def test_a_velocity_that_no_scan_confirms_is_doubted_by_what_it_loses() -> None:
+    moving = driving((0.0, 0.0, 0.0), (0.0, 0.0, 2.0))
+    moving.t_told, moving.velocity_variance = 10.0, np.full(3, 0.01)
+    for k in range(1, 4):
+        motion.carry_to(moving, 10.0 + 0.1 * k, NOISE)
+        motion.slow_down(moving)
+    assert moving.velocity[2] == pytest.approx(2.0 * 0.8**3)
+    assert moving.velocity_variance[2] == pytest.approx(0.01 + 4.0 * (1.0 - 0.8**6))
+    turned = 2.0 * 0.3 - float(moving.T_odom_base[2])  # had it gone on at its velocity
+    assert turned < 1.5 * np.sqrt(moving.P[2, 2])

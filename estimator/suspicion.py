@@ -1,0 +1,151 @@
+"""Whether the robot may have been carried off though scans fit again: then its place has to stand a search of the map.
+
+The laser follows the robot from scan to scan, and where the surroundings repeat it follows it into the wrong place. It
+is suspected where physics says that something else than driving has happened:
+
+* a match moves the pose farther than any driving can have in that time;
+* the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
+  seen afterwards is not what was seen before.
+
+One look in the whole map then decides: if another place fits nearly as well the robot is adrift. So it is after a jump
+where the place does not hold, there or in the local map; all else may have been a door, or somebody who sat and left.
+Until the answer has come nothing is laid into the map. Where light has placed it light is the witness, see
+`adrift.doubt`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Final
+
+from estimator import adrift, keyframe, localmap, relocate, se2
+from estimator.atlas import LOOK
+from estimator.fusion import noise_of
+from estimator.hypotheses import BEHIND
+from estimator.keyframe import Keyframe
+from estimator.linear3 import invert3
+from estimator.records import Array, Odometry, Scan
+from estimator.relocate import Looked, Piece, Query, Verdict
+from estimator.result import MatchResult
+from estimator.scanpoints import ScanPoints
+from estimator.state import State
+
+SURPRISE: Final = 25.0
+"""Squared Mahalanobis distance of a correction that no driving explains; as that of `matching.demand_on`."""
+FASTEST: Final = (1.0, 2.0)
+"""m/s, rad/s. No robot indoors drives so much faster than wheels, or its velocity, say; but wheels slip in turns, and
+stamps come late."""
+ROW: Final = 3
+"""Scans in a row that do not fit, and then do; so many more, before the place is looked for: the first that fits may be
+of two places, or blurred."""
+UNWATCHED_S, MISSED = 0.5, 4.0
+"""Long enough to be lifted and put down, also counted in scans: a few that are lost are no news."""
+CHANGED: Final = 0.1
+"""Share of the beams by which what is seen fits worse than before, where it is not the same."""
+LEARNING: Final = 0.1
+"""Share of the latest match in what is usual: the time between two, and how many beams fit."""
+STILL_M, STILL_RAD = 0.002, 0.002
+"""Wheels that turn by no more between two readings stand."""
+NODES: Final = 1_000_000
+"""A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
+310 thousand."""
+PATIENCE_S: Final = 2.0
+"""An answer that has not come by then is not waited for: the map must go on."""
+
+
+def on_odometry(state: State, record: Odometry) -> None:
+    """Take in how long the wheels stand."""
+    doubt = state.suspicion
+    x, y, yaw = record.delta.tolist()
+    still = math.hypot(x, y) <= STILL_M and abs(yaw) <= STILL_RAD
+    doubt.still_s = doubt.still_s + record.t_end - record.t_begin if still else 0.0
+    doubt.unwatched_s = max(doubt.unwatched_s, doubt.still_s)
+
+
+def waits(state: State) -> bool:
+    """Whether nothing may be laid into the map now, because the robot may be elsewhere."""
+    doubt = state.suspicion
+    looking = doubt.job in state.atlas.asked and state.fused.t_mono - doubt.t_asked < PATIENCE_S
+    return looking or doubt.fitted > 0
+
+
+def raised(state: State, match: MatchResult) -> bool:
+    """Whether the place is to be looked for now; to be asked before the match is fused."""
+    doubt, atlas = state.suspicion, state.atlas
+    if not match.ok or state.local is None:
+        return False
+    alone = unwatched(state)
+    lit = state.absolute is not None and state.absolute.placed
+    if lit or atlas.adrift is not None or state.settings.loops is None or doubt.job in atlas.asked:
+        doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
+        return False
+    share, odd = match.inliers / max(1, match.queries), surprising(state, match)
+    made = se2.between(state.T_odom_scan, match.T_odom_base)  # wheels that lie move the prediction, not the robot
+    jump = odd and all(too_far(T, state.fused.t_mono - state.t_match) for T in (match.correction, made))
+    doubt.jumped |= jump
+    if doubt.fitted or alone or jump or state.failures >= ROW:
+        doubt.odd |= odd
+        doubt.fitted += 1
+    else:
+        doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
+    if doubt.fitted >= ROW and not doubt.odd and share > doubt.share - CHANGED:
+        doubt.fitted = 0  # the same picture from the same place
+    return doubt.fitted >= ROW
+
+
+def unwatched(state: State) -> bool:
+    """Whether the robot has stood, or nobody knows, for long without a match; another one has come now."""
+    doubt, since = state.suspicion, state.fused.t_mono - state.t_match
+    usual, alone_s = doubt.period_s, min(doubt.unwatched_s, since) if state.fused.odometry else since
+    doubt.still_s = doubt.unwatched_s = 0.0
+    if math.isfinite(since):
+        doubt.period_s = (1.0 - LEARNING) * usual + LEARNING * min(since, 2.0 * usual) if usual else since
+    return usual > 0.0 and alone_s >= max(UNWATCHED_S, MISSED * usual)
+
+
+def surprising(state: State, match: MatchResult) -> bool:
+    """Whether a match has moved the pose farther than the prediction allows."""
+    off = match.correction
+    return float(off @ invert3(state.fused.P) @ off) > SURPRISE
+
+
+def too_far(moved: Array, dt: float) -> bool:
+    """Whether a pose has moved (x, y, yaw) farther than a robot can drive in ``dt`` seconds."""
+    x, y, yaw = moved.tolist()
+    v, w = FASTEST
+    return math.hypot(x, y) > relocate.SAME_M + v * dt or abs(yaw) > relocate.SAME_RAD + w * dt
+
+
+def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> None:
+    """Ask whether the place, after the match is fused, stands a search of the whole map."""
+    atlas, told, doubt = state.atlas, state.settings.loops, state.suspicion
+    assert told is not None
+    assert state.local is not None
+    T = state.fused.T_odom_base
+    frame = keyframe.keep(state.next_key, se2.compose(state.T_map_odom, T), T, scan, points.turned_rad)
+    against = localmap.contradicted(state.local, frame.T_odom_lidar, frame.beams(), noise_of(state, scan))
+    share = match.inliers / max(1, match.queries)
+    holds = relocate.judged(match, share, against, told) is Verdict.HOLDS
+    jump = doubt.jumped
+    doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
+    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
+    if pieces:
+        query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=NODES)
+        then = partial(answered, state, frame, holds or not jump)
+        doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), then)
+        doubt.t_asked = state.fused.t_mono
+    elif jump:  # nothing of the map is finished yet that could be searched
+        adrift.afresh(state)
+
+
+def answered(state: State, frame: Keyframe, holds: bool, payload: object) -> None:
+    """Be adrift if the place is not the only one, or does not hold; ``holds``: it does, or need not."""
+    assert isinstance(payload, Looked)
+    if state.atlas.adrift is not None or frame.key != state.next_key:
+        return  # the map has been begun anew meanwhile, or went on without an answer
+    here = payload.guesses[0]
+    least = max(relocate.LEAST, here.share - BEHIND)
+    alone = all(fit.share < least for fit, _ in payload.fresh)
+    if not alone or not (holds or here.verdict is Verdict.HOLDS):
+        adrift.afresh(state)

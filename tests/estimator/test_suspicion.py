@@ -1,0 +1,131 @@
+"""A robot that is carried off and goes on fitting its map: where the surroundings repeat its place is not believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from estimator import se2
+from estimator.pipeline import new_state
+from estimator.records import Array
+from tests.estimator.adrift import Robot, furnished, way
+from tools.bench._scenes import Scene, box
+
+pytestmark = pytest.mark.jit
+
+IMAGE = Scene(np.array(box(-3.0, -2.0, 3.0, 2.0), dtype=np.float64), (-2.5, -1.5), (2.5, 1.5))
+"""Turned by half a turn it looks the same from everywhere."""
+ABOUT = ((-1.5, -1.0), (1.5, -1.0), (1.5, 1.0), (-1.5, 1.0), (-1.5, -1.0), (1.5, -1.0), (1.5, 0.5))
+OTHER_END = np.array((0.0, 0.0, np.pi))
+HALL = ((1.0, 6.0), (10.8, 6.0))
+TOUR = (*HALL, (1.85, 6.0), (1.85, 1.5), (1.85, 6.0), (5.85, 6.0))
+
+
+def driven(scene: Scene, corners: Iterable[tuple[float, float]], step_m: float = 0.08, young: bool = False) -> Robot:
+    """A robot that was switched on at the first corner, has come to the last one, and knows its place.
+
+    ``young``: nothing of its map is finished yet.
+    """
+    poses = way(tuple(corners), step_m)
+    state = new_state()
+    state.T_map_odom = poses[0].copy()  # the map's frame is the building's
+    robot = Robot(state, scene)
+    said = [robot.at(T).places for T in poses]
+    assert set(said) == {None}
+    assert robot.off()[0] < 0.1
+    assert bool(state.atlas.settled()) is not young
+    return robot
+
+
+def stand(robot: Robot, T: Array, scans: int, covered: bool = False) -> list[int | None]:
+    """What is said while the robot stands; the first scan may be from another place than the one before."""
+    return [robot.at(T, carried=k == 0, covered=covered).places for k in range(scans)]
+
+
+def test_put_down_near_the_other_end_of_a_room_that_is_its_own_image() -> None:
+    """From one scan to the next: it fits there perfectly, but no wheel has moved the robot by that much."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    said = stand(robot, there, 20)
+    assert None not in said[8:]
+    x, y, yaw = there.tolist()
+    ahead = (x + np.cos(yaw), y + np.sin(yaw))
+    said = [robot.at(T).places for T in way(((x, y), ahead, (0.0, 0.0)), 0.06)]
+    assert None not in said, "no way through that room tells its ends apart"
+    assert said[-1] == 2
+
+
+def test_put_down_close_to_the_image_of_its_place_while_the_lidar_was_covered() -> None:
+    """No hand puts it there to the centimetre, and wheels that stand have not moved it by a foot."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((0.2, 0.1, 0.1))))
+    stand(robot, there, 15, covered=True)
+    said = stand(robot, there, 15)
+    assert said[-1] is not None
+    assert said[-1] == 2
+
+
+def test_in_a_map_of_which_nothing_is_finished_a_jump_is_enough_and_a_covered_lidar_is_not() -> None:
+    """There is nothing to be searched: what proves that it was carried counts, what only lets it be does not."""
+    robot = driven(IMAGE, ABOUT[:2], young=True)
+    assert robot.T is not None
+    here = robot.T
+    stand(robot, here, 15, covered=True)
+    assert set(stand(robot, here, 10)) == {None}
+    said = stand(robot, se2.compose(OTHER_END, se2.compose(here, np.array((0.6, 0.1, 0.2)))), 15)
+    assert None not in said[6:]
+
+
+@pytest.mark.parametrize("scans", [4, 15, 60])
+def test_a_covered_lidar_takes_nothing_from_a_place_that_is_like_no_other(scans: int) -> None:
+    robot = driven(furnished(), TOUR)
+    assert robot.T is not None
+    here = robot.T
+    stand(robot, here, scans, covered=True)
+    assert set(stand(robot, here, 20)) == {None}
+    assert robot.state.suspicion.t_asked < 0.0, "it sees what it saw"
+    laid = robot.state.next_key
+    for T in way(((5.85, 6.0), (5.85, 1.5)), 0.08):
+        assert robot.at(T).places is None
+    assert robot.state.next_key > laid, "and the map goes on"
+    assert robot.off()[0] < 0.1
+
+
+def test_wheels_that_turn_while_the_lidar_is_covered_say_that_nobody_carries_the_robot() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    poses = [se2.compose(robot.T, np.array((-0.03 * k, 0.0, 0.0))) for k in range(1, 26)]
+    for T in poses[:15]:
+        robot.at(T, covered=True)
+    assert {robot.at(T).places for T in poses[15:]} == {None}
+
+
+def test_people_who_stand_about_and_leave_are_no_reason() -> None:
+    """They hide walls, and take away nothing that many scans have proved."""
+    plain = furnished()
+    robot = driven(plain, TOUR)
+    assert robot.T is not None
+    for k in range(120):
+        x, y = 5.0 + 0.02 * k, 6.45 - 0.1 * np.sin(0.2 * k)
+        legs = np.array(box(x, y, x + 0.12, y + 0.12) + box(x + 0.3, y - 0.2, x + 0.42, y - 0.08), dtype=np.float64)
+        robot.scene = Scene(np.vstack((plain.walls, legs)), plain.low, plain.high) if 20 < k < 100 else plain
+        assert robot.at(robot.T).places is None
+    assert robot.state.suspicion.t_asked < 0.0
+
+
+def test_a_lidar_that_turns_once_a_second_is_no_covered_one() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    state, here, asked = robot.state, robot.T, robot.state.suspicion.t_asked
+    for _ in range(30):
+        robot.t += 0.9
+        robot.at(here)
+    later = state.suspicion.t_asked
+    for _ in range(30):
+        robot.t += 0.9
+        assert robot.at(here).places is None
+    assert later == state.suspicion.t_asked == asked
