@@ -126,7 +126,7 @@ def _recording(body: Body) -> Body:
 def _check(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
     config_arguments(parser, file=False)
-    parser.set_defaults(body=later("daemon.check", "main"))
+    parser.set_defaults(body=loaded("daemon.check", "main"))  # it resolves the configuration itself
 
 
 def _probe(parser: argparse.ArgumentParser) -> None:

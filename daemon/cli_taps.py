@@ -122,6 +122,13 @@ def _hertz(text: str) -> float:
     return rate
 
 
+def _megabytes(text: str) -> float:
+    size = float(text)
+    if not 0.0 <= size < 1e12:
+        raise argparse.ArgumentTypeError(f"{text} MB: name 0 (fill the disk) or more")
+    return size
+
+
 def _plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP", help="floor plan: map_server's YAML or PGM, or a *.lumimap")
     parser.add_argument("--height", type=float, default=2.5, metavar="M", help="of the lamps above the floor; 2.5")
@@ -160,6 +167,9 @@ def _record_mcap(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--raw", action="store_true", help="also the bytes between daemon and devices")
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after so long; default: when interrupted")
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    parser.add_argument(
+        "--reserve", type=_megabytes, default=200.0, metavar="MB", help="stop while so much is free; default: 200"
+    )
     listening(parser)
     parser.set_defaults(body=needing("mcap", "taps.record_mcap", "main"))
 

@@ -340,7 +340,7 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         for index, network in enumerate(self.allow):
             _named(f"allow[{index}]", parse_network, network)
         if not self.lidar.fitted and not self.photodiode.fitted:
-            raise ValueError("Expected a lidar or a photodiode: `lidar.device` is none and `photodiode.bus` is empty")
+            raise ValueError("Expected a lidar, because `photodiode.bus` is empty, in `lidar.device`, got `none`")
         if self.modbus.serial and self.lidar.place.device == parse_line(self.modbus.serial).path:
             raise ValueError(f"Expected another line than the lidar's in `modbus.serial`, got `{self.modbus.serial}`")
         self._check_ports()

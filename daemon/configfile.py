@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from daemon.config import Config
-from daemon.configwords import MOVED, Option, options, problems, value_text
+from daemon.configwords import MOVED, Option, Wrong, options, problems, value_text
 from daemon.endpoints import AUTO
 from daemon.wholefile import write_whole
 
@@ -52,7 +52,16 @@ All keys with their defaults, ready to paste:
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; each line of the text says where, what was expected and what to do."""
+    """The configuration cannot be used; each line of the text says where, what was expected and what to do.
+
+    Attributes:
+        rest: the configuration without what is wrong; None: nothing is left that could be judged.
+        wrong: the keys that are.
+    """
+
+    def __init__(self, text: str, rest: Config | None = None, wrong: frozenset[str] = frozenset()) -> None:
+        super().__init__(text)
+        self.rest, self.wrong = rest, wrong
 
 
 def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
@@ -74,12 +83,20 @@ def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
         try:
             _lay_over(tree, override)
         except ConfigError as error:
-            found.append(str(error))
+            found.append(Wrong(str(error), ""))
         else:
             found += problems(tree, f"--set {override}")
     if found:
-        raise ConfigError("\n".join(found))
+        told = "\n".join(wrong.text for wrong in found)
+        raise ConfigError(told, _rest(tree, file), frozenset(wrong.path for wrong in found))
     return _anchored(msgspec.convert(tree, Config), file)
+
+
+def _rest(tree: dict[str, Any], file: Path | None) -> Config | None:
+    try:
+        return _anchored(msgspec.convert(tree, Config), file)
+    except msgspec.ValidationError:
+        return None  # what is wrong is not one key, which could be left out
 
 
 def _anchored(config: Config, file: Path | None) -> Config:

@@ -46,49 +46,59 @@ class Option:
 class _Problem:
     """What is wrong: ``keys`` lead to it through the tree, empty where it is not one key; ``words`` say it.
 
-    ``beside``: what names the other keys that it is about.
+    ``beside``: what names the other keys that it is about. ``item``: which one of a list it is; None: all of it.
     """
 
     keys: tuple[str, ...]
     words: str
     beside: str = ""
+    item: int | None = None
 
 
-def options() -> list[Option]:
-    """Every option of the tree in order of declaration."""
+@dataclass(frozen=True, slots=True)
+class Wrong:
+    """One thing that is wrong: the line that says it, and the key (empty where it is not one)."""
+
+    text: str
+    path: str
+
+
+def options(tree: type[msgspec.Struct] = Config) -> list[Option]:
+    """Every option of a tree in order of declaration."""
     from msgspec import inspect  # costs 10 ms, and only explanations need it
 
-    kind = inspect.type_info(Config)
+    kind = inspect.type_info(tree)
     assert isinstance(kind, inspect.StructType)
     return list(_walk(kind, ""))
 
 
-def problems(tree: dict[str, Any], name: str, text: str = "") -> list[str]:
-    """Everything that is wrong with a tree, a line each; what is wrong is taken out, so that the rest can be judged.
+def problems(tree: dict[str, Any], name: str, text: str = "") -> list[Wrong]:
+    """Everything that is wrong with a tree; what is wrong is taken out, so that the rest can be judged.
 
     Args:
         tree: as TOML holds it; good afterwards, where each problem is that of one key.
         name: of the file or the option that it comes from.
         text: of that file, for the numbers of lines.
     """
-    found: list[tuple[int, str]] = []
+    found: list[tuple[int, Wrong]] = []
     gone: list[str] = []
 
     def tell(problem: _Problem) -> None:
         path = ".".join(problem.keys)
         if not any(f"`{key}`" in problem.beside for key in gone):  # else it is about the value that stands in for that
-            found.append((_line_of(text, path), problem.words))
+            line = _line_of(text, path)
+            found.append((line, Wrong(f"{name}:{line}: {problem.words}" if line else f"{name}: {problem.words}", path)))
         gone.append(path)
 
     for nul in list(_nul(tree, ())):
         tell(nul)
-        _take_out(tree, nul.keys)
+        _take_out(tree, nul)
     while (problem := _first(tree)) is not None:
         tell(problem)
-        if not _take_out(tree, problem.keys):
+        if not _take_out(tree, problem):
             break
     found.sort(key=lambda one: one[0])
-    return [f"{name}:{line}: {words}" if line else f"{name}: {words}" for line, words in found]
+    return [wrong for _, wrong in found]
 
 
 def _first(tree: dict[str, Any]) -> _Problem | None:
@@ -100,11 +110,16 @@ def _first(tree: dict[str, Any]) -> _Problem | None:
     return None
 
 
-def _take_out(tree: dict[str, Any], keys: tuple[str, ...]) -> bool:
-    """Whether there was such a key."""
-    for key in keys[:-1]:
+def _take_out(tree: dict[str, Any], problem: _Problem) -> bool:
+    """Whether there was such a key; of a list the other items stay, beside the example's first."""
+    for key in problem.keys[:-1]:
         tree = tree.get(key, {})
-    return bool(keys) and tree.pop(keys[-1], None) is not None
+    if not problem.keys or (value := tree.pop(problem.keys[-1], None)) is None:
+        return False
+    if problem.item is not None:
+        example = next(option.example for option in options() if option.path == ".".join(problem.keys))
+        tree[problem.keys[-1]] = [*value[: problem.item], example[0], *value[problem.item + 1 :]]
+    return True
 
 
 def _nul(tree: dict[str, Any], parents: tuple[str, ...]) -> Iterator[_Problem]:
@@ -129,25 +144,32 @@ def _explain(message: str, tree: dict[str, Any]) -> _Problem:
         path = ".".join(keys)
         moved = f"`{path}` is now part of `lidar.device`: {MOVED.get(path)}"
         table = isinstance(_value(tree, place).get(unknown[1]), dict)
-        return _Problem(keys, moved if path in MOVED else f"unknown key `{_written(keys)}`{_nearest(path, table)}")
+        return _Problem(keys, moved if path in MOVED else f"unknown key `{written(keys)}`{_nearest(path, table)}")
     known = {option.path: option for option in options()}
     if (option := known.get(".".join(keys))) is not None:
-        expected = re.sub("^(?=whole|number|list)", "a ", option.kind)
-        return _Problem(keys, f"`{place}` = {_found(tree, place)}: expected {expected}{_purpose(option)}")
+        return _Problem(keys, wrong_value(place, _value(tree, place), option), item=_item(place))
     if keys and not isinstance(_value(tree, place), dict):
         inside = ", ".join(sorted({path[len(place) + 1 :].split(".")[0] for path in known if path.startswith(place)}))
-        return _Problem(keys, f"`{place}` = {_found(tree, place)}: expected a table, [{place}], of {inside}")
+        found = _found(_value(tree, place))
+        return _Problem(keys, f"`{place}` = {found}: expected a table, [{place}], of {inside}")
     for inner in re.finditer(r"`([a-z_.]+)((?:\[\d+\])?)`(?=, got|$)", message):
         path = f"{place}.{inner[1]}".lstrip(".")
         if (option := known.get(path)) is not None:
             said = re.sub(f",? in {re.escape(inner[0])}", "", message).replace("Expected", "expected", 1)
-            return _Problem(tuple(path.split(".")), f"`{path}{inner[2]}`: {said}{_purpose(option)}", said)
+            words = f"`{path}{inner[2]}`: {said}{_purpose(option)}"
+            return _Problem(tuple(path.split(".")), words, said, _item(inner[2]))
     return _Problem(keys, message, message)
 
 
 def _keys(place: str) -> tuple[str, ...]:
     """Keys of a place without what counts items of lists."""
     return tuple(re.sub(r"\[\d+\]", "", place).split(".")) if place else ()
+
+
+def _item(place: str) -> int | None:
+    """Which item of a list a place is in."""
+    number = re.search(r"\[(\d+)\]", place)
+    return None if number is None else int(number[1])
 
 
 def _value(tree: Any, place: str) -> Any:
@@ -157,8 +179,14 @@ def _value(tree: Any, place: str) -> Any:
     return tree
 
 
-def _found(tree: dict[str, Any], place: str) -> str:
-    text = value_text(_value(tree, place))
+def wrong_value(place: str, value: object, option: Option) -> str:
+    """What is said of a value that its key cannot have: what was found, what is allowed, what it is for, an example."""
+    expected = re.sub("^(?=whole|number|list)", "a ", option.kind)
+    return f"`{place}` = {_found(value)}: expected {expected}{_purpose(option)}"
+
+
+def _found(value: object) -> str:
+    text = value_text(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
@@ -167,7 +195,7 @@ def _purpose(option: Option) -> str:
     return f" ({option.description}); as in {key} = {value_text(option.example)}"
 
 
-def _written(keys: tuple[str, ...]) -> str:
+def written(keys: tuple[str, ...]) -> str:
     """A key as TOML writes it: quotes show that a dot within them divides nothing."""
     return ".".join(key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else value_text(key) for key in keys)
 
@@ -222,9 +250,11 @@ def _walk(kind: inspect.StructType, prefix: str) -> Iterator[Option]:
 
 
 def _told(kind: inspect.Type) -> dict[str, Any]:
-    """What `daemon.config` says of a key."""
+    """What the tree says of a key."""
     from msgspec import inspect
 
+    if isinstance(kind, inspect.UnionType):  # of something, or nothing
+        return _told(kind.types[0])
     return dict(kind.extra_json_schema or {}) if isinstance(kind, inspect.Metadata) else {}
 
 
@@ -233,11 +263,15 @@ def _kind(kind: inspect.Type) -> str:
 
     if isinstance(kind, inspect.Metadata):
         return _kind(kind.type)
+    if isinstance(kind, inspect.UnionType):
+        return _kind(kind.types[0])
     if isinstance(kind, (inspect.IntType, inspect.FloatType)):
         name = "whole number" if isinstance(kind, inspect.IntType) else "number"
         return f"{name}, {kind.ge} to {kind.le}" if kind.ge is not None and kind.le is not None else name
     if isinstance(kind, inspect.BoolType):
         return "true or false"
+    if isinstance(kind, inspect.StructType):
+        return "table"
     if isinstance(kind, inspect.VarTupleType):
         return f"list of {_kind(kind.item_type)}"
     if isinstance(kind, inspect.TupleType):
@@ -254,5 +288,7 @@ def value_text(value: object) -> str:
         return repr(value)
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(value_text(item) for item in value) + "]"
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{written((key,))} = {value_text(item)}" for key, item in value.items()) + " }"
     # a JSON string is a TOML basic string, except that TOML wants DEL escaped too
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007F")

@@ -39,6 +39,7 @@ __all__ = [
     "load_lights",
     "lost_residuals",
     "new_state",
+    "read_residuals",
 ]
 
 HEADER: Final = "lights"
@@ -90,11 +91,11 @@ def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | No
     survey = read_survey(Path(path), profile) if path else Survey(depth=profile.depth)
     if not settings.photodiode.fitted:
         return None
-    return Lights(survey, profile, clock_ppm, _residuals(Path(path)) if path else b"")
+    return Lights(survey, profile, clock_ppm, read_residuals(Path(path)) if path else b"")
 
 
-def _residuals(survey: Path) -> bytes:
-    """Content of the map beside a survey, empty where there is none."""
+def read_residuals(survey: Path) -> bytes:
+    """Content of the map beside a survey, empty where there is none; raises `SurveyError`."""
     path = residuals_beside(survey)
     try:
         return path.read_bytes()

@@ -20,7 +20,8 @@ from daemon.planning.hall import Array, Hall, NoHall, read_hall
 from daemon.planning.sight import Fitting
 from daemon.planning.walls import KNOWN_SIGMA_M, wall_information
 from daemon.results import Folder, OutputRefused
-from daemon.surveyfile import SurveyError, dump, last_code, read_survey
+from daemon.surveyfile import SurveyError, dump, read_survey
+from daemon.surveytree import last_code
 from estimator.lamps import Lamp, Receiver, Survey
 
 HEADROOM_M: Final = 0.2

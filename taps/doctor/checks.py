@@ -13,13 +13,12 @@ from typing import Final
 from daemon.check import Maps, implausible, look_at_maps
 from daemon.config import Config
 from daemon.endpoints import ANYBODY, AUTO, parse_endpoint, subscription_port
-from daemon.folders import can_be_made, maps_folder, runtime_folder, state_folder
+from daemon.folders import can_be_made, maps_folder, runtime_folder, state_folder, stream_path
 from daemon.probe import is_bus
 from daemon.publish.snapshot import LinkUse, State
 from daemon.surveyfile import SurveyError, read_survey
 from hal.inet import refusal
 from taps.doctor.host import Heard, Host
-from taps.stream import path_of
 
 FREE_BYTES: Final = 200 << 20
 """A map of a large building, twice, and some recording."""
@@ -256,11 +255,10 @@ def maps(case: Case) -> Iterator[Finding]:
     if not settings.map.kept:
         yield remark("maps", "are not kept: `map.folder` is none")
         return
-    try:
-        found, text = look_at_maps(settings)
-    except SurveyError:
-        return  # said by the check of the survey
-    if found in (Maps.BROKEN, Maps.FROZEN):
+    found, text = look_at_maps(settings)
+    if found is Maps.TAKEN and not case.runs:
+        yield fix("maps", text, "end it, or name another folder in map.folder")
+    elif found in (Maps.BROKEN, Maps.FROZEN):
         yield fix("maps", text, "make the folder yours, or name another in map.folder")
     elif settings.map.localise and found is not Maps.READY:
         yield fix("maps", f"{text}; map.localise asks for one", "map first, or set map.localise = false")
@@ -358,7 +356,7 @@ def sockets(case: Case) -> Iterator[Finding]:
     folder = runtime_folder()
     if not case.runs and case.host.exists(str(folder)) and not case.host.usable(str(folder)):
         remedy = "start it as the user whose folder it is, or set RUNTIME_DIRECTORY"
-        yield fix("stream", f"{path_of(case.settings.name)} cannot be made by {case.host.user()}", remedy)
+        yield fix("stream", f"{stream_path(case.settings.name)} cannot be made by {case.host.user()}", remedy)
 
 
 CHECKS: Final[tuple[Check, ...]] = (

@@ -7,9 +7,9 @@ import json
 import sys
 
 from daemon import cli, configfile
+from daemon.folders import stream_path
 from taps.doctor.checks import CHECKS, Case, Finding, Level
 from taps.doctor.host import Host
-from taps.stream import path_of
 
 _WORDS = {Level.GOOD: "good", Level.REMARK: "note", Level.FIX: "FIX"}
 
@@ -27,7 +27,7 @@ def examine(args: argparse.Namespace, host: Host) -> int:
         wrong = Finding("configuration", Level.FIX, str(error), "mend it; nothing else can be judged before")
         _tell([wrong], args.json)
         return cli.USAGE
-    case = Case(settings, args.config, host, host.listen(args.stream or path_of(settings.name)))
+    case = Case(settings, args.config, host, host.listen(args.stream or stream_path(settings.name)))
     found = [finding for check in CHECKS for finding in check(case)]
     _tell(found, args.json)
     return cli.FAILED if any(finding.level is Level.FIX for finding in found) else cli.OK

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,49 @@ def test_a_code_that_the_profile_does_not_have_is_refused(
     assert str(last) in said
 
 
+def test_all_that_is_wrong_is_told_in_one_round(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The configuration, the survey that it names, and the map that it asks for."""
+    bad = SURVEY.replace("code = 5", "code = 5000").replace("z = 2.6", "z = 900", 1)
+    file = write(tmp_path, bad, bus="i2c-1")
+    maps = tmp_path / "maps"
+    with file.open("a") as more:
+        more.write(f'[modbus]\nprt = 3\n[map]\nfolder = "{maps}"\nlocalise = true\n')
+    assert cli.main(["check", str(file), "--set", "odometry.port=x"]) == cli.USAGE
+    said = capsys.readouterr().err
+    assert [
+        line.replace(f"{tmp_path.resolve()}/", "").removeprefix("lumiloop: ").split(": ")[0]
+        for line in said.splitlines()
+    ] == [
+        "robot.toml:2",
+        "robot.toml:6",
+        "--set odometry.port=x",
+        "lights.toml:3",
+        "lights.toml:3",
+        "maps",
+    ]
+    (tmp_path / "lights.toml").unlink()
+    assert cli.main(["check", str(file)]) == cli.USAGE
+    assert "lights.toml: no such survey" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "silent"),
+    [("profile = 'C'", "is none of profile"), ("profile = 'A'\n[lights]\nsurvey = 3", "is none of")],
+)
+def test_what_hangs_on_a_wrong_key_is_not_judged(
+    tmp_path: Path, line: str, silent: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "lights.toml").write_text(SURVEY.replace("code = 17", "code = 400"))
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        f"lights.survey = 'lights.toml'\n[photodiode]\n{line}\n" if "lights" not in line else f"[photodiode]\n{line}\n"
+    )
+    assert cli.main(["check", str(file)]) == cli.USAGE
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert silent not in said
+
+
 def test_a_survey_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path)
     (tmp_path / "lights.toml").unlink()
@@ -124,3 +168,24 @@ def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureF
     (maps / "map-00000007-00000001.lumimap").unlink()
     assert f"{maps}: no map in it can be used" in said()
     assert [path.name for path in maps.glob("*.lumimap*")] == ["map-00000007-00000002.lumimap"], "nothing is moved"
+
+
+def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maps, file = tmp_path / "maps", tmp_path / "robot.toml"
+    file.write_text(f'[map]\nfolder = "{maps}"\n')
+    other = Store(maps)
+    other.claim()
+
+    def said(*more: str) -> str:
+        assert cli.main(["check", str(file), *more]) == cli.OK
+        return capsys.readouterr().out
+
+    words = f"; process {os.getpid()} keeps its maps there, and no other can (fault 403)"
+    assert f"{maps}: no map in it yet{words}" in said()
+    other.save(content(Shape(submaps=3, map_id=7)), 7)
+    assert f"of 3 submaps is good{words}" in said()
+    assert "403" not in said("--set", "map.localise=true"), "nothing is kept then"
+    other.close()
+    assert "403" not in said()
+    (maps / "lock").chmod(0o444)
+    assert ("403" in said()) is (os.geteuid() != 0), "root may write everywhere"

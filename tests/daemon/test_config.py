@@ -175,7 +175,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
             "robot.toml:3: `photodiode.level`: expected chip@address/channel beside the converter, got",
         ),
         ("[photodiode]\nprofile = 'C'", "robot.toml:2: `photodiode.profile`: expected one of A, B, D, got `C`"),
-        ("[lidar]\ndevice = 'none'", "Expected a lidar or a photodiode: `lidar.device` is none"),
+        ("[lidar]\ndevice = 'none'", "expected a lidar, because `photodiode.bus` is empty"),
         ("name = ''", 'robot.toml:1: `name` = "": expected text'),
         ("x y", "robot.toml:1: not valid TOML: Expected '=' after a key in a key/value pair (at line 1, column 3)"),
     ],

@@ -61,6 +61,30 @@ def test_what_stands_in_for_a_wrong_value_is_no_error_of_its_own(tmp_path: Path,
     assert len(refused(tmp_path, text).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        (
+            "lidar.device = 'none'\n[modbus]\nport = 99999\n[odometry]\nport = 5\n[pose]\nreceivers = ['*:5']",
+            ["lidar.device", "modbus.port", "pose.receivers"],
+        ),
+        (
+            "allow = ['plc', '10.0.0.7', 'gate']\n[pose]\nreceivers = ['plc', '*:1502', 7]\n"
+            "[lidar.mask]\nsectors = [[1.0, 999.0], [1.0, 2.0], [3.0]]",
+            [
+                *("allow[0]", "allow[2]", "pose.receivers", "pose.receivers[0]", "pose.receivers[2]"),
+                *("lidar.mask.sectors[0][1]", "lidar.mask.sectors[2]"),
+            ],
+        ),
+    ],
+)
+def test_what_only_shows_beside_other_keys_is_said_whatever_else_is_wrong(
+    tmp_path: Path, text: str, keys: list[str]
+) -> None:
+    told = [line.split("`")[1] for line in refused(tmp_path, text).splitlines()]
+    assert sorted(told) == sorted(keys)
+
+
 def test_one_wrong_value_hides_no_other_that_names_it(tmp_path: Path) -> None:
     """What `allow` is for says `bind`."""
     assert len(refused(tmp_path, "bind = 'x'\nallow = ['plc']").splitlines()) == 2
@@ -75,7 +99,7 @@ def test_no_error_speaks_of_the_program(wrong: object) -> None:
         tree: dict[str, object] = {key: wrong}
         for parent in reversed(parents):
             tree = {parent: tree}
-        for line in problems(tree, "robot.toml"):
+        for line in (wrong.text for wrong in problems(tree, "robot.toml")):
             assert f"`{option.path}" in line
             assert "; as in " in line
             assert not spoken.search(line), line

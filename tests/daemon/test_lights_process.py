@@ -128,5 +128,5 @@ def test_a_bad_survey_stops_the_start_with_its_place(tmp_path: Path) -> None:
     with daemon(tmp_path) as started:
         _, said = started.process.communicate(timeout=30.0)
     assert started.process.returncode == 2
-    assert "lights.toml:2: Expected `float`, got `str`" in said
+    assert 'lights.toml:2: lamp 1: `z` = "high": expected a number' in said
     assert "Traceback" not in said

@@ -15,6 +15,15 @@ from estimator.state import new_state
 from tests.daemon.keeping import Bench
 
 
+def second(folder: Path) -> tuple[Store, Bench]:
+    """A store that holds a folder of maps, and a bench that has asked for it in vain."""
+    other, bench = Store(folder), Bench(folder)
+    other.claim()
+    assert bench.store is not None
+    bench.store.claim()
+    return other, bench
+
+
 def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) -> None:
     async def run() -> None:
         tmp_path.joinpath("map-00000077-00000001.lumimap").write_bytes(b"x")
@@ -33,11 +42,7 @@ def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_d
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def run() -> None:
-        other = Store(tmp_path)
-        other.claim()
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.claim()
+        other, bench = second(tmp_path)
         keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
         assert keeper.fault
         bench.keeper = keeper
@@ -139,11 +144,7 @@ def test_at_the_stop_what_there_is_is_saved_though_the_folder_has_not_been_looke
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def run() -> None:
-        other = Store(tmp_path)
-        other.claim()
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.claim()
+        other, bench = second(tmp_path)
         other.close()
         bench.drive()
         bench.clock.t += LOOK_S

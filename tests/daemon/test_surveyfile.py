@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.surveyfile import SurveyError, dump, order_of, read_survey, write_survey
+from daemon.surveyfile import SurveyError, dump, read_survey, write_survey
+from daemon.surveytree import order_of
 from estimator.cdma_profile import PROFILE_A, PROFILE_B, PROFILE_D, Profile
 from estimator.codes import gold_codes
 from estimator.lamps import Lamp, Receiver, Survey
@@ -105,12 +106,17 @@ def test_tables_and_half_angle(tmp_path: Path) -> None:
 
 
 WRONG = [
-    ("x = 1.0\n", "x = nan\n", ":5", ">= -10000.0 - at `$.lamp[0].x` (metres, luminous centre)"),
-    ("x = 1.0\n", "x = inf\n", ":5", "<= 10000.0"),
+    (
+        "x = 1.0\n",
+        "x = nan\n",
+        ":5",
+        "lamp 4: `x` = nan: expected a number, -10000.0 to 10000.0 (metres, luminous centre); as in x = 2.5",
+    ),
+    ("x = 1.0\n", "x = inf\n", ":5", "to 10000.0"),
     ("code = 17\nx = 1.0", "code = 513\nx = 1.0", ":4", "number of the CDMA code"),
     ("code = 17\nx = 1.0", "code = -1\nx = 1.0", ":4", "code"),
     ("lamp_id = 4", "lamp_id = 2", ":9", "lamp 2: that `lamp_id` is taken already by line 2"),
-    ("lamp_id = 4", 'lamp_id = "4"', ":3", "int"),
+    ("lamp_id = 4", 'lamp_id = "4"', ":3", 'lamp[0]: `lamp_id` = "4": expected a whole number, 0 to 65535'),
     (
         "y = 2.0\nz = 3.0\nhalf",
         "y = 2.0\nz = 3.0\npower = 2\nhalf",
@@ -118,15 +124,15 @@ WRONG = [
         "unknown key `power`; did you mean `power_w`",
     ),
     ("z = 3.0\nhalf", "hight = 3.0\nhalf", ":7", "unknown key `hight`"),
-    ("z = 3.0\nhalf", "half", ":2", "missing required field `z`"),
+    ("z = 3.0\nhalf", "half", ":2", "lamp 4: `z` is missing: metres above the floor; as in z = 2.6"),
     ("half_angle_deg = 60.0", "half_angle_deg = 60.0\norder = 1.0", ":2", "got both"),
     ("half_angle_deg = 60.0", "half_angle_deg = 90.0", ":8", "angle at which intensity has halved"),
-    ("z = 3.0\nhalf", "z = nan\nhalf", ":7", "`$.lamp[0].z`"),
+    ("z = 3.0\nhalf", "z = nan\nhalf", ":7", "lamp 4: `z` = nan"),
     ("z = 3.0\nhalf", "z = 300.0\nhalf", ":7", "metres above the floor"),
     ("x = 4.0", "x = 1.0", ":9", "hangs where lamp 4 hangs"),
-    ("depth = 0.3", "depth = 3.0", ":1", "modulation depth"),
+    ("depth = 0.3", "depth = 3.0", ":1", "`depth` = 3.0: expected a number, 0.002 to 0.95 (modulation depth"),
     ("depth = 0.3", "dept = 0.3", ":1", "did you mean `depth`"),
-    ("x = 0.1", "x = 40.0", ":16", "ahead of the robot"),
+    ("x = 0.1", "x = 40.0", ":16", "receiver: `x` = 40.0: expected a number, -5.0 to 5.0 (metres ahead of the robot"),
     ("x = 0.1", "lever = 0.1", ":16", "known here are x, y, z"),
     ("x = 0.1", "z = 2.9", ":2", "not above the receiver"),
 ]
@@ -139,9 +145,62 @@ def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, line: str, w
     path.write_text(GOOD.replace(old, new, 1))
     with pytest.raises(SurveyError) as error:
         read_survey(path)
-    text = str(error.value)
-    assert text.startswith(f"{path}{line}: "), text
-    assert words in text
+    told = str(error.value).splitlines()
+    assert any(one.startswith(f"{path}{line}: ") and words in one for one in told), told
+
+
+MANY = """\
+depth = 3.0
+flor = 0.1
+lamp = [
+  { lamp_id = 1, code = 130, x = 0.0, y = 0.0, z = 2.6 },
+  { lamp_id = 1, code = -5, x = nan, y = 0.0, hight = 2.6 },
+  { lamp_id = 70000, code = 5, x = 0.0, y = 0.0, z = 2.6 },
+  { lamp_id = 4, code = 5, x = 5.0, y = 0.0, z = 2.6, order = 1, half_angle_deg = 60 },
+  { lamp_id = 6, code = 5, x = 9.0, y = 0.0, z = 2.1 },
+  7,
+]
+[receiver]
+z = 2.0
+slope_x = "a"
+"""
+
+
+def test_all_that_is_wrong_is_said_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "lights.toml"
+    path.write_text(MANY)
+    with pytest.raises(SurveyError) as error:
+        read_survey(path, PROFILE_A)
+    told = [line.removeprefix(f"{path}:") for line in str(error.value).splitlines()]
+    expected = [
+        (" lamp[5]: expected a table", "lamp_id, code"),
+        ("1: `depth` = 3.0", "as in depth = 0.25"),
+        ("2: unknown key `flor`", "did you mean `floor`?"),
+        ("4: lamp 1: code 130 is none of profile A", "0 to 128"),
+        ("5: lamp 1: unknown key `hight`", "known here are"),
+        ("5: lamp 1: `code` = -5", "as in code = 73"),
+        ("5: lamp 1: `x` = nan", "as in x = 2.5"),
+        ("5: lamp 1: `z` is missing", "as in z = 2.6"),
+        ("5: lamp 1: that `lamp_id` is taken already", "by line 4"),
+        ("6: lamp[2]: `lamp_id` = 70000", "0 to 65535"),
+        ("6: lamp[2]: hangs where lamp 1 hangs by line 4", "delete one"),
+        ("7: lamp 4: expected `order` or `half_angle_deg`, got both", ""),
+        ("8: lamp 6: hangs at z = 2.1 m, not above the receiver", ""),
+        ('13: receiver: `slope_x` = "a"', "as in slope_x = 0.0"),
+    ]
+    for line, (head, tail) in zip(told, expected, strict=True):
+        assert line.startswith(head)
+        assert tail in line
+
+
+def test_what_stands_in_for_a_wrong_value_is_no_error_of_its_own(tmp_path: Path) -> None:
+    """A receiver whose height cannot be read is above no lamp, and a lamp without a place hangs where no other does."""
+    path = tmp_path / "lights.toml"
+    for old, new in (("x = 0.1", "z = 200.0"), ("x = 4.0", "x = 'a'"), ("lamp_id = 2", "lamp_id = -4")):
+        path.write_text(GOOD.replace(old, new, 1))
+        with pytest.raises(SurveyError) as error:
+            read_survey(path)
+        assert len(str(error.value).splitlines()) == 1
 
 
 PROFILES = (PROFILE_A, PROFILE_B, PROFILE_D)
@@ -158,7 +217,7 @@ def test_codes_are_those_of_the_profile(tmp_path: Path, profile: Profile) -> Non
         read_survey(path, profile)
     words = f":4: lamp 4: code {last + 1} is none of profile {profile.name}, which has codes 0 to {last}; "
     if profile is PROFILE_D:
-        words = ":4: Expected `int` <= 512"
+        words = ":4: lamp 4: `code` = 513: expected a whole number, 0 to 512"
     assert words in str(error.value)
 
 
@@ -183,7 +242,7 @@ def test_lines_are_found_in_the_written_form(tmp_path: Path) -> None:
         read_survey(path)
     lines[at] = lines[at].replace("lamp_id = 6,", "lamp_id = 7, colour = 3,")
     path.write_text("\n".join(lines))
-    with pytest.raises(SurveyError, match=f":{at + 1}: unknown key `colour`"):
+    with pytest.raises(SurveyError, match=f":{at + 1}: lamp 7: unknown key `colour`"):
         read_survey(path)
 
 

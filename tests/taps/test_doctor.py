@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from daemon import cli
+from daemon.store import Store
 from hal.errors import DeviceFault
 from hal.lidar import LidarGeometry
 from hal.photodiode.probe import BusFinding, Chip
@@ -249,6 +250,18 @@ def test_a_folder_that_cannot_be_made_is_not_a_full_disk(file: Path, capsys: pyt
     assert "FIX  maps" in said
     assert "/proc/maps: cannot be made by this user" in said
     assert "where /proc" not in said
+
+
+@pytest.mark.parametrize(("heard", "verdict"), [("nobody listens there", "FIX"), (Heard("lumiloop", 77, POSE), "good")])
+def test_a_folder_that_another_daemon_has_is_to_be_fixed_and_our_own_daemons_is_not(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], heard: Heard | str, verdict: str
+) -> None:
+    other = Store(tmp_path / "maps")
+    other.claim()
+    asked(file, Computer(heard=heard), f"map.folder={tmp_path / 'maps'}")
+    words = rf"{verdict} +maps +.*process {os.getpid()} keeps its maps there"
+    assert re.search(words, capsys.readouterr().out)
+    other.close()
 
 
 def test_maps_are_judged_by_what_they_are_and_not_by_their_names(

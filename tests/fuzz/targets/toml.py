@@ -15,6 +15,8 @@ PARSERS = (
     "daemon/configwords.py",
     "daemon/config.py",
     "daemon/surveyfile.py",
+    "daemon/surveytree.py",
+    "daemon/surveywords.py",
     "daemon/mapserver.py",
 )
 
