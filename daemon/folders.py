@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
+
+SERVICE: Final = Path("/run/lumiloop")
+"""The service manager's RuntimeDirectory."""
 
 
 def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
@@ -21,6 +25,20 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
         return Path(named)
     user = environment.get("XDG_RUNTIME_DIR", "")
     return Path(user) / "lumiloop" if user else state_folder(environment)
+
+
+def stream_path(name: str) -> Path:
+    """Where the daemon of that ``name`` (of the configuration) serves its local stream: ours, else the service's."""
+    own, service = runtime_folder() / f"{name}.stream", SERVICE / f"{name}.stream"
+    return service if _there(service) and not _there(own) else own
+
+
+def _there(path: Path) -> bool:
+    """Whether it exists, or may: what lies in a folder that is not open to us is said when it is opened."""
+    try:
+        return path.exists()
+    except PermissionError:  # also for a moment while the service starts, until its folder belongs to our group
+        return True
 
 
 def can_be_made(folder: Path) -> bool:

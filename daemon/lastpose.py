@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from daemon.publish.snapshot import Snapshot, State
+from daemon.publish.snapshot import GUESSED, Snapshot, State
 from daemon.wholefile import defect_in, reason_of, sync_folder
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,6 @@ SYNC_S: Final = 10.0
 RETRY_S: Final = 5.0
 CLOSE_S: Final = 1.0
 SURE: Final = (State.TRACKING, State.DEGRADED)
-LOST: Final = (State.LOST, State.RELOCATING, State.AMBIGUOUS)
 
 Pose = tuple[float, float, float]
 
@@ -144,7 +143,7 @@ class LastPose:
         if snapshot.state in SURE and snapshot.pose is not None:
             if snapshot.t_sent >= self._due and self._is_news(snapshot.map_id, snapshot.pose):
                 self._put(Remembered(snapshot.map_id, snapshot.pose, snapshot.t_utc), snapshot.t_sent)
-        elif snapshot.state in LOST and self._kept is not None and self._kept.pose is not None:
+        elif snapshot.state in GUESSED and self._kept is not None and self._kept.pose is not None:
             self._put(Remembered(snapshot.map_id, None, snapshot.t_utc), snapshot.t_sent)
 
     def _is_news(self, map_id: int, pose: Pose) -> bool:

@@ -16,14 +16,14 @@ from estimator import se2
 from estimator.records import Array
 from estimator.result import Loop, StepResult
 
-_FIELDS: Final = 11
-_STAMP, _ANCHOR = 0, 1
+_FIELDS: Final = 12
+_STAMP, _ANCHOR, _STATE = 0, 1, 11
 _ONLINE, _ODOM, _ON_ANCHOR = slice(2, 5), slice(5, 8), slice(8, 11)
 
 
 @dataclass(slots=True)
 class Ledger:
-    """One row a scan, in the order of the log, and counts. A row is 88 bytes: a day at 40 Hz fits into memory.
+    """One row a scan, in the order of the log, and counts. A row is 96 bytes: a day at 40 Hz fits into memory.
 
     Where scans are missing, there is a row for each cycle in which light alone held the pose.
 
@@ -67,7 +67,7 @@ class Ledger:
         if (record.scan is not None or lit) and pose is not None:
             at = stamp + (result.t_mono - t_mono)
             odom, on_anchor = result.T_odom_base.tolist(), result.T_anchor_base.tolist()
-            self._rows.extend((at, result.anchor, *pose, *odom, *on_anchor))
+            self._rows.extend((at, result.anchor, *pose, *odom, *on_anchor, record.snapshot.state))
 
     def _count(self, result: StepResult, stamp: float) -> None:
         self.keyframes += result.keyframe >= 0
@@ -94,9 +94,9 @@ class Ledger:
         self._settled.append(final)
 
     def online(self) -> Trajectory:
-        """T_map_base of every scan as it was published."""
+        """T_map_base of every scan as it was published, and in which state."""
         rows = self._table()
-        return Trajectory(rows[:, _STAMP], rows[:, _ONLINE])
+        return Trajectory(rows[:, _STAMP], rows[:, _ONLINE], rows[:, _STATE].astype(np.int64))
 
     def final(self) -> Trajectory:
         """T_map_base of every scan by what was known when it was settled; as published where it was not yet."""

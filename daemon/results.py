@@ -17,6 +17,7 @@ import numpy.typing as npt
 from daemon import mapimage
 from daemon.mapserver import FREE, OCCUPIED
 from daemon.png import encode_png
+from daemon.publish.snapshot import GUESSED, State
 from estimator.grid import Grid
 from estimator.records import Array
 
@@ -36,10 +37,22 @@ class OutputRefused(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Stamps in seconds (n,) and poses (x, y, yaw) (n, 3)."""
+    """Stamps in seconds (n,), poses (x, y, yaw) (n, 3), and the states in which they were published (n,), None: any."""
 
     stamps: Array
     poses: Array
+    states: npt.NDArray[np.int64] | None = None
+
+    def ordered(self) -> Trajectory:
+        """The same, ascending by stamp, equal stamps in their given order."""
+        order = np.argsort(self.stamps, kind="stable")
+        return Trajectory(self.stamps[order], self.poses[order], None if self.states is None else self.states[order])
+
+    def guesses(self) -> list[str]:
+        """For every pose the state in which it is a guess; empty: it is none."""
+        if self.states is None:
+            return [""] * len(self.stamps)
+        return [State(state).name if state in GUESSED else "" for state in self.states.tolist()]
 
 
 class Folder:
@@ -95,18 +108,28 @@ class Folder:
 
 
 def tum(trajectory: Trajectory) -> bytes:
-    """TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp (equal stamps in their given order)."""
-    order = np.argsort(trajectory.stamps, kind="stable")
-    stamps, poses = trajectory.stamps[order].tolist(), trajectory.poses[order]
-    half = 0.5 * poses[:, 2]
-    columns = (stamps, poses[:, 0].tolist(), poses[:, 1].tolist(), np.sin(half).tolist(), np.cos(half).tolist())
-    lines = [f"{t:.6f} {x:.6f} {y:.6f} 0 0 0 {s:.9f} {c:.9f}\n" for t, x, y, s, c in zip(*columns, strict=True)]
+    """TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp (equal stamps in their given order).
+
+    A guess is a remark, ``# STATE t x y ...``: who reads the file compares what was said to be known.
+    """
+    told = trajectory.ordered()
+    half = 0.5 * told.poses[:, 2]
+    x, y = told.poses[:, 0].tolist(), told.poses[:, 1].tolist()
+    columns = (told.guesses(), told.stamps.tolist(), x, y, np.sin(half).tolist(), np.cos(half).tolist())
+    lines = [
+        f"{guess and f'# {guess} '}{t:.6f} {x:.6f} {y:.6f} 0 0 0 {s:.9f} {c:.9f}\n"
+        for guess, t, x, y, s, c in zip(*columns, strict=True)
+    ]
     return (_TUM_HEAD + "".join(lines)).encode()
 
 
 def kitti(trajectory: Trajectory) -> bytes:
-    """KITTI text: the upper three rows of each pose's matrix in one line, ascending by stamp; it has no stamps."""
-    poses = trajectory.poses[np.argsort(trajectory.stamps, kind="stable")]
+    """KITTI text: the upper three rows of each pose's matrix in one line, ascending by stamp; it has no stamps.
+
+    It has no remarks either: guesses are left out.
+    """
+    told = trajectory.ordered()
+    poses = told.poses[[not guess for guess in told.guesses()]]
     c, s = np.cos(poses[:, 2]).tolist(), np.sin(poses[:, 2]).tolist()
     rows = zip(c, s, poses[:, 0].tolist(), poses[:, 1].tolist(), strict=True)
     return "".join(

@@ -87,10 +87,12 @@ def _export(args: argparse.Namespace) -> int:
             _draw(told, translator, file)
         cli.say(f"{args.mcap}: {file.messages} messages")
     final = told.rerun.ledger.online() if args.online else told.rerun.ledger.final()
+    guesses = sum(map(bool, final.guesses()))
+    guessed = f", and {guesses} guesses that are none" if guesses else ""
     for path, text in ((args.tum, tum), (args.kitti, kitti)):
         if path is not None:
             write_whole(path, text(final))
-            cli.say(f"{path}: {len(final.stamps)} poses")
+            cli.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}")
     for sentence in told.source.report.sentences():
         cli.say(f"{args.log}: {sentence}")
     if told.rerun.comparison.differ:

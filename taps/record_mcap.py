@@ -1,7 +1,8 @@
 """`lumiloop record-mcap OUT.mcap`: what a running daemon tells, as an MCAP file of ROS 2 messages, until interrupted.
 
-A recorder that is killed leaves a file without an index, which lacks at most half a second; `lumiloop export FILE.mcap
---mcap WHOLE.mcap` makes a whole one of it.
+It ends while the disk still has room for the daemon's maps (``--reserve``). A recorder that is killed leaves a file
+without an index, which lacks at most half a second; `lumiloop export FILE.mcap --mcap WHOLE.mcap` makes a whole one of
+it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from daemon import cli
 from daemon.config import Config
 from hal.serving import work_until_told
 from taps.frames import Hello, NotTheStream
-from taps.mcapfile import FLUSH_S, McapFile
+from taps.mcapfile import FLUSH_S, McapFile, NoRoom
 from taps.ros import Translator
 from taps.stream import Lost, Stream
 
@@ -27,11 +28,15 @@ def main(args: argparse.Namespace) -> int:
     if args.out.exists() and not args.force:
         return cli.fail(f"{args.out} is there already; name another file, or replace it with --force", cli.USAGE)
     stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
+    file = None
     try:
-        with McapFile(args.out) as file:
+        with McapFile(args.out, reserve=round(args.reserve * (1 << 20))) as file:
             asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))
     except NotTheStream as error:
         return cli.fail(str(error))
+    except NoRoom as error:
+        whole = "the file is whole up to here; " if file is not None else ""
+        return cli.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
     except OSError as error:
         return cli.fail(f"{args.out}: {error.strerror}; free space or name another file")
     cli.say(f"{args.out}: {file.messages} messages")
@@ -46,6 +51,7 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
     Raises:
         NotTheStream: the other end is no daemon of this version.
         OSError: the file cannot be written.
+        NoRoom: its disk has no room but what is to stay free.
     """
     translator = Translator(settings.lidar.mount)
     flushing = asyncio.ensure_future(_flush(file))
@@ -70,4 +76,5 @@ async def _flush(file: McapFile) -> None:
     while True:
         await asyncio.sleep(FLUSH_S)
         if file.waiting:
-            file.flush()
+            with contextlib.suppress(NoRoom):  # the next message says it
+                file.flush()

@@ -17,15 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from daemon.folders import runtime_folder
+from daemon.folders import stream_path
 from daemon.publish.stream import TOPICS
 from taps import frames
 from taps.frames import LONGEST, Frame, NotTheStream, Refused
 
 FIRST_RETRY_S: Final = 0.2
 LAST_RETRY_S: Final = 2.0
-SERVICE: Final = Path("/run/lumiloop")
-"""The service manager's RuntimeDirectory."""
 SILENT_S: Final = 10.0
 """Without a greeting for so long: the daemon stands, or the path leads to another program."""
 
@@ -37,25 +35,11 @@ class Lost:
     text: str
 
 
-def path_of(name: str) -> Path:
-    """Where the daemon of that ``name`` (of the configuration) serves it: one of ours, else the system's service."""
-    own, service = runtime_folder() / f"{name}.stream", SERVICE / f"{name}.stream"
-    return service if _there(service) and not _there(own) else own
-
-
-def _there(path: Path) -> bool:
-    """Whether it exists, or may: what lies in a folder that is not open to us is said when it is opened."""
-    try:
-        return path.exists()
-    except PermissionError:  # also for a moment while the service starts, until its folder belongs to our group
-        return True
-
-
 class Stream:
     """What a daemon tells, for as long as somebody asks.
 
     Args:
-        path: of the socket; or the name of a daemon, whose socket is looked for at each try (:func:`path_of`).
+        path: of the socket; or the name of a daemon, whose socket is looked for at each try.
         topics: that are wanted.
         patient: whether to go on trying after a loss, and when nobody is there at first.
 
@@ -71,7 +55,7 @@ class Stream:
     @property
     def path(self) -> Path:
         """Of the socket, as far as is known now."""
-        return path_of(self._of) if isinstance(self._of, str) else self._of
+        return stream_path(self._of) if isinstance(self._of, str) else self._of
 
     async def frames(self) -> AsyncGenerator[Frame | Lost, None]:
         """Every frame, from the greeting on; ends after :class:`Lost` where it is not patient. To be closed.

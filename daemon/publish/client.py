@@ -21,7 +21,8 @@ from daemon.publish import integrity, lights, parts, pulse, registers
 from daemon.publish.block import Block
 from daemon.publish.points import U16, Value
 from daemon.publish.requests import BLOCKS
-from daemon.publish.snapshot import LightFix, LinkUse, Stage, State
+from daemon.publish.snapshot import GUESSED, LightFix, LinkUse, Stage, State
+from daemon.publish.whose import Whose, whose
 
 if TYPE_CHECKING:
     from daemon.config import Config
@@ -38,7 +39,6 @@ _ANSWER: Final = struct.Struct(">HHHBBB")
 _READ_INPUT: Final = 4
 _ANY_HOST: Final = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
 _TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
-_SEEKING: Final = (State.AMBIGUOUS, State.RELOCATING, State.LOST)
 _GUESS: Final = "  (a guess: the place is not known)"
 _CLEAR: Final = "\x1b[H\x1b[2J"
 
@@ -52,12 +52,18 @@ class NoAnswer(Exception):
 class Reader:
     """Reads the published block of one daemon. Use as a context manager.
 
+    Args:
+        host: name or address.
+        port: of it.
+        name: of the daemon that is meant, on this computer; None: whichever answers.
+
     Raises:
         NoAnswer: the host's name is not known.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, name: str | None = None) -> None:
         self._where = f"{host}:{port}"
+        self._host, self._port, self._name = host, port, name
         self._transaction = 0
         try:
             family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -74,6 +80,22 @@ class Reader:
 
     def __exit__(self, *_: object) -> None:
         self._sock.close()
+
+    def whose(self) -> Whose:
+        """Who answers.
+
+        Raises:
+            NoAnswer: another daemon than the one that is meant, and that one runs, too.
+        """
+        if self._name is None:
+            return Whose(0, "", 0)
+        found = whose(self._name, self._host, self._port)
+        if found.another:
+            raise NoAnswer(
+                f"{self._where} is answered by {found}, not by `{self._name}` (process {found.meant}), which cannot "
+                f"have the port: give one of them another modbus.port; `lumiloop status {self._where}` shows that one"
+            )
+        return found
 
     def read(self) -> Reading:
         """The latest snapshot.
@@ -137,7 +159,7 @@ def main(args: argparse.Namespace) -> int:
     """Body of the command; `args` has address, json, watch, and settings (:class:`daemon.config.Config`)."""
     try:
         host, port = address_of(args.address, args.settings)
-        with Reader(host, port) as reader:
+        with Reader(host, port, None if args.address or args.settings is None else args.settings.name) as reader:
             return _watch(reader, args.json) if args.watch else _once(reader, args.json)
     except NoAnswer as error:
         sys.stderr.write(f"lumiloop: {error}\n")
@@ -167,30 +189,36 @@ def address_of(text: str | None, settings: Config | None) -> tuple[str, int]:
 
 def _once(reader: Reader, as_json: bool) -> int:
     first = reader.read()
+    who = reader.whose()
     time.sleep(_STALL_S)
     reading = reader.read()
-    _show(reading, as_json, stalled=reading["seq"] == first["seq"])
+    _show(reading, as_json, reading["seq"] == first["seq"], who)
     return OK
 
 
 def _watch(reader: Reader, as_json: bool) -> int:
     before: Value = None
+    who = None
     while True:
         try:
             reading = reader.read()
+            who = reader.whose() if before is None or who is None else who
         except NoAnswer as error:
             sys.stderr.write(f"lumiloop: {error}\n")
             before = None
         else:
             if sys.stdout.isatty() and not as_json:
                 sys.stdout.write(_CLEAR)
-            _show(reading, as_json, stalled=reading["seq"] == before)
+            _show(reading, as_json, reading["seq"] == before, who)
             before = reading["seq"]
         time.sleep(_REFRESH_S)
 
 
-def _show(reading: Reading, as_json: bool, stalled: bool) -> None:
-    text = json.dumps(as_object(reading, stalled)) if as_json else as_table(reading, stalled)
+def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose) -> None:
+    if as_json:
+        text = json.dumps(as_object(reading, stalled) | {"process": who.pid or None})
+    else:
+        text = (f"{'daemon':<10} {who}\n" if who.pid else "") + as_table(reading, stalled)
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
@@ -383,7 +411,7 @@ def _unknown_axes(flags: dict[str, bool]) -> str:
 
 def _reserve(state: Value, flags: dict[str, bool]) -> str:
     """What has to be known of a pose before it is used."""
-    return _GUESS if state in _SEEKING and flags["pose_valid"] else _unknown_axes(flags)
+    return _GUESS if state in GUESSED and flags["pose_valid"] else _unknown_axes(flags)
 
 
 def _loops(reading: Reading) -> str:

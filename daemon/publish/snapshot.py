@@ -23,6 +23,10 @@ class State(IntEnum):
     RELOCATING = 7  # looking for the place
 
 
+GUESSED: Final = (State.LOST, State.RELOCATING, State.AMBIGUOUS)
+"""States in which the place is not known: a pose that is published meanwhile is a guess."""
+
+
 class LightFix(IntEnum):
     """How far the position from lights has come (`estimator.result.Fix`). Numbers are part of the contract."""
 

@@ -11,11 +11,10 @@ from typing import Final
 
 from daemon import cli
 from daemon.config import Config
-from daemon.folders import maps_folder
+from daemon.folders import maps_folder, stream_path
 from taps.doctor.host import Heard, Host
 from taps.lamps.history import BadHistory, by_lamp, in_maps, load, merged, save
 from taps.lamps.judge import Verdict, judge, together
-from taps.stream import path_of
 
 FILE: Final = "lamps.csv"
 TOGETHER: Final = -0.02
@@ -46,7 +45,7 @@ def tell(args: argparse.Namespace, host: Host) -> int:
         return cli.fail(
             f"{error.filename or path}: {error.strerror}; run it as the daemon's user, or name --history FILE"
         )
-    heard = host.listen(args.stream or path_of(settings.name))
+    heard = host.listen(args.stream or stream_path(settings.name))
     uses = {lamp: use for (_, lamp), use in heard.lamps.items() if lamp is not None} if isinstance(heard, Heard) else {}
     verdicts = judge(by_lamp(looks), host.utc(), uses)
     if not verdicts:

@@ -129,6 +129,8 @@ class View:
         try:
             if (viewer := await self._greeted(socket)) is not None:
                 await self._serve(socket, viewer)
+        except ConnectionResetError:
+            pass  # the page was closed while something was being sent to it
         finally:
             self._sockets.discard(socket)
         return socket

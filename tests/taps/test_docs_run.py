@@ -7,6 +7,7 @@ times are shorter. What is run elsewhere, or cannot be run, is said in `tests.ta
 from __future__ import annotations
 
 import gzip
+import itertools
 import os
 import re
 import shutil
@@ -15,7 +16,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.request import urlopen
@@ -50,7 +52,7 @@ class Desk:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.at, self._logs = folder, "", 0
+        self.folder, self.at, self._logs = folder, "", itertools.count(1)
         self.modbus, self.odometry, self.metrics, self.foxglove, self.view = (str(free_port()) for _ in range(5))
         (folder / "run" / "lumiloop").mkdir(parents=True)
         self.environment = {
@@ -98,8 +100,7 @@ class Desk:
     @contextmanager
     def running(self, command: list[str], by: signal.Signals = signal.SIGINT) -> Iterator[subprocess.Popen[bytes]]:
         """Run one that lasts, until a person stops it; it ends well."""
-        self._logs += 1
-        words, log = self.words(command), self.folder / f"log{self._logs}"
+        words, log = self.words(command), self.folder / f"log{next(self._logs)}"
         with log.open("w") as file:
             process = subprocess.Popen(words, cwd=self.folder, env=self.environment, stdout=file, stderr=file)
         try:
@@ -117,6 +118,20 @@ def until(what: Callable[[], object], seconds: float = 20.0) -> None:
     while not what():
         assert time.monotonic() < end, "it has not come about"
         time.sleep(0.05)
+
+
+def side_by_side(do: Callable[[list[str]], object], *lanes: Iterable[list[str]]) -> None:
+    """Run commands, in each lane one after the other: what needs or overwrites what another has written is in its lane.
+
+    No more at once than the smallest computer has cores.
+    """
+
+    def one_by_one(lane: Iterable[list[str]]) -> None:
+        for command in lane:
+            do(command)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        list(pool.map(one_by_one, lanes))  # asks each for its error
 
 
 def got(address: str) -> bool:
@@ -174,19 +189,20 @@ def beside(desk: Desk) -> None:
     """What is said to a running daemon, or heard of it."""
     (desk.folder / "view.token").write_text("0123456789abcdef0123456789abcdef")
     (desk.folder / "view.token").chmod(0o600)
-    page, pages = f"http://127.0.0.1:{desk.view}/", 0
-    for command in to_run("beside"):
+    page, pages = f"http://127.0.0.1:{desk.view}/", list[list[str]]()
+
+    def do(command: list[str]) -> None:
         match command[:2]:
             case ["lumiloop", "view"]:
                 with desk.running(command):
                     until(lambda: got(page))
-                    pages += 1
+                    pages.append(command)
             case ["lumiloop", "metrics"]:
                 with desk.running(command):
                     until(lambda: got(f"http://127.0.0.1:{desk.metrics}/vda5050"))
                     (curl,) = (one for one in to_run("beside") if one[0] == "curl")
                     if shutil.which("curl") is not None:
-                        assert '"localized": true' in desk.do(curl)
+                        until(lambda: '"localized": true' in desk.do(curl))
             case ["lumiloop", "foxglove"]:
                 with desk.running(command):
                     until(lambda: listens(int(desk.foxglove)))
@@ -203,13 +219,18 @@ def beside(desk: Desk) -> None:
                 pass  # beside the metrics
             case _:
                 desk.do(command)
-    assert pages == len([one for one in to_run("beside") if one[1] == "view"]) > 3
+
+    views = [command for command in to_run("beside") if command[1] == "view"]
+    side_by_side(do, views, [command for command in to_run("beside") if command not in views])
+    assert pages == views
+    assert len(views) > 3
 
 
 @pytest.mark.system
 def test_of_a_drive(desk: Desk) -> None:
     assert re.search(r"^\d\d:\d\d:\d\d$", desk.at)
-    for command in to_run("drive"):
+
+    def do(command: list[str]) -> None:
         if command[:3] == ["lumiloop", "view", "drive/"]:
             with desk.running(command):
                 until(lambda: got(f"http://127.0.0.1:{desk.view}/"), 40.0)
@@ -219,6 +240,9 @@ def test_of_a_drive(desk: Desk) -> None:
             assert "poses" in desk.do(command[:-1], evo_traj=str(program))
         else:
             desk.do(command, LOG="drive", DIR="drive" if command[1] == "why" else "out")
+
+    replays = [command for command in to_run("drive") if command[1] == "replay"]
+    side_by_side(do, replays, [command for command in to_run("drive") if command not in replays])
     for name in ("result/trajectory.tum", "result/map.lumimap", "map/map.pgm", "drive.mcap", "drive.tum", "why.png"):
         assert (desk.folder / name).stat().st_size > 0, name
     assert list((desk.folder / "out").glob("match-*.json"))
@@ -240,8 +264,12 @@ def test_of_maps(recording: Path, tmp_path: Path) -> None:
     for name in ("drive.clf.gz", "intel.clf.gz"):
         (tmp_path / name).write_bytes(gzip.compress((tmp_path / "scans/keyframes.clf").read_bytes()))
     before = len(list(tmp_path.rglob("*.lumimap")))
+    kept = [command for command in to_run("maps") if command[2] in ("name", "align", "import")]
+    made: dict[str, list[list[str]]] = {}
     for command in to_run("maps"):
-        desk.do(command)
+        if command not in kept:
+            made.setdefault(command[-1], []).append(command)  # its file or folder
+    side_by_side(desk.do, kept, *made.values())
     for name in (
         "hall.png",
         "out/hall/map.pgm",
@@ -257,7 +285,10 @@ def test_of_maps(recording: Path, tmp_path: Path) -> None:
 @pytest.mark.system
 def test_alone(tmp_path: Path) -> None:
     desk = Desk(tmp_path)
-    for command in to_run("alone"):
+
+    def do(command: list[str]) -> None:
         assert desk.do(command) or "draw" in " ".join(command)
+
+    side_by_side(do, *([command] for command in to_run("alone")))
     assert (tmp_path / "office.png").stat().st_size > 0
     assert (tmp_path / "light.png").stat().st_size > 0

@@ -16,6 +16,8 @@ import pytest
 
 from daemon import blackbox, cli, disk
 from daemon.flight import DUMP
+from daemon.publish.snapshot import State
+from daemon.results import Trajectory, kitti, tum
 from hal.replay.recording import Kind, open_recording
 from hal.replay.report import LogReport
 from tests.daemon.replay.room import read_tum
@@ -66,6 +68,14 @@ def seconds(header: Any) -> float:
 
 def yaw_of(q: Any) -> float:
     return 2.0 * math.atan2(q.z, q.w)
+
+
+def test_a_guess_is_a_remark_in_tum_and_left_out_of_kitti() -> None:
+    poses, states = np.zeros((3, 3)), np.array([State.TRACKING, State.LOST, State.DEGRADED])
+    told = Trajectory(np.array([3.0, 2.0, 1.0]), poses, states)
+    assert [line[:10] for line in tum(told).decode().splitlines()[1:]] == ["1.000000 0", "# LOST 2.0", "3.000000 0"]
+    assert len(kitti(told).splitlines()) == 2
+    assert len(kitti(Trajectory(told.stamps, poses)).splitlines()) == 3
 
 
 def test_a_ros_tool_reads_the_drive(exported: Path) -> None:

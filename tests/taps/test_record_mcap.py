@@ -10,6 +10,9 @@ import pytest
 from daemon import cli
 
 pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
+from mcap.reader import make_reader
+
+from taps import mcapfile
 from taps.ros import TOPICS
 from tests.taps.serving import served
 from tests.taps.test_mcap import messages
@@ -51,6 +54,33 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
     assert "replace it with --force" in said
     assert "is the daemon running?" in said
     assert "No such file" in said
+
+
+def test_a_disk_is_not_filled(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot needs room for its maps: the recorder stops before, and what it has written is a whole file."""
+    out, room = tmp_path / "a.mcap", iter([300, 300, 300, 300, 199])
+    monkeypatch.setattr(mcapfile, "free_bytes", lambda folder: next(room, 199) << 20)
+    with served(tmp_path / "s"):
+        assert record(tmp_path / "s", out, "--seconds", "20") == cli.FAILED
+    said = capsys.readouterr().err
+    assert f"{out}: stopped, only 199 MB are free there (--reserve keeps 200): " in said
+    assert "the file is whole up to here" in said
+    with out.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None, "there is an index"
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == sum(map(len, messages(out).values())) > 10
+
+
+def test_without_room_no_file_is_begun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.mcap"
+    out.write_bytes(b"precious")
+    with served(tmp_path / "s"):
+        assert record(tmp_path / "s", out, "--force", "--reserve", "1e9") == cli.FAILED
+    assert "--reserve" in capsys.readouterr().err
+    assert out.read_bytes() == b"precious"
 
 
 def test_a_disk_that_is_full_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

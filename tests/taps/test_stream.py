@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon.folders import stream_path
 from daemon.publish.snapshot import (
     Condition,
     LightFix,
@@ -31,7 +32,7 @@ from daemon.publish.stream import SCHEMA, TOPICS, StreamServer, framed
 from hal.adc import Blemish, RawSamples
 from taps import frames, stream
 from taps.frames import TYPES, Frame, Hello, NotTheStream
-from taps.stream import Lost, Stream, path_of
+from taps.stream import Lost, Stream
 from tests.daemon.publish.test_stream import raw_scan, run
 from tests.taps.serving import served
 
@@ -219,13 +220,13 @@ def test_any_bytes_are_a_frame_or_refused(body: bytes) -> None:
 
 def test_the_path_is_the_daemons(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr(stream, "SERVICE", tmp_path / "run")
-    assert path_of("agv") == tmp_path / "agv.stream"
+    monkeypatch.setattr("daemon.folders.SERVICE", tmp_path / "run")
+    assert stream_path("agv") == tmp_path / "agv.stream"
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "agv.stream").touch()
-    assert path_of("agv") == tmp_path / "run" / "agv.stream", "a person looks at the service"
+    assert stream_path("agv") == tmp_path / "run" / "agv.stream", "a person looks at the service"
     (tmp_path / "agv.stream").touch()
-    assert path_of("agv") == tmp_path / "agv.stream"
+    assert stream_path("agv") == tmp_path / "agv.stream"
 
 
 def test_a_folder_that_is_not_open_to_us_yet_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,9 +237,9 @@ def test_a_folder_that_is_not_open_to_us_yet_is_tried_again(tmp_path: Path, monk
             raise PermissionError(13, "Permission denied", str(path))
         return False
 
-    monkeypatch.setattr("taps.stream.SERVICE", tmp_path / "run")
+    monkeypatch.setattr("daemon.folders.SERVICE", tmp_path / "run")
     monkeypatch.setattr(Path, "exists", shut)
-    assert path_of("agv") == tmp_path / "run" / "agv.stream"
+    assert stream_path("agv") == tmp_path / "run" / "agv.stream"
 
     async def all_that_is_told() -> list[object]:
         return [frame async for frame in Stream("agv", ("pose",), patient=False).frames()]
@@ -253,7 +254,7 @@ def test_types_stand_for_every_topic() -> None:
 def test_a_daemon_of_a_name_is_found_wherever_it_comes_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A person starts to listen, and the system's service is started later."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "own"))
-    monkeypatch.setattr("taps.stream.SERVICE", tmp_path)
+    monkeypatch.setattr("daemon.folders.SERVICE", tmp_path)
 
     async def body() -> None:
         async with asyncio.timeout(10.0), contextlib.aclosing(Stream("agv", ("pose",)).frames()) as frames:

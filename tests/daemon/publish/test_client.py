@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -219,6 +223,47 @@ def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
     told = capsys.readouterr().err
     assert f"127.0.0.1:{port}" in told
     assert "lumiloop run" in told
+
+
+@contextmanager
+def another_process(path: Path) -> Iterator[int]:
+    """A process that listens at a local stream; yields its id."""
+    listening = f"import socket; s = socket.socket(socket.AF_UNIX); s.bind({str(path)!r}); s.listen()"
+    program = f"{listening}; print(flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield process.pid
+        process.terminate()
+
+
+def test_whose_registers_are_shown_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modbus answers at the configured port: another daemon, or the one of the configured name."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address:
+        settings = Config(name="agv", modbus=ModbusConfig(port=int(address.rpartition(":")[2])))
+        assert status(None, settings) == 0, "whoever is meant does not run, or cannot be seen"
+        assert capsys.readouterr().out.startswith(f"daemon     process {os.getpid()}: ")
+        assert status(None, settings, json=True) == 0
+        assert json.loads(capsys.readouterr().out)["process"] == os.getpid()
+        with another_process(tmp_path / "agv.stream") as meant:
+            assert status(None, settings) == 1
+            said = capsys.readouterr()
+            assert not said.out
+            assert f"{address} is answered by process {os.getpid()}" in said.err
+            assert f"not by `agv` (process {meant})" in said.err
+            assert "modbus.port" in said.err
+            assert status(address, settings) == 0, "who names an address means whoever answers there"
+            assert capsys.readouterr().out.startswith("state")
+        (tmp_path / "agv.stream").unlink()
+        with socket.socket(socket.AF_UNIX) as ours:
+            ours.bind(str(tmp_path / "agv.stream"))
+            ours.listen()
+            assert status(None, settings) == 0
 
 
 def test_silence(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

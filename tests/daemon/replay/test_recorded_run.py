@@ -18,7 +18,7 @@ from daemon import cli
 from daemon.budget import FixedBudget
 from daemon.config import Config, LidarConfig, ModbusConfig, Mount
 from daemon.main import Daemon, World
-from daemon.publish.snapshot import Snapshot
+from daemon.publish.snapshot import Snapshot, State
 from daemon.record import Recorder
 from daemon.store import Start
 from daemon.worker import CycleWorker
@@ -195,6 +195,33 @@ def test_the_replay_gives_the_same_poses_to_the_last_bit(
         told = posed[np.abs(posed[:, 0] - stamp) < 2e-6]  # cycles without a scan may carry the same instant
         off = np.column_stack([told[:, 1:3] - pose[:2], np.sin(told[:, 3] - pose[2])])
         assert np.abs(off).max(axis=1).min() < 2e-6
+
+
+async def lost(bench: Bench) -> None:
+    """Pushed on in a pause, without a word from its wheels."""
+    await bench.drive(3.0)
+    bench.daemon.cycle.inbox.put_command(Command(bench.loop.time(), Order.PAUSE))
+    await asyncio.sleep(25.0)
+    bench.daemon.cycle.inbox.put_command(Command(bench.loop.time(), Order.RESUME))
+    await bench.drive(3.0)
+
+
+def test_a_pose_that_is_a_guess_is_no_line_that_others_read(tmp_path: Path) -> None:
+    """It stays in the file, in its place, as a remark that names the state."""
+    bench = record(tmp_path / "rec", lost)
+    replay(tmp_path / "rec", tmp_path / "out")
+    state = {1.7e9 + snapshot.t_mono: snapshot.state for snapshot in bench.snapshots if snapshot.pose}
+    guesses = (State.LOST, State.RELOCATING, State.AMBIGUOUS)
+    stamps, _ = read_tum(tmp_path / "out" / "online.tum")
+    lines = (tmp_path / "out" / "online.tum").read_text().splitlines()[1:]
+    remarks = [line.split() for line in lines if line.startswith("# ")]
+    assert len(remarks) > 10
+    assert len(stamps) + len(remarks) == len(lines) == len(read_tum(tmp_path / "out" / "trajectory.tum")[0])
+    assert all(state[min(state, key=lambda t: abs(t - stamp))] not in guesses for stamp in stamps.tolist())
+    for _, name, stamp, *pose in remarks:
+        assert state[min(state, key=lambda t: abs(t - float(stamp)))].name == name
+        assert len(pose) == 7
+    assert {name for _, name, *_ in remarks} <= {state.name for state in guesses}
 
 
 def test_a_recording_that_lost_its_end_is_replayed_up_to_there(tmp_path: Path) -> None:

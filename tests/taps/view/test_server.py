@@ -182,6 +182,30 @@ def test_nonsense_ends_a_connection_and_nothing_else(
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR], "it is no defect of ours"
 
 
+def test_a_page_that_is_closed_while_it_is_greeted_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    greet, requests = server.welcome, list[Any]()
+
+    def closed(*told: Any) -> dict[str, Any]:
+        requests[0].transport.abort()
+        return greet(*told)
+
+    async def body(house: House) -> None:
+        monkeypatch.setattr(server, "_little_kept", requests.append)
+        monkeypatch.setattr(server, "welcome", closed)
+        async with house.page() as page:
+            while await page.read():
+                pass
+        monkeypatch.setattr(server, "welcome", greet)
+        async with house.page() as other:
+            await other.welcome()
+
+    run(tmp_path, body)
+    assert len(requests) == 2
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+
 def test_a_browser_that_takes_nothing_gets_the_latest() -> None:
     async def body() -> None:
         viewer = viewers.Viewer(1)
