@@ -86,3 +86,13 @@ def test_programs_of_the_documents_know_the_options_named(module: str) -> None:
     for page, options in programs()[module]:
         for option in options:
             assert re.search(rf"{option}\b", done.stdout), f"{page}: {module} {option}"
+
+
+def test_no_picture_is_kept_beside_the_one_that_a_command_keeps() -> None:
+    """It would stay as it is when the figures change."""
+    pictures = {path.name for path in (ROOT / "docs" / "images").glob("*.png")}
+    assert not pictures & {path.name for path in (ROOT / "docs" / "results").glob("*.png")}
+    assert (
+        set(re.findall(r"`([\w-]+\.png)`", (ROOT / "docs" / "images" / "README.md").read_text())) - {"map.png"}
+        == pictures
+    )
