@@ -69,11 +69,15 @@ def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
 
 
 def _say_unused(memory: Memory, evidence: Evidence, why: Reason) -> tuple[State, Reason]:
-    """The part of the table for a laser that is there and left out: light and odometry carry the pose, or nothing."""
+    """The part of the table for a laser that is there and left out: light and odometry carry the pose, or nothing.
+
+    Where the place is lost meanwhile, what is to be done is to let the laser in again, not to drive on.
+    """
     if memory.lost:
-        return State.LOST, Reason.NO_WITNESS
+        return State.LOST, why
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
-        return _say_vague(evidence.light)
+        state, reason = _say_vague(evidence.light)
+        return state, why if state is State.LOST else reason
     if (evidence.light is not None and evidence.light.lost) or _contradicted(memory, evidence):
         return State.DEGRADED, Reason.LIGHT_DISAGREES
     return State.DEGRADED, why
