@@ -52,8 +52,8 @@ COMMANDS: Final[dict[CommandCode, str]] = {
     CommandCode.RELOCALISE: "The robot was carried off: it is looked for everywhere in the map.",
     CommandCode.PAUSE: "The map is left alone and the laser does not move the pose, which light and odometry carry; "
     "the state is DEGRADED, LOST once nothing knows the place any more, both with reason 20. For a hall "
-    "full of people, or a robot on a lift. With neither light nor odometry nothing follows a robot that moves meanwhile: "
-    "SET_POSE or RELOCALISE then.",
+    "full of people, or a robot on a lift. With neither light nor odometry nothing follows a robot that moves "
+    "meanwhile: SET_POSE or RELOCALISE then.",
     CommandCode.RESUME: "The end of a pause.",
     CommandCode.DUMP_RECORDER: "What the flight recorder holds is written to the disk. Done when it is there.",
     CommandCode.SWITCH_MAP: "The map in use is saved, then the stored map `map_id` is loaded and the robot is looked "
