@@ -28,7 +28,7 @@ MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Parameters of mallopt(3)."""
 
-LARGE, SLACK = 1 << 20, 4 << 20
+LARGE, SLACK = 1 << 20, 1 << 20
 """Blocks of so many bytes are mapped each by itself; so much may be free at the end of the heap."""
 
 
