@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -154,23 +155,62 @@ def test_nothing_is_switched_on_by_the_installation() -> None:
         assert set(orders) <= {"daemon-reload", "stop", "try-restart", "disable"}, script
 
 
+RECORDER: Final = {"KEEP": "24", "SECONDS": "3600", "RESERVE": "200", "ROOM": "800"}
+
+
+def pruned(folder: Path, **environment: str) -> list[str]:
+    """What the shell's words before a recording leave, as the service manager would have them said."""
+    told = dict(tap("record"))["ExecStartPre"].replace("$$", "$").replace("%%", "%")
+    environment = {**os.environ, **RECORDER, "STATE_DIRECTORY": str(folder), **environment}
+    subprocess.run(shlex.split(told), env=environment, check=True)
+    return sorted(path.name for path in folder.glob("*.mcap"))
+
+
+def recorded(folder: Path, hours: int) -> None:
+    folder.mkdir()
+    for hour in range(hours):
+        (folder / f"20260101T{hour:02d}0000Z.mcap").touch()
+
+
 def test_files_of_an_hour_are_kept_so_many(tmp_path: Path) -> None:
-    """The shell's words before a recording, as the service manager would have them said."""
-    told = dict(tap("record"))
-    environment = dict(
-        word.split("=") for word in dict(pair for pair in tap("record") if "KEEP" in pair[1])["Environment"].split()
-    )
-    assert environment == {"KEEP": "24", "SECONDS": "3600"}
-    for hour in range(30):
-        (tmp_path / f"20260101T{hour:02d}0000Z.mcap").touch()
-    (tmp_path / "other").touch()
-    words = shlex.split(told["ExecStartPre"].replace("$$", "$"))
+    told = dict(pair for pair in tap("record") if "KEEP" in pair[1])["Environment"]
+    assert dict(word.split("=") for word in told.split()) == RECORDER
+    recorded(tmp_path / "kept", 30)
+    (tmp_path / "kept" / "other").touch()
     for _ in range(2):
-        subprocess.run(words, env={**os.environ, **environment, "STATE_DIRECTORY": str(tmp_path)}, check=True)
-        kept = sorted(path.name for path in tmp_path.glob("*.mcap"))
+        kept = pruned(tmp_path / "kept", RESERVE="0", ROOM="0")
         assert (len(kept), kept[0]) == (24, "20260101T060000Z.mcap")
-    (tmp_path / "empty").mkdir()
-    subprocess.run(words, env={**os.environ, **environment, "STATE_DIRECTORY": str(tmp_path / "empty")}, check=True)
+    assert (tmp_path / "kept" / "other").exists()
+    recorded(tmp_path / "empty", 0)
+    assert pruned(tmp_path / "empty", RESERVE=str(10**9)) == []
+
+
+@pytest.mark.parametrize(
+    ("disk", "before", "after"),
+    [
+        (5000, 3, 3),  # there is room
+        (5000, 7, 5),  # the oldest make room for an hour's, beside the reserve
+        (1000, 1, 1),  # the newest stays for as long as the reserve is there
+        (850, 1, 0),
+    ],
+)
+def test_on_a_small_disk_the_newest_files_are_kept_and_the_reserve_stays_free(
+    disk: int, before: int, after: int, tmp_path: Path
+) -> None:
+    """Files of 700 MB on a disk of so many: the oldest go, and the recorder is not refused for months."""
+    recorded(tmp_path / "kept", before)
+    (tmp_path / "stat").write_text(f'#!/bin/sh\necho "$(({disk} - 700 * $(ls *.mcap | wc -l)))*1048576"\n')
+    (tmp_path / "stat").chmod(0o755)
+    kept = pruned(tmp_path / "kept", PATH=f"{tmp_path}:{os.environ['PATH']}")
+    assert kept == [f"20260101T{hour:02d}0000Z.mcap" for hour in range(before - after, before)]
+
+
+def test_room_is_looked_for_on_the_recordings_own_disk(tmp_path: Path) -> None:
+    recorded(tmp_path / "kept", 3)
+    free = shutil.disk_usage(tmp_path).free >> 20
+    assert len(pruned(tmp_path / "kept", RESERVE=str(free // 2), ROOM="0")) == 3
+    assert len(pruned(tmp_path / "kept", RESERVE="0", ROOM=str(2 * free))) == 1
+    assert pruned(tmp_path / "kept", RESERVE=str(2 * free)) == []
 
 
 def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
