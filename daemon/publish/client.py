@@ -63,7 +63,7 @@ class Reader:
 
     def __init__(self, host: str, port: int, name: str | None = None) -> None:
         self._where = f"{host}:{port}"
-        self._host, self._port, self._name = host, port, name
+        self._name = name
         self._transaction = 0
         try:
             family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -89,7 +89,7 @@ class Reader:
         """
         if self._name is None:
             return Whose(0, "", 0)
-        found = whose(self._name, self._host, self._port)
+        found = whose(self._name, *self._sock.getpeername()[:2])
         if found.another:
             raise NoAnswer(
                 f"{self._where} is answered by {found}, not by `{self._name}` (process {found.meant}), which cannot "

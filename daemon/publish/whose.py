@@ -20,32 +20,44 @@ from daemon.folders import stream_path
 PROC: Final = Path("/proc")
 _CREDENTIALS: Final = struct.Struct("3i")  # of a peer: process, user, group
 _PATIENCE_S: Final = 0.5
-_EVERYWHERE: Final = ("0.0.0.0", "::")
 
 
 @dataclass(frozen=True, slots=True)
 class Whose:
-    """Who answers: process ``pid``, 0: not to be seen, started by ``command``; ``meant``: that of the name, 0: none."""
+    """Who answers: process ``pid``, 0: not to be seen, started by ``command``; ``meant``: that of the name, 0: none.
+
+    ``apart``: the latter has a network of its own (a container), whose ports others pass on.
+    """
 
     pid: int
     command: str
     meant: int
+    apart: bool = False
 
     @property
     def another(self) -> bool:
         """Whether it is another daemon than the one that was meant, which runs and has not got the port."""
-        return 0 not in (self.pid, self.meant) and self.pid != self.meant
+        return 0 not in (self.pid, self.meant) and self.pid != self.meant and not self.apart
 
     def __str__(self) -> str:
-        return f"process {self.pid}" + (f": {self.command}" if self.command else "") if self.pid else ""
+        if not self.pid:
+            return ""
+        passed_on = f" (the configured name is that of process {self.meant}, which has a network of its own)"
+        said = f"process {self.pid}" + (f": {self.command}" if self.command else "")
+        return said + (passed_on if self.apart and self.pid != self.meant else "")
 
 
 def whose(name: str, host: str, port: int) -> Whose:
     """Who answers at a UDP port of this computer, and who is the daemon of that name; what cannot be seen is 0."""
     meant = _listener(stream_path(name))
-    holders = list(_holders(set(_sockets(host, port))))
-    pid = meant if meant in holders else next(iter(holders), 0)
-    return Whose(pid, _command(pid), meant)
+    inodes = _sockets(host, port)
+    holders = dict(_holders(inodes))
+    pid = 0
+    if meant in holders:
+        pid = meant
+    elif inodes == set().union(*holders.values()):  # else the one that is not to be seen may be who answers
+        pid = next(iter(holders), 0)
+    return Whose(pid, _command(pid), meant, _apart(meant))
 
 
 def _listener(path: Path) -> int:
@@ -58,15 +70,22 @@ def _listener(path: Path) -> int:
     return 0
 
 
-def _sockets(host: str, port: int) -> Iterator[str]:
-    """The inodes of UDP sockets that are bound to an address and a port, or to the port on every address."""
+def _sockets(host: str, port: int) -> set[str]:
+    """The inodes of the UDP sockets that get what is sent to an address and a port.
+
+    As in the kernel those that are bound to the address itself go before those of every address, and these before those
+    of the other family, which take IPv4 too.
+    """
+    bound: dict[str, set[str]] = {}
     for table in ("udp", "udp6"):
         with contextlib.suppress(OSError):
             for line in (PROC / "net" / table).read_text().splitlines()[1:]:
                 words = line.split()
                 address, _, number = words[1].partition(":")
-                if int(number, 16) == port and _written(address) in (host, *_EVERYWHERE):
-                    yield words[9]
+                if int(number, 16) == port:
+                    bound.setdefault(_written(address), set()).add(words[9])
+    nearest = (host, "::") if ":" in host else (host, "0.0.0.0", "::")
+    return next((bound[address] for address in nearest if address in bound), set())
 
 
 def _written(address: str) -> str:
@@ -76,25 +95,33 @@ def _written(address: str) -> str:
     return socket.inet_ntop(family, b"".join(word.to_bytes(4, sys.byteorder) for word in words))
 
 
-def _holders(inodes: set[str]) -> Iterator[int]:
-    """The processes that have one of these sockets open, as far as we may look into them."""
-    names = {f"socket:[{inode}]" for inode in inodes}
+def _holders(inodes: set[str]) -> Iterator[tuple[int, set[str]]]:
+    """The processes that have some of these sockets open, as far as we may look into them, and which."""
+    names = {f"socket:[{inode}]": inode for inode in inodes}
     for process in PROC.iterdir() if names else ():
         if process.name.isdecimal():
             with contextlib.suppress(OSError):
-                if any(_link(file) in names for file in (process / "fd").iterdir()):
-                    yield int(process.name)
+                if held := {names[link] for file in (process / "fd").iterdir() if (link := _link(file)) in names}:
+                    yield int(process.name), held
+
+
+def _apart(pid: int) -> bool:
+    """Whether a process is known to have another network than this one."""
+    theirs, ours = (_link(PROC / who / "ns" / "net") for who in (str(pid), "self"))
+    return bool(theirs) and bool(ours) and theirs != ours
 
 
 def _link(file: Path) -> str:
     try:
         return str(file.readlink())
-    except OSError:  # closed meanwhile
+    except OSError:  # closed meanwhile, or another user's
         return ""
 
 
 def _command(pid: int) -> str:
+    """A process's command line; what is no letter, and might be an order to the terminal, is written out."""
+    line = ""
     with contextlib.suppress(OSError):
         if pid:
-            return (PROC / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
-    return ""
+            line = (PROC / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in line)
