@@ -106,13 +106,12 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
         CannotLoad: as for :func:`load`.
     """
     try:
-        mark = mark_of(what)
-        if mark.exists():
+        if is_marked(what):
             return
         begun, before = time.monotonic(), _compiled()
         with _announced(say, before):
             work()
-        mark.touch()
+        mark_of(what).touch()
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
     if count := len(_compiled() - before):
@@ -157,9 +156,14 @@ def mark_of(what: str) -> Path:
     return CACHE_DIR / f"{what}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
 
 
-def _mark(lights: bool) -> Path:
-    """Of what a start of the daemon needs, with lights or without."""
-    return mark_of("warm-lights" if lights else "warm")
+def is_marked(what: str) -> bool:
+    """Whether that file is there, and kernels: who makes room on a disk deletes these, which are large."""
+    return mark_of(what).exists() and bool(_compiled())
+
+
+def _what(lights: bool) -> str:
+    """What a start of the daemon needs, with lights or without."""
+    return "warm-lights" if lights else "warm"
 
 
 def is_warm(lights: bool) -> bool:
@@ -169,7 +173,7 @@ def is_warm(lights: bool) -> bool:
         CannotLoad: nowhere to keep compiled kernels.
     """
     try:
-        return _mark(lights).exists()
+        return is_marked(_what(lights))
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
 
@@ -180,15 +184,15 @@ def _load_locked(begun: float, lights: Lights | None) -> Warmth:
 
     with (CACHE_DIR / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        mark = _mark(lights is not None)
-        cold = not mark.exists()
+        what = _what(lights is not None)
+        cold = not is_marked(what)
         if cold:
             count = kernel_count(lights is not None)
             log.info("first start of this version: compiling %d kernels, which takes a minute or two", count)
         with _uncollected(not cold):
             _exercise()
             code_us = 0.0 if lights is None else _exercise_lights(lights)
-        mark.touch()
+        mark_of(what).touch()
     return Warmth(cold, time.monotonic() - begun, code_us)
 
 

@@ -123,9 +123,9 @@ class Host:
         Raises:
             OSError, RuntimeError: there is nowhere to keep them.
         """
-        from daemon.warmup import mark_of
+        from daemon.warmup import is_marked
 
-        return mark_of("warm-lights" if lights else "warm").exists()
+        return is_marked("warm-lights" if lights else "warm")
 
     def realtime(self) -> bool:
         """Whether we may take a real-time priority."""

@@ -244,6 +244,25 @@ def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
     assert done.stderr == "lumiloop: an earlier start has compiled the kernels\n"
 
 
+def test_a_mark_without_kernels_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who makes room on the disk deletes what is large: the kernels, and not the mark."""
+    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr(warmup, "_exercise", lambda: None)
+    worked: list[str] = []
+    for what in ("warm", "export"):
+        warmup.mark_of(what).touch()
+    assert not warmup.is_warm(lights=False)
+    assert warmup.load().compiled
+    warmup.load_aloud(lambda text: None, "export", lambda: worked.append("export"))
+    assert worked == ["export"]
+    (tmp_path / "part").mkdir()
+    (tmp_path / "part" / "one.nbc").touch()
+    assert warmup.is_warm(lights=False)
+    assert not warmup.load().compiled
+    warmup.load_aloud(lambda text: None, "export", lambda: worked.append("again"))
+    assert worked == ["export"]
+
+
 def test_another_processor_s_kernels_are_none_of_this_one_s(monkeypatch: pytest.MonkeyPatch) -> None:
     ours = warmup.mark_of("warm")
     assert warmup.mark_of("warm") == ours
