@@ -50,11 +50,11 @@ def problems(tree: dict[str, Any], name: str, text: str, profile: Profile | None
     lamps, receiver = tree.get("lamp"), tree.get("receiver")
     listed = lamps if isinstance(lamps, list) else []
     judged = [_judge(lamp, LampEntry) for lamp in listed]
-    eye = _judge(receiver if isinstance(receiver, dict) else {}, ReceiverEntry)
+    eye = _judge({} if receiver is None else receiver, ReceiverEntry)
     sound: dict[str, Any] = {}  # what is in them is told by itself
     if isinstance(lamps, list):
         sound["lamp"] = [_stand_ins(LampEntry)] * bool(lamps)
-    if isinstance(receiver, dict):
+    if receiver is not None:
         sound["receiver"] = {}
     found = [(lines.of(key), words) for key, words in _judge(tree | sound, SurveyTree).wrong]
     found += [(lines.of(key, table="receiver"), f"receiver: {words}") for key, words in eye.wrong]
@@ -177,9 +177,11 @@ class _Lines:
 
     def __init__(self, text: str) -> None:
         self._lines = [line.partition("#")[0] for line in text.splitlines()]
-        tables = any(re.match(r"\s*\[\[", line) for line in self._lines)
-        start = r"\s*\[\[\s*lamp\s*\]\]" if tables else r"[^{]*\{.*"
-        self._lamps = self._matching(start)
+        if any(re.match(r"\s*\[\[", line) for line in self._lines):
+            self._lamps = self._matching(r"\s*\[\[\s*lamp\s*\]\]")
+        else:
+            first = next(iter(self._matching(r"\s*lamp\s*=")), len(self._lines))
+            self._lamps = [at for at in self._matching(r"[^{]*\{") if first <= at < self._after(first)]
 
     def of(self, key: str, lamp: int | None = None, table: str = "") -> int:
         """Line of a key of a lamp, of a table, or of the root; of the lamp or the table where it has none itself."""
@@ -193,11 +195,18 @@ class _Lines:
     def _matching(self, form: str) -> list[int]:
         return [at for at, line in enumerate(self._lines) if re.match(form, line)]
 
+    def _after(self, first: int) -> int:
+        """The line after the last one of the value that begins in a line: the next key, or table."""
+        later = self._matching(r"\s*(\w+\s*=|\[\s*\w+\s*\])")
+        return next((at for at in later if at > first), len(self._lines))
+
     def _span(self, lamp: int | None, table: str) -> tuple[int, int]:
         """Lines of a lamp or of a table: the first, and the one after the last; an empty span where there is none."""
         end = len(self._lines)
         if lamp is None:
             begins = self._matching(rf"\s*(\[\s*{table}\s*\]|{table}\s*=)") if table else [0]
+            if begins and table and "[" not in self._lines[begins[0]].partition("=")[0]:
+                return begins[0], begins[0] + 1
             return (begins[0], end) if begins else (0, 0)
         if lamp >= len(self._lamps):
             return 0, 0

@@ -193,6 +193,34 @@ def test_all_that_is_wrong_is_said_at_once_in_the_order_of_the_file(tmp_path: Pa
         assert tail in line
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "receiver = { x = 40.0 }\nlamp = [\n{ lamp_id = 1, code = -5, x = 0.0, y = 0.0, z = 2.6 },\n7,\n]\n",
+            [":1: receiver: `x` = 40.0", ":3: lamp 1: `code` = -5", ": lamp[1]: expected a table"],
+        ),
+        (
+            "lamp = [{ lamp_id = 1, code = -5, x = 0.0, y = 0.0, z = 2.6 },\n7,\n]\nreceiver = { x = 40.0 }\n",
+            [":1: lamp 1: `code` = -5", ":4: receiver: `x` = 40.0", ": lamp[1]: expected a table"],
+        ),
+        (
+            "receiver = { x = 40.0 }\n[[lamp]]\nlamp_id = 1\ncode = 5\nx = 0.0\ny = 0.0\nz = 2.6\n",
+            [":1: receiver: `x` = 40.0"],
+        ),
+        ("lamp = []\nreceiver = 3\n", [":2: receiver: expected a table, { ... }, of x, y, z, "]),
+    ],
+)
+def test_a_table_in_one_line_has_its_own_line(tmp_path: Path, text: str, expected: list[str]) -> None:
+    path = tmp_path / "lights.toml"
+    path.write_text(text)
+    with pytest.raises(SurveyError) as error:
+        read_survey(path)
+    told = [line.removeprefix(str(path)) for line in str(error.value).splitlines()]
+    assert all(any(line.startswith(head) for line in told) for head in expected), told
+    assert len(told) == len(expected)
+
+
 def test_what_stands_in_for_a_wrong_value_is_no_error_of_its_own(tmp_path: Path) -> None:
     """A receiver whose height cannot be read is above no lamp, and a lamp without a place hangs where no other does."""
     path = tmp_path / "lights.toml"
