@@ -181,8 +181,18 @@ def _value(tree: Any, place: str) -> Any:
 
 def wrong_value(place: str, value: object, option: Option) -> str:
     """What is said of a value that its key cannot have: what was found, what is allowed, what it is for, an example."""
-    expected = re.sub("^(?=whole|number|list)", "a ", option.kind)
+    expected = re.sub("^(?=whole|number|list)", "a ", _kind_at(place, option.kind))
     return f"`{place}` = {_found(value)}: expected {expected}{_purpose(option)}"
+
+
+def _kind_at(place: str, kind: str) -> str:
+    """What is allowed at a place: of an item of a list, ``sectors[1][0]``, what is allowed of that."""
+    for number in re.findall(r"\[(\d+)\]", place):
+        if items := re.fullmatch(r"\[(.*)\](?:, each (.*))?", kind):
+            kind = items[1].split(", ")[int(number)] + (f", {items[2]}" if items[2] else "")
+        else:
+            kind = kind.removeprefix("list of ")
+    return kind
 
 
 def _found(value: object) -> str:

@@ -61,7 +61,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ("lidar = 3", "robot.toml:1: `lidar` = 3: expected a table, [lidar], of device, intensity, mask, mount"),
         (
             "[lidar.mask]\nsectors = [[1, 2], [3]]",
-            "robot.toml:2: `lidar.mask.sectors[1]` = [3]: expected a list of [number, number], each -360.0 to",
+            "robot.toml:2: `lidar.mask.sectors[1]` = [3]: expected [number, number], each -360.0 to",
         ),
         (
             "[lidar.mask]\nsectors = [[1, 1]]",

@@ -49,6 +49,25 @@ receivers = ["plc"]
 
 
 @pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("allow = [1]", "`allow[0]` = 1: expected text ("),
+        ("allow = 1", "`allow` = 1: expected a list of text ("),
+        (
+            "[lidar.mask]\nsectors = [3]",
+            "`lidar.mask.sectors[0]` = 3: expected [number, number], each -360.0 to 360.0 (",
+        ),
+        (
+            "[lidar.mask]\nsectors = [[1, 'a']]",
+            '`lidar.mask.sectors[0][1]` = "a": expected a number, -360.0 to 360.0 (',
+        ),
+    ],
+)
+def test_of_an_item_its_own_kind_is_said(tmp_path: Path, text: str, words: str) -> None:
+    assert words in refused(tmp_path, text)
+
+
+@pytest.mark.parametrize(
     "text",
     [
         "lidar.device = 'none'\n[photodiode]\nbus = 'i2c-1'",
