@@ -18,6 +18,7 @@ from daemon.folders import can_be_made, maps_folder
 
 FAR_M: Final = 5.0
 """A lidar is on its robot."""
+LOCKS: Final = Path("/proc/locks")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -154,17 +155,18 @@ def _keeper(lock: Path) -> str:
         with lock.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # and back at once: who starts meanwhile tries again
     except BlockingIOError:
-        inode = str(lock.stat().st_ino)
+        about = lock.stat()
+        named = f"{os.major(about.st_dev):02x}:{os.minor(about.st_dev):02x}:{about.st_ino}"
     except OSError:
         return ""
     else:
         return ""
     with contextlib.suppress(OSError):
-        for line in Path("/proc/locks").read_text().splitlines():
+        for line in LOCKS.read_text().splitlines():
             words = line.split()  # 3: FLOCK  ADVISORY  WRITE 1234 08:01:5678 0 EOF
-            if "FLOCK" in words and words[-3].endswith(f":{inode}"):
+            if "FLOCK" in words and words[-3] == named:
                 return f"process {words[-4]}"
-    return "another process"  # of a container of its own
+    return "another process"  # of a container of its own, or on a file system that has other numbers here
 
 
 def _look_at_bus(name: str) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from pathlib import Path
 
 import pytest
 
-from daemon import cli
+from daemon import check, cli
 from daemon.store import Store
 from tests.daemon.mapmaker import Shape, content
 
@@ -168,6 +169,24 @@ def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureF
     (maps / "map-00000007-00000001.lumimap").unlink()
     assert f"{maps}: no map in it can be used" in said()
     assert [path.name for path in maps.glob("*.lumimap*")] == ["map-00000007-00000002.lumimap"], "nothing is moved"
+
+
+def test_a_lock_of_the_same_number_on_another_disk_is_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, listed = tmp_path / "lock", tmp_path / "locks"
+    lock.touch()
+    about = lock.stat()
+    line = "1: FLOCK  ADVISORY  WRITE {} {:02x}:{:02x}:{} 0 EOF\n"
+    place = (os.major(about.st_dev), os.minor(about.st_dev))
+    foreign = line.format(11, place[0] + 1, place[1], about.st_ino)
+    monkeypatch.setattr(check, "LOCKS", listed)
+    with lock.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        listed.write_text(foreign)
+        assert check._keeper(lock) == "another process"
+        listed.write_text(foreign + line.format(22, *place, about.st_ino))
+        assert check._keeper(lock) == "process 22"
 
 
 def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
