@@ -160,6 +160,14 @@ def test_what_the_emulation_has_worked_is_told_with_each_scenario(
     assert [str(figure) for one in guest.results for figure in one.figures] == 2 * ["work of the emulation: 1.5 CPU s"]
 
 
+def test_a_computer_that_has_ended_leaves_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends at the end of a scenario: what that has shown stays, and the next one says why it cannot be."""
+    monkeypatch.setattr(Playing, "worked_s", lambda playing: None)
+    _, outcomes, said = played_by_two(monkeypatch, tmp_path, [like(passes), like(dies), passes])
+    assert outcomes == [["passed", "FAILED", "skipped"]]
+    assert "seen QEMU has ended with -9" in said
+
+
 def test_what_takes_time_to_ask_for_is_asked_for_where_it_is_told() -> None:
     asked: list[int] = []
     common.need(True, lambda: f"{asked.append(1)}")

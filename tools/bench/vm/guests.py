@@ -84,8 +84,11 @@ class Guest:
                 for scenario in self.share:
                     before = whole.machine.worked_s()
                     one = tried(scenario, whole)
-                    worked = Figure("work of the emulation", whole.machine.worked_s() - before, "CPU s")
-                    self.results.append(replace(one, figures=(*one.figures, worked)))
+                    after = whole.machine.worked_s()
+                    if before is not None and after is not None:
+                        worked = Figure("work of the emulation", after - before, "CPU s")
+                        one = replace(one, figures=(*one.figures, worked))
+                    self.results.append(one)
                     self._tell(self.results[-1], say)
                 with contextlib.suppress(Order, OSError):
                     (out / f"journal-{self.number}.log").write_text(whole.machine.run(*JOURNAL, seconds=120))

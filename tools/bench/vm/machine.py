@@ -177,14 +177,16 @@ class Machine:
         lines = self.run("systemctl", "show", unit, *(f"--property={name}" for name in names)).splitlines()
         return dict(line.split("=", 1) for line in lines if "=" in line)
 
-    def worked_s(self) -> float:
-        """Seconds of processor time that it has taken of this computer."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    def worked_s(self) -> float | None:
+        """Seconds of processor time that it has taken of this computer; None: it has ended."""
+        with suppress(OSError):
+            fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+            return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return None
 
     def waited_s(self) -> float:
         """Seconds that its processor would have run and had to wait for one of this computer's."""
-        return max(map(_waited_s, Path(f"/proc/{self.process.pid}/task").glob("*/schedstat")), default=0.0)
+        return _waited_s(Path(f"/proc/{self.process.pid}/task"))
 
     def power_cut(self) -> None:
         """Off and on again, without a word to the system inside; its disk keeps what had been written."""
@@ -238,10 +240,14 @@ class Machine:
             self._qmp[0].close()
 
 
-def _waited_s(schedstat: Path) -> float:
-    with suppress(OSError, IndexError, ValueError):  # the thread has ended; or a kernel that does not tell
-        return 1e-9 * int(schedstat.read_text().split()[1])
-    return 0.0
+def _waited_s(task: Path) -> float:
+    """Of the threads in a folder of /proc those that are emulated processors, which QEMU names ``CPU 0/TCG``."""
+    waited = 0.0
+    for thread in task.glob("*"):
+        with suppress(OSError, IndexError, ValueError):  # it has ended; or a kernel that does not tell
+            if (thread / "comm").read_text().startswith("CPU "):
+                waited += 1e-9 * int((thread / "schedstat").read_text().split()[1])
+    return waited
 
 
 def _connected(path: Path) -> socket.socket:
@@ -265,7 +271,8 @@ def _words(image: Image, folder: Path, ports: Ports) -> list[str]:
     """
     forwards = f"hostfwd=tcp:127.0.0.1:{ports.modbus}-:{MODBUS},hostfwd=udp:127.0.0.1:{ports.modbus}-:{MODBUS}"
     return [
-        "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-machine", "q35",
+        "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-name", "debug-threads=on", "-display", "none",
+        "-machine", "q35",
         "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "1", "-m", "1536",
         "-kernel", str(image.kernel), "-initrd", str(image.initrd), "-append", COMMAND_LINE,
         "-drive", f"file={image.disk},if=none,id=disk,format=raw,snapshot=on,cache=unsafe",
