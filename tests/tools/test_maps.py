@@ -66,6 +66,22 @@ def test_a_written_map_is_drawn_with_its_path_and_loops(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_poses_that_were_no_more_than_guesses_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are in no figure of what was published: who is LOST more would seem the better."""
+    lines = [f"{at}.0 {at}.0 0.0 0 0 0 0 1\n" for at in range(5)]
+    for name in ("trajectory.tum", "aces.gmapping_gfs.tum"):
+        (tmp_path / name).write_text("".join(lines))
+    (tmp_path / "online.tum").write_text(
+        "# stamp x y\n" + "".join(["# LOST " + line for line in lines[:2]] + lines[2:])
+    )
+    (tmp_path / "loops.csv").write_text("stamp,counter\n")
+    monkeypatch.setattr(maps, "placed", lambda log, poses: ())
+    monkeypatch.setattr(maps, "thickness", lambda: np.array([0.01]))
+    figures = maps._figures("aces", tmp_path / "aces.clf.gz", tmp_path, maps.Used(1.0, 1.0))
+    (told,) = [figure for figure in figures if "guesses" in figure.name]
+    assert (told.name, told.value) == ("aces, as published: guesses, left out", 2.0)
+
+
 @pytest.mark.slow
 def test_walls_of_real_logs_are_thin(monkeypatch: pytest.MonkeyPatch, log_root: Path, tmp_path: Path) -> None:
     monkeypatch.setenv("LUMILOOP_DATA", str(log_root))

@@ -10,6 +10,8 @@ points count that lie within ``ALONG_M`` along the wall and ``ACROSS_M`` across 
 of its own, so that the two faces of a wall are two walls. If at least ``ENOUGH`` of them, and two scans more than 30 s
 apart, are there, and single scans show a flat piece of wall (9 of 10 of them less than ``FLAT_M`` across), the
 thickness is the width across that holds the middle 90 % of them. What was moved meanwhile counts as thick.
+
+**As published** are poses of which a place was claimed; guesses (LOST, RELOCATING, AMBIGUOUS) are counted.
 """
 
 from __future__ import annotations
@@ -131,6 +133,7 @@ def _figures(name: str, log: Path, out: Path, used: Used) -> list[Figure]:
             _judged(f"{name}, at the end: RMS to the reference", float(np.sqrt((off**2).mean())), "m", "<= 0.5"),
             _judged(f"{name}, as published: RMS to the reference", float(np.sqrt((live**2).mean())), "m"),
         ]
+    figures.append(_judged(f"{name}, as published: guesses, left out", len(stamps) - len(online[0]), ""))
     widths = thickness(*placed(log, poses))
     with (out / "loops.csv").open() as file:
         loops = list(csv.DictReader(file))
