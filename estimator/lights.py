@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator import ekf, ekf_links, lights_motion, se2
+from estimator import ekf, ekf_links, lights_motion, row, se2
 from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
@@ -207,6 +207,8 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
+        if lights.course.wheels and len(lights.tracks) == 1 and lights.result is not None:
+            row.loosen(lights.catalogue, lights.result.accepted, track.P)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
         likelihood = absorb(lights, track, seen, view_of(lights, back))
         track.weight += likelihood * news

@@ -17,6 +17,9 @@ from estimator.records import Array
 ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2
 """Lamps less than the first off a line are a row; the second is allowed for across it, the third for the heading."""
 
+SIDE_M, SIDE_RAD = 0.5, 0.1
+"""What no number of looks at a row makes surer than."""
+
 KNOWN = 4096
 """So many sets of lamps are remembered."""
 
@@ -38,6 +41,32 @@ def doubt(catalogue: Catalogue, lamps: frozenset[int]) -> Array:
             catalogue.doubts.clear()
         catalogue.doubts[lamps] = known
     return known
+
+
+def loosen(catalogue: Catalogue, lamps: frozenset[int], P: Array) -> None:
+    """Keep a pose that these lamps have told from becoming surer across their row than one look at them makes it.
+
+    How far the lamps seem from the row is the same mistake in every epoch (walls beside, a common gain), and with it
+    the heading: believed twenty times a second it is soon held for certain, and is a mistake along the next row.
+
+    Args:
+        catalogue: of all lamps.
+        lamps: those in use.
+        P: covariance, its first three rows and columns those of the pose in the survey's axes; changed in place.
+    """
+    at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, sorted(lamps)) if lamp is not None]
+    if len(at) < 2:
+        return
+    _, across, angle = spread(at)
+    narrow = math.exp(-2.0 * across / ROW_M**2)
+    nx, ny = -math.sin(angle), math.cos(angle)
+    lacks = narrow * SIDE_M**2 - (nx * nx * P[0, 0] + 2.0 * nx * ny * P[0, 1] + ny * ny * P[1, 1])
+    if lacks > 0.0:
+        P[0, 0] += lacks * nx * nx
+        P[0, 1] += lacks * nx * ny
+        P[1, 0] = P[0, 1]
+        P[1, 1] += lacks * ny * ny
+    P[2, 2] += max(0.0, narrow * SIDE_RAD**2 - P[2, 2])
 
 
 def spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
