@@ -91,6 +91,24 @@ def test_a_hidden_lamp_leads_no_robot_astray_that_stands_after_its_start() -> No
     assert error < 3.0 * math.sqrt(result.covariance[0, 0] + result.covariance[1, 1])
 
 
+def test_a_robot_that_stands_keeps_its_place_when_all_lamps_but_one_are_uncovered() -> None:
+    """Those that fit again are not used before it drives on, and speak for the place nevertheless."""
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 10.0)
+    here = circle(10.0)
+    assert lf.result(filter_).fix is Fix.GOOD
+    hidden = min(lf.result(filter_).accepted)
+    room = Room(cover=lambda lamp, t: 0.05 if t < 11.0 or lamp == hidden else 1.0)
+    for k in range(1, 201):
+        t = 10.0 + 0.05 * k
+        lf.predict(filter_, wheels(lambda _: here, t, 0.05))
+        result = lf.update(filter_, room.epoch(t, here))
+        assert result.fix in (Fix.GOOD, Fix.HELD)
+    assert off(result, here)[0] < 0.1
+    assert off(result, here)[1] < math.radians(5.0)
+    assert states(result)[hidden] is LinkState.OCCLUDED
+
+
 @pytest.mark.parametrize("curve", [-0.06, 0.06])
 def test_wheels_that_have_never_been_calibrated_are_found_out(curve: float) -> None:
     filter_, room = lf.new_lights(SURVEY), Room()
