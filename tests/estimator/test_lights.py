@@ -10,8 +10,9 @@ from estimator import ekf, se2
 from estimator import lights as lf
 from estimator.cdma_epoch import BlockFlag
 from estimator.lamps import Survey
+from estimator.lights_links import Sight, gate
 from estimator.records import Array, Imu
-from estimator.result import Fix, LightsResult, LinkState
+from estimator.result import Fix, LightsResult, LinkState, speaks_against
 from tests.estimator.light_room import LAMPS, RECEIVER, SURVEY, Room, circle, drive, wheels
 from tools.sim.lightrun import room_run
 
@@ -68,6 +69,18 @@ def test_a_start_that_is_decided_keeps_nothing_of_the_other_hypotheses() -> None
     assert len(shared) == 1
     assert len(filter_.tracks) == 1
     assert filter_.tracks[0].P.base is None
+
+
+def test_what_pauses_a_link_and_what_speaks_against_the_place_are_the_same_limits() -> None:
+    assert not {"weak", "strong"} & {setting.name for setting in dataclasses.fields(lf.LightsSettings)}
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 5.0)
+    for deviations in (-3.1, -2.9, 0.0, 3.4, 3.6):
+        track = filter_.tracks[0]
+        track.watches.clear()
+        sight = Sight(5, 1e-6, 1e-18, LinkState.ACCEPTED, LAMPS[5], residual=deviations * 0.1, sigma=0.1)
+        paused = gate(filter_, track, sight) is not LinkState.ACCEPTED
+        assert paused is speaks_against(LinkState.ACCEPTED, sight.residual, sight.sigma)
 
 
 def test_standing_still_it_says_that_it_does_not_know_the_heading() -> None:
