@@ -145,7 +145,7 @@ class Observer:
         if result is None or result.lights is None:
             return Light(alive, placed=self._placed, known=self._known)
         lights, gap = result.lights, result.gap
-        against = _against(lights.links) > len(lights.accepted) and lights.fix is not Fix.NONE
+        against = _contradicts(lights) and lights.fix is not Fix.NONE
         self._placed, self._known = result.placed, _axes(result.known_axes)
         moved = result.jumps > self._jumps and self._odd
         self._jumps = result.jumps
@@ -243,9 +243,10 @@ def _axes(known: Array) -> tuple[bool, bool, bool]:
     return x, y, yaw
 
 
-def _against(links: tuple[light.Link, ...]) -> int:
-    """How many lamps are received that cannot be so at the place light is held to have told."""
-    return sum(link.against for link in links)
+def _contradicts(lights: light.LightsResult) -> bool:
+    """Whether of the lamps more are received that cannot be so at the place light is held to have told, than fit it."""
+    fitting = len(lights.accepted) + sum(link.waiting for link in lights.links)
+    return sum(link.against for link in lights.links) > fitting
 
 
 def _places(result: StepResult | None) -> int | None:

@@ -71,16 +71,24 @@ def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
 def _say_unused(memory: Memory, evidence: Evidence, why: Reason) -> tuple[State, Reason]:
     """The part of the table for a laser that is there and left out: light and odometry carry the pose, or nothing.
 
-    Where the place is lost meanwhile, what is to be done is to let the laser in again, not to drive on.
+    Where the place is lost during a pause, what is to be done is to let the laser in again, not to drive on. A computer
+    that is too slow is told by a fault of its own, and must not hide what a lost place asks for.
     """
     if memory.lost:
-        return State.LOST, why
+        return State.LOST, _why_lost(memory, why)
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
         state, reason = _say_vague(evidence.light)
-        return state, why if state is State.LOST else reason
+        return state, why if state is State.LOST and why is Reason.PAUSED else reason
     if (evidence.light is not None and evidence.light.lost) or _contradicted(memory, evidence):
         return State.DEGRADED, Reason.LIGHT_DISAGREES
     return State.DEGRADED, why
+
+
+def _why_lost(memory: Memory, why: Reason) -> Reason:
+    """The reason of a place that was lost before: that of then, or by a pause, which is to be ended."""
+    if why is Reason.PAUSED:
+        return why
+    return memory.reason if memory.state is State.LOST and memory.reason is not Reason.PAUSED else Reason.NO_WITNESS
 
 
 def _say_without_laser(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:

@@ -24,7 +24,7 @@ from estimator.lights_start import Place, begin, decide, headings, mixture, new_
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3, positive_part
 from estimator.records import Array, Imu, Odometry
-from estimator.result import Fix, LightsResult, Link, LinkState, speaks_against
+from estimator.result import Fix, LightsResult, Link, LinkState, speaks_against, waits
 
 __all__ = [
     "Lights",
@@ -273,15 +273,16 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
     states = [sight.state for sight in seen]
     doubtful = [sight.state for sight in seen if speaks_against(sight.state, sight.residual, sight.sigma)]
     against, used = len(doubtful), states.count(LinkState.ACCEPTED) - doubtful.count(LinkState.ACCEPTED)
+    fitting = used + sum(waits(sight.state, sight.residual, sight.sigma) for sight in seen)
     now = lights.course.t_mono
     if used:
         lights.t_used = now
     relearn(lights, lights.tracks[0])
     distrust(lights, lights.tracks[0])
     rejected = states.count(LinkState.REJECTED)
-    odd = rejected >= 2 and rejected > ODD_SHARE * (used + against)
+    odd = rejected >= 2 and rejected > ODD_SHARE * (fitting + against)
     lights.t_odd = min(lights.t_odd, now) if odd else math.inf
-    if against <= LOST_SHARE * (used + against):
+    if against <= LOST_SHARE * (fitting + against):
         lights.t_lost = math.inf
         return
     lights.t_lost = min(lights.t_lost, now)
@@ -289,7 +290,7 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
         return
     lights.t_lost = now
     found = places(lights, epoch)
-    if found and found[0].fits >= used + 2:
+    if found and found[0].fits >= fitting + 2:
         keep_gains(lights)
         begin(lights, found, *headings(lights.settings.headings))
         lights.lost = True

@@ -13,7 +13,7 @@ from estimator.lamps import Lamp
 from estimator.lights_state import Lights, Pause, Track, Watch
 from estimator.optics import pack_receiver
 from estimator.records import Array
-from estimator.result import Link, LinkState
+from estimator.result import STRONG, WEAK, Link, LinkState
 
 ACCEPTED, OCCLUDED, REJECTED, RIM, FAINT, TWIN, UNSURVEYED = (
     LinkState.ACCEPTED,
@@ -303,7 +303,7 @@ def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:
     if watch.moved:
         parole(watch, abs(r) < PAROLE * sigma, step)
         return REJECTED
-    low, high = r < -settings.weak * sigma, r > settings.strong * sigma
+    low, high = r < -WEAK * sigma, r > STRONG * sigma
     if low or high:
         watch.t_bad, watch.way_bad = t, way
         if math.isinf(watch.t_run):

@@ -16,7 +16,7 @@ from estimator.lamps import Survey
 from estimator.lights_catalogue import Catalogue
 from estimator.optics import LAMP_COLUMNS
 from estimator.records import Array
-from estimator.result import STRONG, WEAK, LightsResult
+from estimator.result import LightsResult
 
 
 class Pause(Enum):
@@ -105,7 +105,6 @@ class LightsSettings:
 
     Attributes:
         link_n: how many of the strongest links are used, 0 for all. pause: see :class:`Pause`.
-        weak, strong: deviations below and above which a link is paused.
         wait_s, wait_m: how long and how far a link stays paused after it fits again.
         rim_rad: links nearer to the edge of view are not used. faint: least amplitude in sigmas.
         headings: hypotheses of a start. decided: share of the probability that ends one.
@@ -115,8 +114,6 @@ class LightsSettings:
     model: ModelErrors = field(default_factory=ModelErrors)
     link_n: int = 0
     pause: Pause = Pause.LINK
-    weak: float = WEAK
-    strong: float = STRONG
     wait_s: float = 0.5
     wait_m: float = 0.15
     rim_rad: float = 0.14

@@ -25,6 +25,11 @@ UNSEEN = np.array((0.5, 0.5, 0.5))
 """One-sigma speed (m/s, m/s, rad/s) of a robot that nobody watches: it may be pushed, or go on at walking pace."""
 LARGEST_TURN = math.pi
 """No heading is less certain than one that may be any."""
+STILL_M, STILL_RAD = 0.03, 0.02
+"""A robot has stood for as long as it is found no further than that from where it was: the noise of good matches."""
+STARTS_S = 0.2
+"""So long a robot that stands is taken to be starting, as one that drives may: a scan that finds it on its way, or the
+one after a scan that was lost, must not come as a surprise."""
 
 DYING = 0.8
 """Of a velocity that nothing confirms so much is left after each scan."""
@@ -103,6 +108,7 @@ class Motion:
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
         t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
         t_told: when a match or wheels last told the pose; since then the velocity has carried it.
+        T_stood: where it stands, or last stood; t_stood: since when, infinite before anything is known.
         ahead: motion already applied beyond the last odometry. odometry: whether any has arrived; t_odometry: its end.
         doubt: factor on the noise's variance, learned. gyro: sums and bias. trail: the way of the last two seconds.
     """
@@ -115,6 +121,8 @@ class Motion:
     t_felt: float = -math.inf
     t_gyro: float = -math.inf
     t_told: float = -math.inf
+    T_stood: Array = field(default_factory=se2.identity)
+    t_stood: float = math.inf
     ahead: Array = field(default_factory=se2.identity)
     odometry: bool = False
     t_odometry: float = -math.inf
@@ -186,6 +194,7 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
     """
     begin, end = interval
     motion.t_told = max(motion.t_told, end)
+    stir(motion, end)
     dt = end - begin
     if not 1e-3 < dt < LONGEST_CARRY_S:
         return
@@ -214,24 +223,35 @@ def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
         motion.t_gyro = record.t_end
         motion.gyro.add(rate * dt, dt)
     carry_to(motion, record.t_end, noise)
+    stir(motion, record.t_end)
 
 
 def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
-    """Bring the pose to ``t_mono`` at constant velocity; an instant in the past changes nothing."""
+    """Bring the pose to ``t_mono`` at constant velocity; an instant in the past changes nothing.
+
+    :data:`LONGEST_CARRY_S` after the last that told it, the pose is held, whether others are heard meanwhile or not.
+    """
     dt = t_mono - motion.t_mono
     if not dt > 0.0:
         return
     if math.isfinite(dt):
-        unseen, dt = max(0.0, dt - LONGEST_CARRY_S), min(dt, LONGEST_CARRY_S)
-        delta = se2.exp(motion.velocity * dt)
-        variance = carried_variance(motion, dt, noise)
+        before = untold(motion)
+        carried = [min(t + dt, LONGEST_CARRY_S) - min(t, LONGEST_CARRY_S) for t in before]
+        delta = se2.exp(motion.velocity * carried)
+        variance = carried_variance(motion, before, dt, noise)
         move(motion, delta, variance)
         motion.trail.add(motion.t_mono, t_mono, delta, variance)
-        if unseen > 0.0:
+        if dt > LONGEST_CARRY_S:
             motion.trail.forget(t_mono)
-            motion.P += np.diag(np.minimum((UNSEEN * unseen) ** 2, (math.inf, math.inf, LARGEST_TURN**2)))
         motion.ahead = se2.compose(motion.ahead, delta)
     motion.t_mono = t_mono
+
+
+def stir(motion: Motion, t_mono: float) -> None:
+    """Note whether the pose is still where the robot has stood; else it has moved, and stands here at best."""
+    x, y, yaw = se2.between(motion.T_stood, motion.T_odom_base).tolist()
+    if not (motion.t_stood <= t_mono and math.hypot(x, y) < STILL_M and abs(yaw) < STILL_RAD):
+        motion.T_stood, motion.t_stood = motion.T_odom_base.copy(), t_mono
 
 
 def slow_down(motion: Motion) -> None:
@@ -241,18 +261,55 @@ def slow_down(motion: Motion) -> None:
     motion.velocity_variance = motion.velocity_variance + (1.0 - DYING * DYING) * square
 
 
-def carried_variance(motion: Motion, dt: float, noise: MotionNoise) -> Array:
-    """Variance (x, y, yaw) that carrying the pose on for ``dt`` seconds adds.
+def untold(motion: Motion) -> tuple[float, float, float]:
+    """For how long nothing has told where the robot is (x, y) and looks (yaw), s; 0 before anything ever has."""
+    place = motion.t_mono - motion.t_told
+    heading = motion.t_mono - max(motion.t_told, motion.t_gyro)
+    place, heading = (max(0.0, t) if math.isfinite(t) else 0.0 for t in (place, heading))
+    return place, place, heading
+
+
+def carried_variance(motion: Motion, before: tuple[float, float, float], dt: float, noise: MotionNoise) -> Array:
+    """Variance (x, y, yaw) that carrying the pose on for ``dt`` seconds adds, ``before`` so long carried already.
 
     What the velocity is wrong by stays the same from one carry to the next, so that errors add up, and not variances:
     a robot that hears of its lamps between two scans knows no better how it moves than one that does not. Only a gyro
-    says anew how it turns.
+    says anew how it turns. So this is what has added up by the end, less what had by the begin, however time is cut.
     """
-    since = (motion.t_told, motion.t_told, max(motion.t_told, motion.t_gyro))
-    before = np.array([min(max(0.0, motion.t_mono - t), LONGEST_CARRY_S) if math.isfinite(t) else 0.0 for t in since])
-    begin, end = before * before, (before + dt) ** 2
-    unknown = noise.acceleration_variance() * (end * end - begin * begin)
-    return np.asarray(motion.doubt * (motion.velocity_variance * (end - begin) + unknown))
+    stood = max(0.0, motion.t_told - motion.t_stood)
+    spread, unknown = (
+        motion.velocity_variance.tolist(),
+        (noise.acceleration, noise.acceleration, noise.angular_acceleration),
+    )
+    added = []
+    for axis, t in enumerate(before):
+        grown = carried_square(t + dt, unknown[axis], axis, stood, motion.doubt)
+        grown -= carried_square(t, unknown[axis], axis, stood, motion.doubt)
+        t0, t1 = min(t, LONGEST_CARRY_S), min(t + dt, LONGEST_CARRY_S)
+        added.append(motion.doubt * spread[axis] * (t1 * t1 - t0 * t0) + grown)
+    added[2] = min(added[2], max(0.0, LARGEST_TURN**2 - float(motion.P[2, 2])))
+    return np.array(added)
+
+
+def carried_square(t: float, acceleration: float, axis: int, stood: float, doubt: float) -> float:
+    """Variance of how far a robot is along an axis from where its velocity of ``t`` seconds ago has brought it.
+
+    The velocity is another one by the acceleration that nobody knows, but by no more than that of a robot which nobody
+    watches; after :data:`LONGEST_CARRY_S` the pose is held, and all of such a velocity is its error. One that has
+    ``stood`` for so many seconds goes on standing for another ``t`` with the chance ``stood / (stood + t)``: nothing
+    says how long a halt lasts but how long it has lasted. If it starts, any moment is as likely, which makes the square
+    of its way a third.
+    """
+    speed = float(UNSEEN[axis])
+
+    def square(t: float) -> float:
+        carried = min(t, LONGEST_CARRY_S)
+        way = min(acceleration * carried, speed) * carried
+        return doubt * way * way + (speed * (t - carried)) ** 2
+
+    if t <= STARTS_S or stood <= 0.0:
+        return square(t)
+    return max(square(STARTS_S), square(t) * t / (t + 3.0 * stood))
 
 
 def learn(motion: Motion, correction: Array, H: Array, known: bool) -> Array:

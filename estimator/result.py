@@ -106,6 +106,8 @@ class Loop:
 
 WEAK, STRONG = 3.0, 3.5
 """Deviations below and above which a lamp is too weak, or too strong, for the place."""
+FITS = 2.0
+"""Deviations within which one that is not used fits the place."""
 
 
 class LinkState(Enum):
@@ -149,6 +151,11 @@ class Link:
         """Whether it speaks against the place, see :func:`speaks_against`."""
         return speaks_against(self.state, self.residual, self.sigma)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether it fits the place and only waits to be used again, see :func:`waits`."""
+        return waits(self.state, self.residual, self.sigma)
+
 
 def speaks_against(state: LinkState, residual: float | None, sigma: float | None) -> bool:
     """Whether what is received of a lamp speaks against the place.
@@ -159,6 +166,16 @@ def speaks_against(state: LinkState, residual: float | None, sigma: float | None
     if state not in (LinkState.ACCEPTED, LinkState.OCCLUDED) or residual is None or sigma is None:
         return state in (LinkState.OCCLUDED, LinkState.REJECTED)
     return residual < -WEAK * sigma or (state is LinkState.ACCEPTED and residual > STRONG * sigma)
+
+
+def waits(state: LinkState, residual: float | None, sigma: float | None) -> bool:
+    """Whether a lamp that is not used is received as it should be at the place, and so speaks for it.
+
+    One that was hidden is used again only after a while and some way: if the robot stands, not before it drives on.
+    """
+    if state is not LinkState.OCCLUDED or residual is None or sigma is None:
+        return False
+    return abs(residual) <= FITS * sigma
 
 
 class Fix(Enum):

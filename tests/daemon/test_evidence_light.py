@@ -97,6 +97,14 @@ def test_lamps_that_fit_again_and_wait_to_be_used_do_not_contradict() -> None:
         assert Watch().light(result(lit(seen=seen)), EPOCH).agrees is agrees
 
 
+def test_lamps_that_fit_again_and_wait_speak_for_the_place() -> None:
+    fits = replace(links(LinkState.OCCLUDED)[0], residual=0.01, sigma=0.01)
+    hidden = replace(fits, residual=-0.5)
+    for waiting, agrees in ((0, False), (1, True)):
+        seen = (*links(LinkState.RIM), hidden, *[fits] * waiting)
+        assert Watch().light(result(lit(seen=seen)), EPOCH).agrees is agrees
+
+
 def test_a_jump_after_a_contradiction_has_moved_the_pose_and_another_has_not() -> None:
     watch = Watch()
     assert not watch.light(result(lit(), jumps=1), EPOCH).moved

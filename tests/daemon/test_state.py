@@ -308,7 +308,8 @@ def test_a_laser_that_is_left_out_degrades_and_says_why(why: Reason) -> None:
     assert said(paused) == (State.DEGRADED, why)
     assert paused.known == (False, False, False)
     assert not paused.doubt  # odometry has carried the pose
-    assert said(judge(paused, seen(6.0, None, sigma_m=1.1 * rules.LOST_M, unused=why))) == (State.LOST, why)
+    lost = judge(paused, seen(6.0, None, sigma_m=1.1 * rules.LOST_M, unused=why))
+    assert said(lost) == (State.LOST, why if why is Reason.PAUSED else Reason.UNCERTAIN)
     contradicted = scans(6.0, 5, None, light=replace(LIT, agrees=False), odometry=True, unused=why)
     assert said(run(paused, contradicted)) == (State.DEGRADED, Reason.LIGHT_DISAGREES)
     assert run(paused, scans(6.0, 40, odometry=True)).state is State.TRACKING
@@ -319,6 +320,19 @@ def test_a_pause_without_odometry_leaves_a_place_in_doubt() -> None:
     assert paused.doubt
     lost = replace(tracking(), lost=True, doubt=True)
     assert said(judge(lost, seen(3.0, None, unused=Reason.PAUSED))) == (State.LOST, Reason.PAUSED)
+
+
+def test_a_lost_place_is_what_is_told_whether_the_computer_is_too_slow_or_not() -> None:
+    lost = run(tracking(), scans(3.0, 30, BAD))
+    assert said(lost) == (State.LOST, Reason.NO_WITNESS)
+    vague = judge(tracking(), seen(3.0, sigma_rad=1.1 * rules.LOST_RAD))
+    assert said(vague) == (State.LOST, Reason.UNCERTAIN)
+    for before in (lost, vague):
+        slow = run(before, scans(6.0, 30, None, unused=Reason.OVERLOADED))
+        assert said(slow) == said(before)
+        paused = judge(slow, seen(9.0, None, unused=Reason.PAUSED))
+        assert said(paused) == (State.LOST, Reason.PAUSED)
+        assert said(judge(paused, seen(9.1, None, unused=Reason.OVERLOADED))) == (State.LOST, Reason.NO_WITNESS)
 
 
 def test_every_reason_has_a_meaning_and_every_trouble_a_remedy() -> None:

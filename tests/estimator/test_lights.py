@@ -10,8 +10,9 @@ from estimator import ekf, se2
 from estimator import lights as lf
 from estimator.cdma_epoch import BlockFlag
 from estimator.lamps import Survey
+from estimator.lights_links import Sight, gate
 from estimator.records import Array, Imu
-from estimator.result import Fix, LightsResult, LinkState
+from estimator.result import Fix, LightsResult, LinkState, speaks_against
 from tests.estimator.light_room import LAMPS, RECEIVER, SURVEY, Room, circle, drive, wheels
 from tools.sim.lightrun import room_run
 
@@ -70,6 +71,18 @@ def test_a_start_that_is_decided_keeps_nothing_of_the_other_hypotheses() -> None
     assert filter_.tracks[0].P.base is None
 
 
+def test_what_pauses_a_link_and_what_speaks_against_the_place_are_the_same_limits() -> None:
+    assert not {"weak", "strong"} & {setting.name for setting in dataclasses.fields(lf.LightsSettings)}
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 5.0)
+    for deviations in (-3.1, -2.9, 0.0, 3.4, 3.6):
+        track = filter_.tracks[0]
+        track.watches.clear()
+        sight = Sight(5, 1e-6, 1e-18, LinkState.ACCEPTED, LAMPS[5], residual=deviations * 0.1, sigma=0.1)
+        paused = gate(filter_, track, sight) is not LinkState.ACCEPTED
+        assert paused is speaks_against(LinkState.ACCEPTED, sight.residual, sight.sigma)
+
+
 def test_standing_still_it_says_that_it_does_not_know_the_heading() -> None:
     filter_, room = lf.new_lights(SURVEY), Room()
     for k in range(200):
@@ -89,6 +102,24 @@ def test_a_hidden_lamp_leads_no_robot_astray_that_stands_after_its_start() -> No
     error, _ = off(result, here)
     assert error < 0.3
     assert error < 3.0 * math.sqrt(result.covariance[0, 0] + result.covariance[1, 1])
+
+
+def test_a_robot_that_stands_keeps_its_place_when_all_lamps_but_one_are_uncovered() -> None:
+    """Those that fit again are not used before it drives on, and speak for the place nevertheless."""
+    filter_ = lf.new_lights(SURVEY)
+    follow(filter_, Room(), 10.0)
+    here = circle(10.0)
+    assert lf.result(filter_).fix is Fix.GOOD
+    hidden = min(lf.result(filter_).accepted)
+    room = Room(cover=lambda lamp, t: 0.05 if t < 11.0 or lamp == hidden else 1.0)
+    for k in range(1, 201):
+        t = 10.0 + 0.05 * k
+        lf.predict(filter_, wheels(lambda _: here, t, 0.05))
+        result = lf.update(filter_, room.epoch(t, here))
+        assert result.fix in (Fix.GOOD, Fix.HELD)
+    assert off(result, here)[0] < 0.1
+    assert off(result, here)[1] < math.radians(5.0)
+    assert states(result)[hidden] is LinkState.OCCLUDED
 
 
 @pytest.mark.parametrize("curve", [-0.06, 0.06])

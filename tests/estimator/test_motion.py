@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -110,6 +112,82 @@ def test_what_a_velocity_is_wrong_by_does_not_average_out_over_many_short_carrie
         motion.carry_to(often, float(t), NOISE)
     np.testing.assert_allclose(np.diag(often.P), np.diag(once.P), rtol=1e-6)
     assert np.sqrt(once.P[2, 2]) == pytest.approx(np.hypot(0.2 * 0.1, 2.0 * 0.1**2), rel=1e-6)
+
+
+def unseen(seconds: float, cuts: int, stood_s: float = 0.0) -> Motion:
+    """A robot without wheels and gyro, so long after its last match, with so many records of others in between."""
+    moving = driving((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    moving.t_told, moving.t_stood, moving.velocity_variance = 10.0, 10.0 - stood_s, np.array((0.01, 0.01, 0.04))
+    for k in range(1, cuts + 1):
+        motion.carry_to(moving, 10.0 + seconds * k / cuts, NOISE)
+    return moving
+
+
+@pytest.mark.parametrize("stood_s", [0.0, 1.0, 30.0])
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 0.5, 1.0, 2.0, 10.0])
+def test_what_nobody_has_watched_does_not_depend_on_how_time_is_cut(seconds: float, stood_s: float) -> None:
+    once = np.diag(unseen(seconds, 1, stood_s).P)
+    for cuts in (2, 7, 40, 400):
+        np.testing.assert_allclose(np.diag(unseen(seconds, cuts, stood_s).P), once, rtol=1e-6)
+    assert once[2] <= math.pi**2
+    assert once[0] <= (0.1 * min(seconds, 0.5)) ** 2 + (0.5 * seconds) ** 2 + 1e-9, "walking pace"
+
+
+def test_what_nobody_has_watched_grows_as_long_as_it_lasts_and_a_heading_up_to_any() -> None:
+    P = [np.diag(unseen(seconds, 20).P) for seconds in (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 4.0, 8.0)]
+    for earlier, later in pairwise(P):
+        assert (later > earlier).all()
+    assert unseen(60.0, 600).P[2, 2] == pytest.approx(math.pi**2)
+
+
+def test_a_pose_is_held_when_its_velocity_says_nothing_any_more_however_time_is_cut() -> None:
+    for cuts in (1, 3, 60):
+        moving = driving((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+        moving.t_told = 10.0
+        for k in range(1, cuts + 1):
+            motion.carry_to(moving, 10.0 + 3.0 * k / cuts, NOISE)
+        assert moving.T_odom_base[0] == pytest.approx(0.5)
+
+
+def watched(path: Callable[[float], tuple[float, float, float]], seconds: float) -> Motion:
+    """A robot whose laser tells ten times a second, to a millimetre, where it is; it has no wheels."""
+    moving, noise = driving((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), np.random.default_rng(1)
+    before = np.array(path(0.0))
+    for k in range(1, round(10.0 * seconds) + 1):
+        motion.carry_to(moving, 10.0 + 0.1 * k, NOISE)
+        moving.T_odom_base = np.array(path(0.1 * k)) + 1e-3 * noise.standard_normal(3)
+        moving.P = np.diag((1e-6, 1e-6, 1e-6))
+        made = se2.between(before, moving.T_odom_base)
+        motion.feel(moving, made, (9.9 + 0.1 * k, 10.0 + 0.1 * k), 2.0 * moving.P.diagonal(), NOISE)
+        before = moving.T_odom_base
+    return moving
+
+
+def test_a_robot_that_has_stood_may_start_at_once_but_is_not_lost_for_a_lost_scan() -> None:
+    stands, drives = watched(lambda _: (1.0, 2.0, 0.5), 3.0), watched(lambda t: (0.3 * t, 0.0, 0.0), 3.0)
+    crawls = watched(lambda t: (0.0, 0.0, 0.2 * t), 3.0)
+    for moving in (stands, drives, crawls):
+        moving.P = np.zeros((3, 3))
+        motion.carry_to(moving, 13.2, NOISE)
+    sigma = np.sqrt(np.diag(stands.P))
+    np.testing.assert_allclose(sigma, np.sqrt(np.diag(drives.P)), rtol=0.01)  # a scan or two: it may have started
+    for moving in (stands, drives, crawls):
+        motion.carry_to(moving, 14.0, NOISE)
+    assert math.sqrt(stands.P[2, 2]) < 0.26, "a second without a scan"
+    assert math.sqrt(drives.P[2, 2]) > 0.3
+    assert math.sqrt(crawls.P[2, 2]) > 0.26, "what turns slowly does not stand"
+    motion.carry_to(stands, 23.0, NOISE)
+    assert math.sqrt(stands.P[0, 0]) > 2.0, "nobody knows for how long a robot goes on standing"
+
+
+def test_how_far_a_robot_comes_that_starts_some_time_is_within_what_is_said() -> None:
+    """One that has stood for T goes on for s more with the chance T / (T + s); then it turns at walking pace."""
+    rng, stood = np.random.default_rng(0), 3.0
+    for seconds in (0.3, 0.5, 1.0, 2.0):
+        start = stood * (1.0 / (1.0 - rng.random(20000)) - 1.0)
+        rate, u = 0.5 * rng.standard_normal(20000), np.maximum(0.0, seconds - start)
+        turned = rate * np.maximum(0.5 * u, u - 0.25) * (u > 0.0)
+        assert np.sqrt(np.mean(turned**2)) < math.sqrt(unseen(seconds, 10, stood).P[2, 2])
 
 
 def test_a_velocity_that_no_scan_confirms_is_doubted_by_what_it_loses() -> None:
