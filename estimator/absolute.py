@@ -358,7 +358,7 @@ def blind(state: State) -> bool:
 
 
 def tells(state: State) -> bool:
-    """Whether light has told the place and goes on telling; lamps that went out hold nobody where they told him to be."""
+    """Whether light has told the place and goes on telling; lamps that went out hold nobody where he was."""
     tie, light = state.absolute, state.light
     return tie is not None and tie.placed and light is not None and state.fused.t_mono - light.filter.t_used <= SILENT_S
 
