@@ -48,6 +48,7 @@ def test_two_rows_one_lamp_or_none_change_nothing() -> None:
         assert np.sqrt(np.diag(P)) == pytest.approx((0.02, 0.02, 0.01), abs=2e-4)
 
 
+@pytest.mark.jit
 def test_along_a_corridor_light_alone_does_not_become_certain_of_a_wrong_side() -> None:
     """Walls beside make lamps that are farther look stronger than in a room: 65 cm off, which it held to 11 cm."""
     run = drive_of(CASES[1], 1)
