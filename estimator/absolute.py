@@ -64,8 +64,6 @@ KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
 """Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey's frame counts as known."""
 MEMORY_S = 1.0
 """How late a light epoch may come."""
-SILENT_S = 0.5
-"""Light of which nothing could be used for so long says nothing of where the robot is now."""
 
 
 @dataclass(slots=True, eq=False)
@@ -355,12 +353,6 @@ def blind(state: State) -> bool:
     tie = state.absolute
     assert tie is not None
     return state.fused.t_mono - tie.t_match > max(BLIND_S, BLIND_PERIODS * tie.scan_s)
-
-
-def tells(state: State) -> bool:
-    """Whether light has told the place and goes on telling; lamps that went out hold nobody where he was."""
-    tie, light = state.absolute, state.light
-    return tie is not None and tie.placed and light is not None and state.fused.t_mono - light.filter.t_used <= SILENT_S
 
 
 def pose_at(state: State, t_mono: float) -> Array:

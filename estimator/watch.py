@@ -47,7 +47,7 @@ def take(state: State, watch: Watch, frame: Keyframe, payload: object) -> None:
     if watch.strikes >= STRIKES and state.atlas.watch is watch and state.atlas.adrift is None:
         state.atlas.watch = None
         if watch.alone:
-            adrift.disown(state, watch.first, watch.since)
+            adrift.disown(state, watch)
         adrift.begin(state)
 
 
