@@ -289,7 +289,7 @@ def said(state: State, one: Hypothesis) -> bool | None:
     from estimator import relocate_light
 
     T_map_base = se2.compose(one.T_map_odom, state.fused.T_odom_base)
-    if relocate_light.witness(state, T_map_base, one.latest[0] if one.latest is not None else None):
+    if relocate_light.witness(state, T_map_base):
         return True
     return False if relocate_light.compatible(state, T_map_base) is False else None
 

@@ -17,14 +17,13 @@ import numpy as np
 
 from estimator import se2
 from estimator.cdma_epoch import UNUSABLE
-from estimator.keyframe import Keyframe
 from estimator.lamps import Lamp
 from estimator.light import Light
 from estimator.lights_links import remembered, sights
 from estimator.lights_start import Place, places, probabilities
 from estimator.lights_state import Lights, Track
 from estimator.linear3 import invert3
-from estimator.records import Array, Beam
+from estimator.records import Array
 from estimator.result import SURPRISE, Fix, LinkState
 from estimator.row import ACROSS_M, ROW_M, spread
 from estimator.state import State
@@ -48,8 +47,6 @@ LEAST: Final = 3
 """Links used without which light is no witness."""
 AGAINST: Final = 0.34
 """Share of links against the place from which on it is none."""
-BEHIND_M: Final = 0.5
-"""By which a lamp has to be farther away than what the laser sees there, to be behind it: lamps hang over shelves."""
 
 HEADED_M: Final = 3.0
 """Way since the `lights` filter last looked for its place, before which its heading rules nothing out: strengths tell
@@ -256,13 +253,11 @@ def fits(track: Track, T_map_base: Array) -> bool:
     return float(off @ invert3(FACTOR * track.P[:3, :3] + SLACK) @ off) < SURPRISE
 
 
-def witness(state: State, T_map_base: Array, frame: Keyframe | None = None) -> bool:
+def witness(state: State, T_map_base: Array) -> bool:
     """Whether light counts as the second witness of a pose that the laser has found.
 
     It does where lamps are used and few are against it, and where it allows no other place: a second window means that
     codes repeat, or that the lamps in view are too few to tell.
-
-    ``frame``: what is seen there. A lamp behind it that is too weak is in another room, and against nothing.
     """
     if compatible(state, T_map_base) is not True or len(windows(state)) != 1:
         return False
@@ -274,20 +269,5 @@ def witness(state: State, T_map_base: Array, frame: Keyframe | None = None) -> b
     if lights.result is None:
         return False
     links = lights.result.links
-    used, against = sum(link.state is LinkState.ACCEPTED for link in links), [link for link in links if link.against]
-    weak = {link.lamp_id for link in against if link.state is LinkState.OCCLUDED}
-    lamps = [lamp for lamp in lights.survey.lamps if lamp.lamp_id in weak]
-    hidden = behind(frame, T_map_base, state.fused.T_odom_base, lamps) if frame is not None and lamps else 0
-    return used >= LEAST and len(against) - hidden <= AGAINST * (used + len(against) - hidden)
-
-
-def behind(frame: Keyframe, T_map_base: Array, T_odom_base: Array, lamps: list[Lamp]) -> int:
-    """How many lamps stand behind what a keyframe shows, where the robot's place (two frames) puts it."""
-    T_map_lidar = se2.compose(se2.compose(T_map_base, se2.inverse(T_odom_base)), frame.T_odom_lidar)
-    at = se2.apply(se2.inverse(T_map_lidar), np.array([(lamp.x, lamp.y) for lamp in lamps]))
-    bearing, reach, beam = frame.beams()
-    off = np.abs(np.arctan2(at[:, 1], at[:, 0])[:, None] - bearing)
-    near = np.argmin(np.minimum(off, 2.0 * np.pi - off), axis=1)
-    seen = np.minimum(off, 2.0 * np.pi - off).min(axis=1) <= np.ptp(bearing) / max(1, len(bearing) - 1)
-    ends = (beam[near] == Beam.HIT) & (reach[near] < np.hypot(at[:, 0], at[:, 1]) - BEHIND_M)
-    return int((seen & ends).sum())
+    used, against = sum(link.state is LinkState.ACCEPTED for link in links), sum(link.against for link in links)
+    return used >= LEAST and against <= AGAINST * (used + against)

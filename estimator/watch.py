@@ -10,7 +10,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from estimator import adrift, se2
+from estimator import adrift
 from estimator.atlas import LOOK
 from estimator.hypotheses import Watch
 from estimator.keyframe import Keyframe
@@ -33,28 +33,16 @@ def keyframe_laid(state: State, frame: Keyframe) -> None:
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
     if pieces:
         query = Query(frame, pieces, watch.terrain, (frame.T_map_keyframe,), (), search=False)
-        watch.job = atlas.ask(LOOK, partial(look, query, told), partial(take, state, watch, frame))
+        watch.job = atlas.ask(LOOK, partial(look, query, told), partial(take, state, watch))
 
 
-def take(state: State, watch: Watch, frame: Keyframe, payload: object) -> None:
-    """Take in what a look has found. Where light witnesses the place, it is the room that has changed, or people."""
+def take(state: State, watch: Watch, payload: object) -> None:
+    """Take in what a look has found."""
     assert isinstance(payload, Looked)
     (fit,), watch.terrain = payload.guesses, payload.terrain
-    if fit.verdict is Verdict.HOLDS or (fit.verdict is Verdict.NO and witnessed(state, frame)):
-        watch.strikes = 0
-    elif fit.verdict is Verdict.NO:
-        watch.strikes += 1
+    watch.strikes = 0 if fit.verdict is Verdict.HOLDS else watch.strikes + (fit.verdict is Verdict.NO)
     if watch.strikes >= STRIKES and state.atlas.watch is watch and state.atlas.adrift is None:
         state.atlas.watch = None
         if watch.alone:
             adrift.disown(state, watch)
         adrift.begin(state)
-
-
-def witnessed(state: State, frame: Keyframe) -> bool:
-    """Whether light says that the robot is where it takes itself to be."""
-    if state.light is None:
-        return False
-    from estimator import relocate_light  # costs nothing where there is no photodiode
-
-    return relocate_light.witness(state, se2.compose(state.T_map_odom, state.fused.T_odom_base), frame)

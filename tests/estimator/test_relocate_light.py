@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimator import adrift, se2
-from estimator.keyframe import Keyframe, Submap
+from estimator.keyframe import Submap
 from estimator.light import LightsSetup
 from estimator.lights_start import rule_out
 from estimator.pipeline import new_state, step
@@ -27,7 +27,7 @@ from estimator.relocate_light import (
     windows,
     witness,
 )
-from estimator.result import Fix, Link, LinkState
+from estimator.result import Fix
 from estimator.state import State
 from estimator.submap import Settled
 from tools.experiments.relocate_world import Site, Stroll, lit_house
@@ -87,28 +87,6 @@ def test_what_fits_is_compatible_and_what_lies_elsewhere_is_not() -> None:
     assert compatible(state, HERE + np.array((3.0, 0.0, 0.0))) is False
     assert witness(state, HERE)
     assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
-
-
-def test_a_lamp_behind_what_the_laser_sees_is_not_against_the_place() -> None:
-    """Behind a wall it is received as a few per cent of what it would be in view; behind a table's edge it is not."""
-    state = shown(robot())
-    lights = state.light.filter  # type: ignore[union-attr]
-    assert lights.result is not None
-    far = [one for one in lights.survey.lamps if 5.0 < math.hypot(one.x - HERE[0], one.y - HERE[1]) < 9.0][:4]
-    assert len(far) == 4
-    weak = tuple(Link(one.code, one.lamp_id, LinkState.OCCLUDED, 1e-9, -3.6, 0.15) for one in far)
-    used = tuple(one for one in lights.result.links if one.state is LinkState.ACCEPTED)[:3]
-    lights.result = replace(lights.result, links=used + weak)
-    bearing = np.radians(np.arange(-180.0, 180.0, 2.0))
-    for reach, beam, holds in ((2.0, 1, True), (20.0, 1, False), (2.0, 0, False)):
-        ranges, kinds = np.full(len(bearing), reach, np.float32), np.full(len(bearing), beam, np.uint8)
-        frame = Keyframe(3, state.atlas.submaps[1], np.zeros(3), np.zeros(3), bearing, 0.0, ranges, kinds)
-        assert witness(state, HERE, frame) is holds
-    assert not witness(state, HERE)
-    strong = tuple(replace(one, state=LinkState.REJECTED, residual=2.0) for one in weak)
-    lights.result = replace(lights.result, links=used + strong)
-    frame = Keyframe(3, state.atlas.submaps[1], np.zeros(3), np.zeros(3), bearing, 0.0, ranges * 0 + 2, kinds * 0 + 1)
-    assert not witness(state, HERE, frame)  # what is too strong is not behind anything
 
 
 def test_a_heading_from_light_rules_a_place_out_only_after_some_way() -> None:

@@ -47,30 +47,18 @@ def looked(verdict: Verdict) -> Looked:
     ],
 )
 def test_three_contradictions_without_one_that_holds_end_it(verdicts: list[Verdict], lost: bool) -> None:
-    state, seen, frame = watched()
+    state, seen, _ = watched()
     for verdict in verdicts:
-        watch.take(state, seen, frame, looked(verdict))
+        watch.take(state, seen, looked(verdict))
     assert (state.atlas.adrift is not None) == lost
     assert (state.atlas.watch is None) == lost
 
 
-def test_a_place_that_light_witnesses_is_not_given_up_for_a_room_that_has_changed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A robot that stood right among people set out to look for itself, seven seconds after it had been switched on."""
-    for lit in (True, False):
-        state, seen, frame = watched()
-        monkeypatch.setattr(watch, "witnessed", lambda state, frame, lit=lit: lit)
-        for _ in range(watch.STRIKES):
-            watch.take(state, seen, frame, looked(Verdict.NO))
-        assert (state.atlas.adrift is None) == lit
-
-
 def test_an_answer_to_a_place_given_up_meanwhile_counts_for_nothing() -> None:
-    state, seen, frame = watched()
+    state, seen, _ = watched()
     state.atlas.watch = None
     for _ in range(5):
-        watch.take(state, seen, frame, looked(Verdict.NO))
+        watch.take(state, seen, looked(Verdict.NO))
     assert state.atlas.adrift is None
 
 
@@ -105,7 +93,7 @@ def test_what_was_mapped_in_a_place_that_was_the_wrong_one_goes_if_the_laser_alo
         older = {key: one for key, one in state.keyframes.items() if key < newest.first}
         assert (newest.key in {piece.key for piece in image_of(state).unsettled}) == (not alone)
         for _ in range(watch.STRIKES):
-            watch.take(state, seen, frame, looked(Verdict.NO))
+            watch.take(state, seen, looked(Verdict.NO))
         assert (newest.key in state.atlas.submaps) == (not alone)
         assert (newest.key in state.atlas.constraints.between) == (not alone)
         assert (state.keyframes == older) == alone
@@ -125,7 +113,7 @@ def test_the_live_map_no_longer_shows_it() -> None:
     late = state.atlas.take_jobs()
     assert late
     for _ in range(watch.STRIKES):
-        watch.take(state, seen, frame, looked(Verdict.NO))
+        watch.take(state, seen, looked(Verdict.NO))
     for job in late:
         take_answer(state, Answer(0.0, job.job_id, job.run()))
     go_on(state)
