@@ -207,10 +207,11 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
-        if lights.course.wheels and len(lights.tracks) == 1 and lights.result is not None:
-            row.loosen(lights.catalogue, lights.result.accepted, track.P)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
+        x0, P0 = track.x[:3].copy(), track.P[:3, :3].copy()
         likelihood = absorb(lights, track, seen, view_of(lights, back))
+        if lights.course.wheels and len(lights.tracks) == 1 and lights.result is not None:
+            row.moderate(lights.catalogue, lights.result.accepted, x0, P0, track.x, track.P)
         track.weight += likelihood * news
         views.append((track, seen))
     if len(lights.tracks) > 1:
