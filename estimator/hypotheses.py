@@ -210,7 +210,8 @@ class Suspicion:
     Attributes:
         fitted: scans that have fitted since something else raised the suspicion, 0: nothing has. jumped: the pose did.
         odd: a match has moved it by more than the prediction allowed. share: of the beams that fits usually.
-        still_s: how long the wheels have stood since the last match, unwatched_s: the longest time that they did.
+        t_still: since when the wheels stand, as far as they have told since the last match; moved: what they have turned
+            by since (x, y, yaw). unwatched_s: the longest time since that match that they stood for before they turned.
         period_s: usual time between two matches, 0 before it is known.
         job: ID of the look under way, 0: none. t_asked: when it was asked for.
     """
@@ -219,7 +220,8 @@ class Suspicion:
     jumped: bool = False
     odd: bool = False
     share: float = 0.0
-    still_s: float = 0.0
+    t_still: float = -math.inf
+    moved: Array = field(default_factory=lambda: np.zeros(3))
     unwatched_s: float = 0.0
     period_s: float = 0.0
     job: int = 0

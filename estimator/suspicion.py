@@ -19,6 +19,8 @@ import math
 from functools import partial
 from typing import Final
 
+import numpy as np
+
 from estimator import adrift, keyframe, localmap, relocate, se2
 from estimator.atlas import LOOK
 from estimator.fusion import noise_of
@@ -45,8 +47,9 @@ CHANGED: Final = 0.1
 """Share of the beams by which what is seen fits worse than before, where it is not the same."""
 LEARNING: Final = 0.1
 """Share of the latest match in what is usual: the time between two, and how many beams fit."""
-STILL_M, STILL_RAD = 0.002, 0.002
-"""Wheels that turn by no more between two readings stand."""
+STILL_M, STILL_RAD = 0.01, 0.01
+"""Wheels stand that have turned by no more since they stopped, however often they tell it: 0.02 m/s for
+`UNWATCHED_S`."""
 NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
 310 thousand."""
@@ -55,12 +58,16 @@ PATIENCE_S: Final = 2.0
 
 
 def on_odometry(state: State, record: Odometry) -> None:
-    """Take in how long the wheels stand."""
+    """Take in whether the wheels stand; as long as they tell nothing, they are not known to turn."""
     doubt = state.suspicion
-    x, y, yaw = record.delta.tolist()
-    still = math.hypot(x, y) <= STILL_M and abs(yaw) <= STILL_RAD
-    doubt.still_s = doubt.still_s + record.t_end - record.t_begin if still else 0.0
-    doubt.unwatched_s = max(doubt.unwatched_s, doubt.still_s)
+    moved = doubt.moved + record.delta
+    x, y, yaw = moved.tolist()
+    if not math.isfinite(x + y + yaw):
+        return
+    doubt.moved = moved
+    if math.hypot(x, y) > STILL_M or abs(yaw) > STILL_RAD:
+        doubt.unwatched_s = max(doubt.unwatched_s, record.t_begin - doubt.t_still)
+        doubt.t_still, doubt.moved = max(doubt.t_still, record.t_end), np.zeros(3)
 
 
 def waits(state: State) -> bool:
@@ -96,9 +103,10 @@ def raised(state: State, match: MatchResult) -> bool:
 
 def unwatched(state: State) -> bool:
     """Whether the robot has stood, or nobody knows, for long without a match; another one has come now."""
-    doubt, since = state.suspicion, state.fused.t_mono - state.t_match
-    usual, alone_s = doubt.period_s, min(doubt.unwatched_s, since) if state.fused.odometry else since
-    doubt.still_s = doubt.unwatched_s = 0.0
+    doubt, now = state.suspicion, state.fused.t_mono
+    usual, since = doubt.period_s, now - state.t_match
+    alone_s = min(since, max(doubt.unwatched_s, now - doubt.t_still))
+    doubt.t_still, doubt.moved, doubt.unwatched_s = now, np.zeros(3), 0.0
     if math.isfinite(since):
         doubt.period_s = (1.0 - LEARNING) * usual + LEARNING * min(since, 2.0 * usual) if usual else since
     return usual > 0.0 and alone_s >= max(UNWATCHED_S, MISSED * usual)

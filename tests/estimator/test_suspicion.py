@@ -95,13 +95,29 @@ def test_a_covered_lidar_takes_nothing_from_a_place_that_is_like_no_other(scans:
     assert robot.off()[0] < 0.1
 
 
-def test_wheels_that_turn_while_the_lidar_is_covered_say_that_nobody_carries_the_robot() -> None:
+@pytest.mark.parametrize("readings", [1, 10])
+def test_wheels_that_turn_while_the_lidar_is_covered_say_that_nobody_carries_the_robot(readings: int) -> None:
+    """However often they tell it: at 100 Hz 0.1 m/s is a millimetre a reading."""
+    robot = driven(IMAGE, ABOUT)
+    robot.readings = readings
+    assert robot.T is not None
+    poses = [se2.compose(robot.T, np.array((-0.01 * k, 0.0, 0.0))) for k in range(1, 36)]
+    for T in poses[:25]:
+        robot.at(T, covered=True)
+    for T in poses[25:]:
+        assert robot.at(T).places is None
+        assert robot.state.suspicion.fitted == 0, "it was seen to drive"
+
+
+def test_wheels_that_tell_nothing_do_not_say_that_the_robot_was_not_carried() -> None:
+    """An emergency stop that takes the power from the wheels and their counters, and the lidar is covered."""
     robot = driven(IMAGE, ABOUT)
     assert robot.T is not None
-    poses = [se2.compose(robot.T, np.array((-0.03 * k, 0.0, 0.0))) for k in range(1, 26)]
-    for T in poses[:15]:
-        robot.at(T, covered=True)
-    assert {robot.at(T).places for T in poses[15:]} == {None}
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((0.2, 0.1, 0.1))))
+    for k in range(15):
+        robot.at(there, carried=k == 0, covered=True, silent=True)
+    said = [robot.at(there, silent=True).places for _ in range(3)] + stand(robot, there, 12)
+    assert said[-1] == 2
 
 
 def test_people_who_stand_about_and_leave_are_no_reason() -> None:
