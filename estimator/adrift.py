@@ -67,14 +67,14 @@ def begin(state: State) -> bool:
 
 
 def local_map_lost(state: State) -> None:
-    """The local map is begun anew: the robot may have been carried off, unless light holds it where it is.
+    """The local map is begun anew: the robot may have been carried off, unless light that tells now holds it here.
 
     Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One
     that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
     """
     tie = state.absolute
     held = False
-    if tie is not None and tie.placed and tie.gap is not None:
+    if tie is not None and absolute.tells(state) and tie.gap is not None:
         from estimator.relocate_light import in_place
 
         here = se2.compose(state.T_map_odom, state.fused.T_odom_base)

@@ -9,7 +9,7 @@ is suspected where physics says that something else than driving has happened:
 
 One look in the whole map then decides: if another place fits nearly as well the robot is adrift. So it is after a jump
 where the place does not hold, there or in the local map; all else may have been a door, or somebody who sat and left.
-Until the answer has come nothing is laid into the map. Where light has placed it light is the witness, see
+Until the answer has come nothing is laid into the map. While light tells the place light is the witness, see
 `adrift.doubt`.
 """
 
@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator import adrift, keyframe, localmap, relocate, se2
+from estimator import absolute, adrift, keyframe, localmap, relocate, se2
 from estimator.atlas import LOOK
 from estimator.fusion import noise_of
 from estimator.hypotheses import BEHIND
@@ -83,8 +83,7 @@ def raised(state: State, match: MatchResult) -> bool:
     if not match.ok or state.local is None:
         return False
     alone = unwatched(state)
-    lit = state.absolute is not None and state.absolute.placed
-    if lit or atlas.adrift is not None or state.settings.loops is None or doubt.job in atlas.asked:
+    if absolute.tells(state) or atlas.adrift is not None or state.settings.loops is None or doubt.job in atlas.asked:
         doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
         return False
     share, odd = match.inliers / max(1, match.queries), surprising(state, match)

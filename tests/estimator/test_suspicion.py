@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from estimator import se2
+from estimator.light import LightsSetup
 from estimator.pipeline import new_state
-from estimator.records import Array
+from estimator.records import Array, Command, Order
 from tests.estimator.adrift import Robot, furnished, way
 from tools.bench._scenes import Scene, box
 
@@ -23,13 +24,19 @@ HALL = ((1.0, 6.0), (10.8, 6.0))
 TOUR = (*HALL, (1.85, 6.0), (1.85, 1.5), (1.85, 6.0), (5.85, 6.0))
 
 
-def driven(scene: Scene, corners: Iterable[tuple[float, float]], step_m: float = 0.08, young: bool = False) -> Robot:
+def driven(
+    scene: Scene,
+    corners: Iterable[tuple[float, float]],
+    step_m: float = 0.08,
+    young: bool = False,
+    lights: LightsSetup | None = None,
+) -> Robot:
     """A robot that was switched on at the first corner, has come to the last one, and knows its place.
 
     ``young``: nothing of its map is finished yet.
     """
     poses = way(tuple(corners), step_m)
-    state = new_state()
+    state = new_state(lights=lights)
     state.T_map_odom = poses[0].copy()  # the map's frame is the building's
     robot = Robot(state, scene)
     said = [robot.at(T).places for T in poses]
@@ -145,3 +152,43 @@ def test_a_lidar_that_turns_once_a_second_is_no_covered_one() -> None:
         robot.t += 0.9
         assert robot.at(here).places is None
     assert later == state.suspicion.t_asked == asked
+
+
+def test_light_that_has_told_the_place_once_says_nothing_of_a_robot_that_is_carried_in_the_dark() -> None:
+    robot = driven(IMAGE, ABOUT, lights=LightsSetup())
+    tie = robot.state.absolute
+    assert tie is not None
+    assert robot.T is not None
+    tie.placed, tie.gap = True, 0.0  # the lamps went out then
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    assert stand(robot, there, 15)[-1] is not None
+
+
+def test_a_reset_ends_every_suspicion() -> None:
+    """There is no map any more that it would be of."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    robot.at(there, carried=True)
+    assert robot.state.suspicion.jumped
+    robot.at(there, Command(robot.t, Order.RESET))
+    doubt = robot.state.suspicion
+    assert (doubt.fitted, doubt.jumped, doubt.share, doubt.job) == (0, False, 0.0, 0)
+    assert set(stand(robot, there, 10)) == {None}
+    assert robot.state.anew == 0
+
+
+def test_a_map_of_one_scan_is_begun_anew_where_the_robot_was_put_down() -> None:
+    """Nobody can be looked for in one scan; and no map may be of two places."""
+    robot = Robot(new_state(), IMAGE)
+    here = np.array((-1.5, -1.0, 0.0))
+    stand(robot, here, 10)
+    assert list(robot.state.keyframes) == [1]
+    there = se2.compose(OTHER_END, se2.compose(here, np.array((0.6, 0.1, 0.2))))
+    assert set(stand(robot, there, 10)) == {None}
+    state = robot.state
+    assert list(state.keyframes) == [2]
+    assert [submap.first for submap in state.atlas.submaps.values()] == [2]
+    off = se2.between(state.T_map_start, se2.compose(state.T_map_odom, state.fused.T_odom_base))
+    assert np.abs(off).max() < 0.03, "it starts here"
+    assert state.anew == 1
