@@ -53,10 +53,11 @@ SURPRISE: Final = 16.3
 def begin(state: State) -> bool:
     """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in.
 
-    A map of one submap that is not finished will do: the robot begins another one, and that one is finished then.
+    A map of one submap that is not finished will do: the robot begins another one, and that one is finished then. So
+    will one whose submaps are just being finished.
     """
     atlas = state.atlas
-    young = atlas.adrift is None and len(atlas.frames) >= YOUNG
+    young = atlas.adrift is None and (len(atlas.frames) >= YOUNG or len(atlas.submaps) > 1)
     if state.settings.loops is None or not (young or atlas.settled()):
         return False
     if atlas.adrift is not None:

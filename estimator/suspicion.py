@@ -23,6 +23,7 @@ import numpy as np
 
 from estimator import absolute, adrift, keyframe, localmap, relocate, se2
 from estimator.atlas import LOOK
+from estimator.commands import forget
 from estimator.fusion import noise_of
 from estimator.hypotheses import BEHIND
 from estimator.keyframe import Keyframe
@@ -143,7 +144,7 @@ def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> No
         doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), then)
         doubt.t_asked = state.fused.t_mono
     elif jump:  # nothing of the map is finished yet that could be searched
-        adrift.afresh(state)
+        carried_off(state)
 
 
 def answered(state: State, frame: Keyframe, holds: bool, payload: object) -> None:
@@ -155,4 +156,11 @@ def answered(state: State, frame: Keyframe, holds: bool, payload: object) -> Non
     least = max(relocate.LEAST, here.share - BEHIND)
     alone = all(fit.share < least for fit, _ in payload.fresh)
     if not alone or not (holds or here.verdict is Verdict.HOLDS):
-        adrift.afresh(state)
+        carried_off(state)
+
+
+def carried_off(state: State) -> None:
+    """Be adrift; a map of one scan, in which nobody can be looked for, is begun anew: it would be one of two places."""
+    if not adrift.afresh(state) and state.atlas.adrift is None:
+        forget(state)
+        state.anew += 1

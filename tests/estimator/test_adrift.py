@@ -46,6 +46,17 @@ def test_a_robot_is_looked_for_in_a_map_of_one_submap_that_is_not_finished() -> 
     assert state.atlas.adrift == 2
 
 
+def test_a_map_whose_first_submap_is_just_being_finished_is_one_to_be_looked_for_in() -> None:
+    state, rng = new_state(), np.random.default_rng(3)
+    for key in range(1, SIZE + 2):
+        T = np.array((0.3 * key, 0.0, 0.1 * key))
+        lay(state, T, T, rng, key)
+    state.next_key = SIZE + 2
+    assert len(state.atlas.frames) == 1
+    assert not state.atlas.settled()
+    assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places == 0
+
+
 @pytest.mark.parametrize(
     ("epoch_s", "dark_s", "told"), [(0.1, 0.1, True), (0.1, 1.1, False), (2.0, 2.9, True), (2.0, 30.0, False)]
 )
