@@ -213,7 +213,7 @@ class Suspicion:
         t_still: since when the wheels stand, as far as they have told since the last match; moved: what they have turned
             by since (x, y, yaw). unwatched_s: the longest time since that match that they stood for before they turned.
         period_s: usual time between two matches, 0 before it is known.
-        job: ID of the look under way, 0: none. t_asked: when it was asked for.
+        job: ID of the look under way, 0: none. t_asked: when it was asked for. again: the next one may search more.
     """
 
     fitted: int = 0
@@ -226,6 +226,7 @@ class Suspicion:
     period_s: float = 0.0
     job: int = 0
     t_asked: float = -math.inf
+    again: bool = False
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

@@ -53,7 +53,8 @@ STILL_M, STILL_RAD = 0.01, 0.01
 `UNWATCHED_S`."""
 NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
-310 thousand."""
+310 thousand. One that ends there decides nothing, and is made once more with all of that; where that is not enough
+either nobody can say that the place is the only one."""
 PATIENCE_S: Final = 2.0
 """An answer that has not come by then is not waited for: the map must go on."""
 
@@ -139,23 +140,30 @@ def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> No
     doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
     if pieces:
-        query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=NODES)
-        then = partial(answered, state, frame, holds or not jump)
+        nodes = relocate.NODES if doubt.again else NODES
+        query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=nodes)
+        then = partial(answered, state, frame, holds or not jump, jump or doubt.again)
         doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), then)
-        doubt.t_asked = state.fused.t_mono
+        doubt.t_asked, doubt.again = state.fused.t_mono, False
     elif jump:  # nothing of the map is finished yet that could be searched
         carried_off(state)
 
 
-def answered(state: State, frame: Keyframe, holds: bool, payload: object) -> None:
-    """Be adrift if the place is not the only one, or does not hold; ``holds``: it does, or need not."""
+def answered(state: State, frame: Keyframe, holds: bool, last: bool, payload: object) -> None:
+    """Be adrift if the place is not the only one, or does not hold; ``holds``: it does, or need not.
+
+    ``last``: a search that had to be ended says that too; else it is made anew, see `NODES`.
+    """
     assert isinstance(payload, Looked)
     if state.atlas.adrift is not None or frame.key != state.next_key:
         return  # the map has been begun anew meanwhile, or went on without an answer
     here = payload.guesses[0]
     least = max(relocate.LEAST, here.share - BEHIND)
     alone = all(fit.share < least for fit, _ in payload.fresh)
-    if not alone or not (holds or here.verdict is Verdict.HOLDS):
+    if alone and not payload.complete and not last:
+        doubt = state.suspicion
+        doubt.fitted, doubt.odd, doubt.again = ROW, True, True
+    elif not (alone and payload.complete and (holds or here.verdict is Verdict.HOLDS)):
         carried_off(state)
 
 

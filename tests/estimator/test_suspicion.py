@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from estimator import se2
+from estimator import relocate, se2, suspicion
 from estimator.light import LightsSetup
 from estimator.pipeline import new_state
 from estimator.records import Array, Command, Order
@@ -192,3 +192,23 @@ def test_a_map_of_one_scan_is_begun_anew_where_the_robot_was_put_down() -> None:
     off = se2.between(state.T_map_start, se2.compose(state.T_map_odom, state.fused.T_odom_base))
     assert np.abs(off).max() < 0.03, "it starts here"
     assert state.anew == 1
+
+
+@pytest.mark.parametrize("covered", [False, True])
+@pytest.mark.parametrize("most", [300, 1_000_000])
+def test_a_search_that_had_to_be_ended_does_not_say_that_there_is_no_other_place(
+    covered: bool, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a jump it is taken to be another one; else the search is made once more with all that it may take."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    monkeypatch.setattr(suspicion, "NODES", 300)
+    monkeypatch.setattr(relocate, "NODES", most)
+    moved = (0.2, 0.1, 0.1) if covered else (-0.7, 0.2, 0.3)
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array(moved)))
+    if covered:
+        stand(robot, there, 15, covered=True)
+    asked = robot.state.atlas.next_job
+    said = stand(robot, there, 15)
+    assert said[-1] is not None
+    assert robot.state.atlas.next_job - asked < 8, "it is not looked for again and again"
