@@ -62,6 +62,7 @@ def begin(state: State) -> bool:
         return False
     if atlas.adrift is not None:
         forget_adrift(state)
+    state.suspicion.end()
     atlas.cut(state.next_key)
     atlas.seek = Seek()
     return True
@@ -94,13 +95,14 @@ def forget_adrift(state: State) -> None:
     unlist(state, state.atlas.since)
 
 
-def disown(state: State, watch: Watch) -> None:
+def disown(state: State, first: int, since: int) -> None:
     """The place was the wrong one: what was mapped since lies in it, and is what the next `begin` lets go of.
 
-    Else the robot would find itself again in what it has laid there.
+    Else the robot would find itself again in what it has laid there. ``first``: key of the first submap of that,
+    ``since``: ID of its first keyframe.
     """
-    state.atlas.adrift, state.atlas.since, state.atlas.stale = watch.first, watch.since, True
-    livemap.forget(state, watch.first)
+    state.atlas.adrift, state.atlas.since, state.atlas.stale = first, since, True
+    livemap.forget(state, first)
 
 
 def places(state: State) -> int | None:

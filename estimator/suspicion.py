@@ -25,8 +25,7 @@ from estimator import absolute, adrift, keyframe, localmap, relocate, se2
 from estimator.atlas import LOOK
 from estimator.commands import forget
 from estimator.fusion import noise_of
-from estimator.hypotheses import BEHIND
-from estimator.keyframe import Keyframe
+from estimator.hypotheses import BEHIND, Question
 from estimator.linear3 import invert3
 from estimator.records import Array, Odometry, Scan
 from estimator.relocate import Looked, Piece, Query, Verdict
@@ -55,8 +54,9 @@ NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
 310 thousand. One that ends there decides nothing, and is made once more with all of that; where that is not enough
 either nobody can say that the place is the only one."""
-PATIENCE_S: Final = 2.0
-"""An answer that has not come by then is not waited for: the map must go on."""
+PATIENCE_S, GIVEN_UP_S = 2.0, 10.0
+"""So long nothing is laid until the answer comes; then the map must go on, in a submap of its own, which goes if the
+answer is bad. One that has not come by the latter never will: it is asked anew."""
 
 
 def on_odometry(state: State, record: Odometry) -> None:
@@ -75,7 +75,7 @@ def on_odometry(state: State, record: Odometry) -> None:
 def waits(state: State) -> bool:
     """Whether nothing may be laid into the map now, because the robot may be elsewhere."""
     doubt = state.suspicion
-    looking = doubt.job in state.atlas.asked and state.fused.t_mono - doubt.t_asked < PATIENCE_S
+    looking = doubt.question is not None and state.fused.t_mono - doubt.t_asked < PATIENCE_S
     return looking or doubt.fitted > 0
 
 
@@ -85,8 +85,9 @@ def raised(state: State, match: MatchResult) -> bool:
     if not match.ok or state.local is None:
         return False
     alone = unwatched(state)
-    if absolute.tells(state) or atlas.adrift is not None or state.settings.loops is None or doubt.job in atlas.asked:
-        doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
+    if absolute.tells(state) or atlas.adrift is not None or state.settings.loops is None:
+        doubt.end()
+        atlas.own = 0
         return False
     share, odd = match.inliers / max(1, match.queries), surprising(state, match)
     made = se2.between(state.T_odom_scan, match.T_odom_base)  # wheels that lie move the prediction, not the robot
@@ -99,7 +100,17 @@ def raised(state: State, match: MatchResult) -> bool:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not doubt.odd and share > doubt.share - CHANGED:
         doubt.fitted = 0  # the same picture from the same place
-    return doubt.fitted >= ROW
+    if doubt.question is not None and state.fused.t_mono - doubt.t_asked > GIVEN_UP_S:
+        give_up(state, doubt.question)
+    return doubt.fitted >= ROW and doubt.question is None
+
+
+def give_up(state: State, question: Question) -> None:
+    """Wait for an answer no longer; what was asked has to be asked again."""
+    doubt = state.suspicion
+    state.atlas.asked.pop(doubt.job, None)
+    doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
+    doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
 
 
 def unwatched(state: State) -> bool:
@@ -136,39 +147,52 @@ def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> No
     against = localmap.contradicted(state.local, frame.T_odom_lidar, frame.beams(), noise_of(state, scan))
     share = match.inliers / max(1, match.queries)
     holds = relocate.judged(match, share, against, told) is Verdict.HOLDS
-    jump = doubt.jumped
-    doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
-    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
+    asked = Question(doubt.jumped, holds, doubt.again)
+    doubt.fitted, doubt.jumped, doubt.odd, doubt.again = 0, False, False, False
+    doubt.since = doubt.since or state.next_key
+    older = [one for one in atlas.settled() if one.first < doubt.since]
+    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
     if pieces:
-        nodes = relocate.NODES if doubt.again else NODES
+        nodes = relocate.NODES if asked.again else NODES
         query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=nodes)
-        then = partial(answered, state, frame, holds or not jump, jump or doubt.again)
-        doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), then)
-        doubt.t_asked, doubt.again = state.fused.t_mono, False
-    elif jump:  # nothing of the map is finished yet that could be searched
+        doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), partial(answered, state, asked))
+        doubt.question, doubt.t_asked, atlas.own = asked, state.fused.t_mono, doubt.since
+    elif asked.jumped:  # nothing of the map is finished yet that could be searched
         carried_off(state)
+    else:
+        doubt.since = 0
 
 
-def answered(state: State, frame: Keyframe, holds: bool, last: bool, payload: object) -> None:
-    """Be adrift if the place is not the only one, or does not hold; ``holds``: it does, or need not.
+def answered(state: State, asked: Question, payload: object) -> None:
+    """Be adrift if the place is not the only one, or does not hold after a jump; look again if that was not found out.
 
-    ``last``: a search that had to be ended says that too; else it is made anew, see `NODES`.
+    An answer that comes late counts as well: what was laid meanwhile is of the place that it is about.
     """
     assert isinstance(payload, Looked)
-    if state.atlas.adrift is not None or frame.key != state.next_key:
-        return  # the map has been begun anew meanwhile, or went on without an answer
+    doubt = state.suspicion
+    if doubt.question is not asked:
+        return  # light tells the place, the robot is adrift, or the map has been begun anew since
+    doubt.question = None
     here = payload.guesses[0]
     least = max(relocate.LEAST, here.share - BEHIND)
     alone = all(fit.share < least for fit, _ in payload.fresh)
-    if alone and not payload.complete and not last:
-        doubt = state.suspicion
-        doubt.fitted, doubt.odd, doubt.again = ROW, True, True
-    elif not (alone and payload.complete and (holds or here.verdict is Verdict.HOLDS)):
+    holds = asked.holds or not asked.jumped or here.verdict is Verdict.HOLDS
+    if not (alone and holds):
         carried_off(state)
+    elif payload.complete:
+        doubt.since = state.atlas.own = 0
+    elif asked.jumped or asked.again:
+        carried_off(state)
+    else:
+        doubt.fitted, doubt.odd, doubt.again = ROW, True, True
 
 
 def carried_off(state: State) -> None:
     """Be adrift; a map of one scan, in which nobody can be looked for, is begun anew: it would be one of two places."""
-    if not adrift.afresh(state) and state.atlas.adrift is None:
+    atlas, since = state.atlas, state.suspicion.since
+    first = next((one.key for one in atlas.submaps.values() if one.first >= since > 0), None)
+    if first is not None:
+        adrift.disown(state, first, since)
+    if not adrift.afresh(state) and atlas.adrift is None:
         forget(state)
         state.anew += 1

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from estimator import relocate, se2, suspicion
+from estimator.hypotheses import Question
 from estimator.light import LightsSetup
 from estimator.pipeline import new_state
 from estimator.records import Array, Command, Order
+from estimator.relocate import Fit, Looked, Verdict
 from tests.estimator.adrift import Robot, furnished, way
 from tools.bench._scenes import Scene, box
 
@@ -147,11 +149,11 @@ def test_a_lidar_that_turns_once_a_second_is_no_covered_one() -> None:
     for _ in range(30):
         robot.t += 0.9
         robot.at(here)
-    later = state.suspicion.t_asked
     for _ in range(30):
         robot.t += 0.9
         assert robot.at(here).places is None
-    assert later == state.suspicion.t_asked == asked
+        assert state.suspicion.fitted == 0
+    assert state.suspicion.t_asked == asked
 
 
 def test_light_that_has_told_the_place_once_says_nothing_of_a_robot_that_is_carried_in_the_dark() -> None:
@@ -212,3 +214,64 @@ def test_a_search_that_had_to_be_ended_does_not_say_that_there_is_no_other_place
     said = stand(robot, there, 15)
     assert said[-1] is not None
     assert robot.state.atlas.next_job - asked < 8, "it is not looked for again and again"
+
+
+def test_nothing_is_laid_into_the_map_until_the_answer_has_come() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    state, robot.late = robot.state, 8
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((0.2, 0.1, 0.1))))
+    stand(robot, there, 15, covered=True)
+    laid, places = state.next_key, None
+    for k in range(1, 13):
+        places = places or robot.at(se2.compose(there, np.array((-0.12 * k, 0.0, 0.0)))).places
+        assert state.next_key == laid or places is not None
+        assert state.suspicion.fitted > 0 or state.suspicion.question is not None or places is not None
+    assert places is not None
+
+
+def test_an_answer_that_comes_late_counts_and_takes_what_was_laid_meanwhile_with_it() -> None:
+    """Loops are searched for before it, and boards are slow; the map goes on after two seconds."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    state, robot.late = robot.state, 45
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    x, y, yaw = there.tolist()
+    ahead = (x + np.cos(yaw), y + np.sin(yaw))
+    before, most = state.next_key, 0
+    poses = way(((x, y), ahead, (0.0, 0.0), (1.0, 0.0), (-1.0, 0.5), (1.0, 0.5)), 0.08)
+    robot.at(poses[0], carried=True)
+    said = []
+    for T in poses[1:]:
+        said.append(robot.at(T).places)
+        robot.late = 3 if said[-1] is not None else robot.late
+        if said[-1] is None:
+            most = state.next_key
+    assert most > before, "the map has gone on"
+    assert said[-1] is not None
+    assert state.atlas.since >= most
+    assert not [key for key in state.keyframes if before <= key < most], "or it would be found there again"
+    assert all(submap.first < before or submap.first >= most for submap in state.atlas.submaps.values())
+
+
+def test_a_look_that_never_answers_is_made_again() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    assert set(stand(robot, there, 5)) == {None}
+    assert robot.state.suspicion.question is not None
+    robot.due = []
+    assert set(stand(robot, there, 90)) == {None}
+    assert stand(robot, there, 25)[-1] is not None
+
+
+def test_a_jump_while_a_look_is_under_way_is_not_forgotten() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    doubt, asked = robot.state.suspicion, Question(False, True, False)
+    doubt.question, doubt.t_asked = asked, robot.t
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    assert set(stand(robot, there, 6)) == {None}
+    fine = Fit(there, np.eye(3), 0.9, 0.0, 0.01, 1, np.zeros(3), Verdict.HOLDS)
+    suspicion.answered(robot.state, asked, Looked(None, (fine,), (), True, 0))  # type: ignore[arg-type]
+    assert stand(robot, there, 10)[-1] is not None
