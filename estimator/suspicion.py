@@ -47,8 +47,8 @@ CHANGED: Final = 0.1
 """Share of the beams by which what is seen fits worse than before, where it is not the same."""
 LEARNING: Final = 0.1
 """Share of the latest match in what is usual: the time between two, and how many beams fit."""
-STILL_M, STILL_RAD = 0.01, 0.01
-"""Wheels stand that have turned by no more since they stopped, however often they tell it: 0.02 m/s for
+STILL_M, STILL_RAD = 0.005, 0.005
+"""Wheels stand that have turned by no more since they stopped, however often they tell it: 0.01 m/s for
 `UNWATCHED_S`."""
 NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
