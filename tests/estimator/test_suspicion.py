@@ -238,7 +238,7 @@ def test_an_answer_that_comes_late_counts_and_takes_what_was_laid_meanwhile_with
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
     x, y, yaw = there.tolist()
     ahead = (x + np.cos(yaw), y + np.sin(yaw))
-    before, most = state.next_key, 0
+    before, most, begun = state.next_key, 0, [0]
     poses = way(((x, y), ahead, (0.0, 0.0), (1.0, 0.0), (-1.0, 0.5), (1.0, 0.5)), 0.08)
     robot.at(poses[0], carried=True)
     said = []
@@ -246,8 +246,9 @@ def test_an_answer_that_comes_late_counts_and_takes_what_was_laid_meanwhile_with
         said.append(robot.at(T).places)
         robot.late = 3 if said[-1] is not None else robot.late
         if said[-1] is None:
-            most = state.next_key
+            most, begun = state.next_key, [submap.first for submap in state.atlas.submaps.values()]
     assert most > before, "the map has gone on"
+    assert before in begun, "in a submap of its own, or a part of it would stay in an older one"
     assert said[-1] is not None
     assert state.atlas.since >= most
     assert not [key for key in state.keyframes if before <= key < most], "or it would be found there again"
