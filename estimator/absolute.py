@@ -64,6 +64,9 @@ KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
 """Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey's frame counts as known."""
 MEMORY_S = 1.0
 """How late a light epoch may come."""
+SILENT_S, SILENT_PERIODS = 0.5, 2.5
+"""Light of which nothing could be used for so long, or so many epochs that come slowly, says nothing of where the robot
+is now. One epoch may be lost."""
 
 
 @dataclass(slots=True, eq=False)
@@ -83,6 +86,7 @@ class Absolute:
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
         since: ID of the first keyframe laid after the pose was known for the last time.
         t_match: instant of the latest match; scan_s: what had passed since the scan before it.
+        t_light: instant of the latest epoch, whatever was in it; light_s: what had passed since the one before it.
         poses: T_odom_base of the last second, each with its instant.
         mended: when light has mended the pose in the last seconds, and what part (3x3, odom axes) of its error is left.
     """
@@ -103,6 +107,8 @@ class Absolute:
     since: int = 0
     t_match: float = -math.inf
     scan_s: float = 0.0
+    t_light: float = -math.inf
+    light_s: float = 0.0
     poses: deque[tuple[float, Array]] = field(default_factory=deque)
     mended: deque[tuple[float, Array]] = field(default_factory=deque)
 
@@ -148,6 +154,7 @@ def on_lights(state: State, lights: LightsResult) -> None:
     tie = state.absolute
     assert tie is not None
     tie.gap = None
+    tie.light_s, tie.t_light = min(lights.t_mono - tie.t_light, SLOWEST_S), lights.t_mono
     if begun_anew(state, lights):
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
@@ -353,6 +360,14 @@ def blind(state: State) -> bool:
     tie = state.absolute
     assert tie is not None
     return state.fused.t_mono - tie.t_match > max(BLIND_S, BLIND_PERIODS * tie.scan_s)
+
+
+def tells(state: State) -> bool:
+    """Whether light has told the place and goes on telling; lamps that went out hold nobody where they once did."""
+    tie, light = state.absolute, state.light
+    if tie is None or light is None or not tie.placed:
+        return False
+    return state.fused.t_mono - light.filter.t_used <= max(SILENT_S, SILENT_PERIODS * tie.light_s)
 
 
 def pose_at(state: State, t_mono: float) -> Array:

@@ -53,28 +53,30 @@ SURPRISE: Final = 16.3
 def begin(state: State) -> bool:
     """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in.
 
-    A map of one submap that is not finished will do: the robot begins another one, and that one is finished then.
+    A map of one submap that is not finished will do: the robot begins another one, and that one is finished then. So
+    will one whose submaps are just being finished.
     """
     atlas = state.atlas
-    young = atlas.adrift is None and len(atlas.frames) >= YOUNG
+    young = atlas.adrift is None and (len(atlas.frames) >= YOUNG or len(atlas.submaps) > 1)
     if state.settings.loops is None or not (young or atlas.settled()):
         return False
     if atlas.adrift is not None:
         forget_adrift(state)
+    state.suspicion.end()
     atlas.cut(state.next_key)
     atlas.seek = Seek()
     return True
 
 
 def local_map_lost(state: State) -> None:
-    """The local map is begun anew: the robot may have been carried off, unless light holds it where it is.
+    """The local map is begun anew: the robot may have been carried off, unless light that tells now holds it here.
 
     Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One
     that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
     """
     tie = state.absolute
     held = False
-    if tie is not None and tie.placed and tie.gap is not None:
+    if tie is not None and absolute.tells(state) and tie.gap is not None:
         from estimator.relocate_light import in_place
 
         here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
@@ -93,13 +95,14 @@ def forget_adrift(state: State) -> None:
     unlist(state, state.atlas.since)
 
 
-def disown(state: State, watch: Watch) -> None:
+def disown(state: State, first: int, since: int) -> None:
     """The place was the wrong one: what was mapped since lies in it, and is what the next `begin` lets go of.
 
-    Else the robot would find itself again in what it has laid there.
+    Else the robot would find itself again in what it has laid there. ``first``: key of the first submap of that,
+    ``since``: ID of its first keyframe.
     """
-    state.atlas.adrift, state.atlas.since, state.atlas.stale = watch.first, watch.since, True
-    livemap.forget(state, watch.first)
+    state.atlas.adrift, state.atlas.since, state.atlas.stale = first, since, True
+    livemap.forget(state, first)
 
 
 def places(state: State) -> int | None:

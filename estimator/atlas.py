@@ -142,7 +142,7 @@ class Atlas:
         way_m: driven between keyframes. laid: how many keyframes; since_look: since the last look.
         waiting: loops without support. jobs: to be handed out. asked: when, in keyframes laid, and what to do with the
             answer, by job ID. look, solution: IDs of the latest jobs of these kinds.
-        stale: whether the graph has changed since it was solved.
+        stale: whether the graph has changed since it was solved. own: ID of a keyframe that begins a submap, 0: any.
         adrift: key of the first submap whose place in the map is not known, None where the robot's place is: it and all
             later ones are a part of the graph that nothing joins to the older one. since: ID of their first keyframe, 0
             where nothing is adrift. bridge: the way across that break, if there was one: key of the submap before,
@@ -173,6 +173,7 @@ class Atlas:
     look: int = 0
     solution: int = 0
     stale: bool = False
+    own: int = 0
     adrift: int | None = None
     since: int = 0
     bridge: tuple[int, Array, Array] | None = None
@@ -278,7 +279,7 @@ class Atlas:
         self.way_m += math.hypot(x, y) if newest is not None else 0.0
         self.T_odom_last = T
         cut = newest is not None and self.adrift is not None and newest.key < self.adrift
-        if newest is None or anew or cut or len(self.frames) >= SIZE:
+        if newest is None or anew or cut or len(self.frames) >= SIZE or frame.key == self.own:
             self.strayed = self.strayed + ANYWHERE * (anew or cut)
             self._begin(frame, newest, sigma)
         frame.submap = next(reversed(self.submaps.values()))

@@ -203,6 +203,19 @@ class Watch:
     alone: bool = False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Question:
+    """What a look is to decide: whether the robot was carried off.
+
+    Attributes:
+        jumped: the pose did. holds: the place does, in the local map. again: an earlier search had to be ended.
+    """
+
+    jumped: bool
+    holds: bool
+    again: bool
+
+
 @dataclass(slots=True, eq=False)
 class Suspicion:
     """What is remembered from scan to scan of whether the robot was carried off (`estimator.suspicion`).
@@ -210,20 +223,32 @@ class Suspicion:
     Attributes:
         fitted: scans that have fitted since something else raised the suspicion, 0: nothing has. jumped: the pose did.
         odd: a match has moved it by more than the prediction allowed. share: of the beams that fits usually.
-        still_s: how long the wheels have stood since the last match, unwatched_s: the longest time that they did.
+        t_still: since when the wheels stand, as far as they have told since the last match; moved: by what they have
+            turned meanwhile (x, y, yaw). unwatched_s: the longest time since that match for which they stood, and
+            turned then.
         period_s: usual time between two matches, 0 before it is known.
-        job: ID of the look under way, 0: none. t_asked: when it was asked for.
+        question: what the look under way decides, None: there is none. job: its ID. t_asked: when it was asked for.
+        again: the next one may search more.
+        since: ID of the first keyframe that may be of another place, 0: none.
     """
 
     fitted: int = 0
     jumped: bool = False
     odd: bool = False
     share: float = 0.0
-    still_s: float = 0.0
+    t_still: float = -math.inf
+    moved: Array = field(default_factory=lambda: np.zeros(3))
     unwatched_s: float = 0.0
     period_s: float = 0.0
+    question: Question | None = None
     job: int = 0
     t_asked: float = -math.inf
+    again: bool = False
+    since: int = 0
+
+    def end(self) -> None:
+        """Suspect nothing, and wait for no answer."""
+        self.fitted, self.jumped, self.odd, self.question, self.again, self.since = 0, False, False, None, False, 0
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
+from estimator.absolute import SILENT_S
 from estimator.cdma_epoch import UNUSABLE
 from estimator.lamps import Lamp
 from estimator.light import Light
@@ -38,8 +39,6 @@ GUESS_M: Final = 0.6
 """Size of a window about a place read off a single epoch."""
 WIDEST_M: Final = 3.0
 """Light that is vaguer than that says nothing."""
-SILENT_S: Final = 0.5
-"""Without a usable epoch for so long light says nothing of where the robot is now."""
 FACTOR: Final = 6.0
 """By which the variance of a hypothesis of light counts: what is young about it, and what its model does not know."""
 SLACK: Final = np.diag((0.1**2, 0.1**2, 0.05**2))

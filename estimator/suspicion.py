@@ -9,7 +9,7 @@ is suspected where physics says that something else than driving has happened:
 
 One look in the whole map then decides: if another place fits nearly as well the robot is adrift. So it is after a jump
 where the place does not hold, there or in the local map; all else may have been a door, or somebody who sat and left.
-Until the answer has come nothing is laid into the map. Where light has placed it light is the witness, see
+Until the answer has come nothing is laid into the map. While light tells the place light is the witness, see
 `adrift.doubt`.
 """
 
@@ -19,11 +19,13 @@ import math
 from functools import partial
 from typing import Final
 
-from estimator import adrift, keyframe, localmap, relocate, se2
+import numpy as np
+
+from estimator import absolute, adrift, keyframe, localmap, relocate, se2
 from estimator.atlas import LOOK
+from estimator.commands import forget
 from estimator.fusion import noise_of
-from estimator.hypotheses import BEHIND
-from estimator.keyframe import Keyframe
+from estimator.hypotheses import BEHIND, Question
 from estimator.linear3 import invert3
 from estimator.records import Array, Odometry, Scan
 from estimator.relocate import Looked, Piece, Query, Verdict
@@ -45,28 +47,35 @@ CHANGED: Final = 0.1
 """Share of the beams by which what is seen fits worse than before, where it is not the same."""
 LEARNING: Final = 0.1
 """Share of the latest match in what is usual: the time between two, and how many beams fit."""
-STILL_M, STILL_RAD = 0.002, 0.002
-"""Wheels that turn by no more between two readings stand."""
+STILL_M, STILL_RAD = 0.005, 0.005
+"""Wheels stand that have turned by no more since they stopped, however often they tell it: 0.01 m/s for
+`UNWATCHED_S`."""
 NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
-310 thousand."""
-PATIENCE_S: Final = 2.0
-"""An answer that has not come by then is not waited for: the map must go on."""
+310 thousand. One that ends there decides nothing, and is made once more with all of that; where that is not enough
+either nobody can say that the place is the only one."""
+PATIENCE_S, GIVEN_UP_S = 2.0, 10.0
+"""So long nothing is laid until the answer comes; then the map must go on, in a submap of its own, which goes if the
+answer is bad. One that has not come by the latter never will: it is asked anew."""
 
 
 def on_odometry(state: State, record: Odometry) -> None:
-    """Take in how long the wheels stand."""
+    """Take in whether the wheels stand; as long as they tell nothing, they are not known to turn."""
     doubt = state.suspicion
-    x, y, yaw = record.delta.tolist()
-    still = math.hypot(x, y) <= STILL_M and abs(yaw) <= STILL_RAD
-    doubt.still_s = doubt.still_s + record.t_end - record.t_begin if still else 0.0
-    doubt.unwatched_s = max(doubt.unwatched_s, doubt.still_s)
+    moved = doubt.moved + record.delta
+    x, y, yaw = moved.tolist()
+    if not math.isfinite(x + y + yaw):
+        return
+    doubt.moved = moved
+    if math.hypot(x, y) > STILL_M or abs(yaw) > STILL_RAD:
+        doubt.unwatched_s = max(doubt.unwatched_s, record.t_begin - doubt.t_still)
+        doubt.t_still, doubt.moved = max(doubt.t_still, record.t_end), np.zeros(3)
 
 
 def waits(state: State) -> bool:
     """Whether nothing may be laid into the map now, because the robot may be elsewhere."""
     doubt = state.suspicion
-    looking = doubt.job in state.atlas.asked and state.fused.t_mono - doubt.t_asked < PATIENCE_S
+    looking = doubt.question is not None and state.fused.t_mono - doubt.t_asked < PATIENCE_S
     return looking or doubt.fitted > 0
 
 
@@ -76,9 +85,9 @@ def raised(state: State, match: MatchResult) -> bool:
     if not match.ok or state.local is None:
         return False
     alone = unwatched(state)
-    lit = state.absolute is not None and state.absolute.placed
-    if lit or atlas.adrift is not None or state.settings.loops is None or doubt.job in atlas.asked:
-        doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
+    if absolute.tells(state) or atlas.adrift is not None or state.settings.loops is None:
+        doubt.end()
+        atlas.own = 0
         return False
     share, odd = match.inliers / max(1, match.queries), surprising(state, match)
     made = se2.between(state.T_odom_scan, match.T_odom_base)  # wheels that lie move the prediction, not the robot
@@ -91,14 +100,25 @@ def raised(state: State, match: MatchResult) -> bool:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not doubt.odd and share > doubt.share - CHANGED:
         doubt.fitted = 0  # the same picture from the same place
-    return doubt.fitted >= ROW
+    if doubt.question is not None and state.fused.t_mono - doubt.t_asked > GIVEN_UP_S:
+        give_up(state, doubt.question)
+    return doubt.fitted >= ROW and doubt.question is None
+
+
+def give_up(state: State, question: Question) -> None:
+    """Wait for an answer no longer; what was asked has to be asked again."""
+    doubt = state.suspicion
+    state.atlas.asked.pop(doubt.job, None)
+    doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
+    doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
 
 
 def unwatched(state: State) -> bool:
     """Whether the robot has stood, or nobody knows, for long without a match; another one has come now."""
-    doubt, since = state.suspicion, state.fused.t_mono - state.t_match
-    usual, alone_s = doubt.period_s, min(doubt.unwatched_s, since) if state.fused.odometry else since
-    doubt.still_s = doubt.unwatched_s = 0.0
+    doubt, now = state.suspicion, state.fused.t_mono
+    usual, since = doubt.period_s, now - state.t_match
+    alone_s = min(since, max(doubt.unwatched_s, now - doubt.t_still))
+    doubt.t_still, doubt.moved, doubt.unwatched_s = now, np.zeros(3), 0.0
     if math.isfinite(since):
         doubt.period_s = (1.0 - LEARNING) * usual + LEARNING * min(since, 2.0 * usual) if usual else since
     return usual > 0.0 and alone_s >= max(UNWATCHED_S, MISSED * usual)
@@ -127,25 +147,52 @@ def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> No
     against = localmap.contradicted(state.local, frame.T_odom_lidar, frame.beams(), noise_of(state, scan))
     share = match.inliers / max(1, match.queries)
     holds = relocate.judged(match, share, against, told) is Verdict.HOLDS
-    jump = doubt.jumped
-    doubt.fitted, doubt.jumped, doubt.odd = 0, False, False
-    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
+    asked = Question(doubt.jumped, holds, doubt.again)
+    doubt.fitted, doubt.jumped, doubt.odd, doubt.again = 0, False, False, False
+    doubt.since = doubt.since or state.next_key
+    older = [one for one in atlas.settled() if one.first < doubt.since]
+    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
     if pieces:
-        query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=NODES)
-        then = partial(answered, state, frame, holds or not jump)
-        doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), then)
-        doubt.t_asked = state.fused.t_mono
-    elif jump:  # nothing of the map is finished yet that could be searched
-        adrift.afresh(state)
+        nodes = relocate.NODES if asked.again else NODES
+        query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=nodes)
+        doubt.job = atlas.ask(LOOK, partial(relocate.look, query, told), partial(answered, state, asked))
+        doubt.question, doubt.t_asked, atlas.own = asked, state.fused.t_mono, doubt.since
+    elif asked.jumped:  # nothing of the map is finished yet that could be searched
+        carried_off(state)
+    else:
+        doubt.since = 0
 
 
-def answered(state: State, frame: Keyframe, holds: bool, payload: object) -> None:
-    """Be adrift if the place is not the only one, or does not hold; ``holds``: it does, or need not."""
+def answered(state: State, asked: Question, payload: object) -> None:
+    """Be adrift if the place is not the only one, or does not hold after a jump; look again if that was not found out.
+
+    An answer that comes late counts as well: what was laid meanwhile is of the place that it is about.
+    """
     assert isinstance(payload, Looked)
-    if state.atlas.adrift is not None or frame.key != state.next_key:
-        return  # the map has been begun anew meanwhile, or went on without an answer
+    doubt = state.suspicion
+    if doubt.question is not asked:
+        return  # light tells the place, the robot is adrift, or the map has been begun anew since
+    doubt.question = None
     here = payload.guesses[0]
     least = max(relocate.LEAST, here.share - BEHIND)
     alone = all(fit.share < least for fit, _ in payload.fresh)
-    if not alone or not (holds or here.verdict is Verdict.HOLDS):
-        adrift.afresh(state)
+    holds = asked.holds or not asked.jumped or here.verdict is Verdict.HOLDS
+    if not (alone and holds):
+        carried_off(state)
+    elif payload.complete:
+        doubt.since = state.atlas.own = 0
+    elif asked.jumped or asked.again:
+        carried_off(state)
+    else:
+        doubt.fitted, doubt.odd, doubt.again = ROW, True, True
+
+
+def carried_off(state: State) -> None:
+    """Be adrift; a map of one scan, in which nobody can be looked for, is begun anew: it would be one of two places."""
+    atlas, since = state.atlas, state.suspicion.since
+    first = next((one.key for one in atlas.submaps.values() if one.first >= since > 0), None)
+    if first is not None:
+        adrift.disown(state, first, since)
+    if not adrift.afresh(state) and atlas.adrift is None:
+        forget(state)
+        state.anew += 1

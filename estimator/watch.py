@@ -44,5 +44,5 @@ def take(state: State, watch: Watch, payload: object) -> None:
     if watch.strikes >= STRIKES and state.atlas.watch is watch and state.atlas.adrift is None:
         state.atlas.watch = None
         if watch.alone:
-            adrift.disown(state, watch)
+            adrift.disown(state, watch.first, watch.since)
         adrift.begin(state)

@@ -86,7 +86,10 @@ def stored(submaps: list[tuple[Array, Settled]], settings: Settings | None = Non
 
 @dataclass(eq=False)
 class Robot:
-    """Scans ten times a second, wheels that count 1 % too much, jobs that answer some scans later."""
+    """Scans ten times a second, wheels that count 1 % too much, jobs that answer some scans later.
+
+    ``readings``: of the wheels, from scan to scan.
+    """
 
     state: State
     scene: Scene
@@ -96,9 +99,15 @@ class Robot:
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
     due: list[tuple[int, Job]] = field(default_factory=list)
     scans: int = 0
+    readings: int = 1
 
-    def at(self, T: Array, *orders: Command, carried: bool = False, covered: bool = False) -> StepResult:
-        """One scan at a true pose; the wheels do not see that a robot is carried, nor the lidar while it is covered."""
+    def at(
+        self, T: Array, *orders: Command, carried: bool = False, covered: bool = False, silent: bool = False
+    ) -> StepResult:
+        """One scan at a true pose; the wheels do not see that a robot is carried, nor the lidar while it is covered.
+
+        ``silent``: the wheels tell nothing.
+        """
         self.scans += 1
         ready = [job for scan, job in self.due if scan <= self.scans]
         self.due = [(scan, job) for scan, job in self.due if scan > self.scans]
@@ -106,7 +115,12 @@ class Robot:
         records += orders
         t, self.t = self.t, self.t + 0.1
         delta = np.zeros(3) if self.T is None or carried else se2.between(self.T, T)
-        records.append(Odometry(t, self.t, delta * (1.01, 1.0, 1.0) + self.rng.normal(0.0, 5e-4, 3)))
+        if not silent:
+            parts = self.readings
+            for k in range(parts):  # of one scan's time
+                begin, end = t + 0.1 * k / parts, t + 0.1 * (k + 1) / parts
+                made = delta / parts * (1.01, 1.0, 1.0) + self.rng.normal(0.0, 5e-4 / parts**0.5, 3)
+                records.append(Odometry(begin, end, made))
         self.T = T
         seen = scan_in(self.scene, T, BEAMS, self.rng, t=self.t)
         if covered:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from estimator import se2
+from estimator.absolute import Absolute, on_lights
+from estimator.adrift import local_map_lost
 from estimator.atlas import OWN, SETTLE
+from estimator.light import LightsSetup
 from estimator.pipeline import Settings, keyframe_poses, new_state, step
 from estimator.records import UNLIMITED, Array, Command, Order
 from estimator.submap import SIZE, Settled
@@ -39,6 +44,37 @@ def test_a_robot_is_looked_for_in_a_map_of_one_submap_that_is_not_finished() -> 
     assert [job.priority for job in run_jobs(state)] == [SETTLE]
     assert [submap.key for submap in state.atlas.settled()] == [1]
     assert state.atlas.adrift == 2
+
+
+def test_a_map_whose_first_submap_is_just_being_finished_is_one_to_be_looked_for_in() -> None:
+    state, rng = new_state(), np.random.default_rng(3)
+    for key in range(1, SIZE + 2):
+        T = np.array((0.3 * key, 0.0, 0.1 * key))
+        lay(state, T, T, rng, key)
+    state.next_key = SIZE + 2
+    assert len(state.atlas.frames) == 1
+    assert not state.atlas.settled()
+    assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places == 0
+
+
+@pytest.mark.parametrize(
+    ("epoch_s", "dark_s", "told"), [(0.1, 0.1, True), (0.1, 1.1, False), (2.0, 2.9, True), (2.0, 30.0, False)]
+)
+def test_light_holds_a_robot_that_lost_its_local_map_only_while_it_tells(
+    epoch_s: float, dark_s: float, told: bool
+) -> None:
+    """Epochs may come slower than scans: between two of them the lamps have not gone out."""
+    state, rng = new_state(lights=LightsSetup()), np.random.default_rng(3)
+    assert state.light is not None
+    for key in (1, 2):
+        lay(state, np.array((0.3 * key, 0.0, 0.0)), np.array((0.3 * key, 0.0, 0.0)), rng, key)
+    tie = state.absolute = Absolute(placed=True)
+    for t in (100.0 - 2.0 * epoch_s, 100.0 - epoch_s, 100.0):
+        on_lights(state, replace(state.light.result, t_mono=t))
+    tie.gap = 0.0
+    state.fused.t_mono, state.light.filter.t_used = 100.0 + dark_s, 100.0
+    local_map_lost(state)
+    assert (state.atlas.adrift is None) is told
 
 
 def test_what_is_adrift_leaves_the_older_map_as_it_is() -> None:

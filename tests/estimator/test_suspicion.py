@@ -7,9 +7,12 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from estimator import se2
+from estimator import relocate, se2, suspicion
+from estimator.hypotheses import Question
+from estimator.light import LightsSetup
 from estimator.pipeline import new_state
-from estimator.records import Array
+from estimator.records import Array, Command, Order
+from estimator.relocate import Fit, Looked, Verdict
 from tests.estimator.adrift import Robot, furnished, way
 from tools.bench._scenes import Scene, box
 
@@ -23,13 +26,19 @@ HALL = ((1.0, 6.0), (10.8, 6.0))
 TOUR = (*HALL, (1.85, 6.0), (1.85, 1.5), (1.85, 6.0), (5.85, 6.0))
 
 
-def driven(scene: Scene, corners: Iterable[tuple[float, float]], step_m: float = 0.08, young: bool = False) -> Robot:
+def driven(
+    scene: Scene,
+    corners: Iterable[tuple[float, float]],
+    step_m: float = 0.08,
+    young: bool = False,
+    lights: LightsSetup | None = None,
+) -> Robot:
     """A robot that was switched on at the first corner, has come to the last one, and knows its place.
 
     ``young``: nothing of its map is finished yet.
     """
     poses = way(tuple(corners), step_m)
-    state = new_state()
+    state = new_state(lights=lights)
     state.T_map_odom = poses[0].copy()  # the map's frame is the building's
     robot = Robot(state, scene)
     said = [robot.at(T).places for T in poses]
@@ -95,13 +104,29 @@ def test_a_covered_lidar_takes_nothing_from_a_place_that_is_like_no_other(scans:
     assert robot.off()[0] < 0.1
 
 
-def test_wheels_that_turn_while_the_lidar_is_covered_say_that_nobody_carries_the_robot() -> None:
+@pytest.mark.parametrize("readings", [1, 10])
+def test_wheels_that_turn_while_the_lidar_is_covered_say_that_nobody_carries_the_robot(readings: int) -> None:
+    """However often they tell it: at 100 Hz 0.1 m/s is a millimetre a reading."""
+    robot = driven(IMAGE, ABOUT)
+    robot.readings = readings
+    assert robot.T is not None
+    poses = [se2.compose(robot.T, np.array((-0.01 * k, 0.0, 0.0))) for k in range(1, 36)]
+    for T in poses[:25]:
+        robot.at(T, covered=True)
+    for T in poses[25:]:
+        assert robot.at(T).places is None
+        assert robot.state.suspicion.fitted == 0, "it was seen to drive"
+
+
+def test_wheels_that_tell_nothing_do_not_say_that_the_robot_was_not_carried() -> None:
+    """An emergency stop that takes the power from the wheels and their counters, and the lidar is covered."""
     robot = driven(IMAGE, ABOUT)
     assert robot.T is not None
-    poses = [se2.compose(robot.T, np.array((-0.03 * k, 0.0, 0.0))) for k in range(1, 26)]
-    for T in poses[:15]:
-        robot.at(T, covered=True)
-    assert {robot.at(T).places for T in poses[15:]} == {None}
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((0.2, 0.1, 0.1))))
+    for k in range(15):
+        robot.at(there, carried=k == 0, covered=True, silent=True)
+    said = [robot.at(there, silent=True).places for _ in range(3)] + stand(robot, there, 12)
+    assert said[-1] == 2
 
 
 def test_people_who_stand_about_and_leave_are_no_reason() -> None:
@@ -124,8 +149,130 @@ def test_a_lidar_that_turns_once_a_second_is_no_covered_one() -> None:
     for _ in range(30):
         robot.t += 0.9
         robot.at(here)
-    later = state.suspicion.t_asked
     for _ in range(30):
         robot.t += 0.9
         assert robot.at(here).places is None
-    assert later == state.suspicion.t_asked == asked
+        assert state.suspicion.fitted == 0
+    assert state.suspicion.t_asked == asked
+
+
+def test_light_that_has_told_the_place_once_says_nothing_of_a_robot_that_is_carried_in_the_dark() -> None:
+    robot = driven(IMAGE, ABOUT, lights=LightsSetup())
+    tie = robot.state.absolute
+    assert tie is not None
+    assert robot.T is not None
+    tie.placed, tie.gap = True, 0.0  # the lamps went out then
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    assert stand(robot, there, 15)[-1] is not None
+
+
+def test_a_reset_ends_every_suspicion() -> None:
+    """There is no map any more that it would be of."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    robot.at(there, carried=True)
+    assert robot.state.suspicion.jumped
+    robot.at(there, Command(robot.t, Order.RESET))
+    doubt = robot.state.suspicion
+    assert (doubt.fitted, doubt.jumped, doubt.share, doubt.job) == (0, False, 0.0, 0)
+    assert set(stand(robot, there, 10)) == {None}
+    assert robot.state.anew == 0
+
+
+def test_a_map_of_one_scan_is_begun_anew_where_the_robot_was_put_down() -> None:
+    """Nobody can be looked for in one scan; and no map may be of two places."""
+    robot = Robot(new_state(), IMAGE)
+    here = np.array((-1.5, -1.0, 0.0))
+    stand(robot, here, 10)
+    assert list(robot.state.keyframes) == [1]
+    there = se2.compose(OTHER_END, se2.compose(here, np.array((0.6, 0.1, 0.2))))
+    assert set(stand(robot, there, 10)) == {None}
+    state = robot.state
+    assert list(state.keyframes) == [2]
+    assert [submap.first for submap in state.atlas.submaps.values()] == [2]
+    off = se2.between(state.T_map_start, se2.compose(state.T_map_odom, state.fused.T_odom_base))
+    assert np.abs(off).max() < 0.03, "it starts here"
+    assert state.anew == 1
+
+
+@pytest.mark.parametrize("covered", [False, True])
+@pytest.mark.parametrize("most", [300, 1_000_000])
+def test_a_search_that_had_to_be_ended_does_not_say_that_there_is_no_other_place(
+    covered: bool, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a jump it is taken to be another one; else the search is made once more with all that it may take."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    monkeypatch.setattr(suspicion, "NODES", 300)
+    monkeypatch.setattr(relocate, "NODES", most)
+    moved = (0.2, 0.1, 0.1) if covered else (-0.7, 0.2, 0.3)
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array(moved)))
+    if covered:
+        stand(robot, there, 15, covered=True)
+    asked = robot.state.atlas.next_job
+    said = stand(robot, there, 15)
+    assert said[-1] is not None
+    assert robot.state.atlas.next_job - asked < 8, "it is not looked for again and again"
+
+
+def test_nothing_is_laid_into_the_map_until_the_answer_has_come() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    state, robot.late = robot.state, 8
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((0.2, 0.1, 0.1))))
+    stand(robot, there, 15, covered=True)
+    laid, places = state.next_key, None
+    for k in range(1, 13):
+        places = places or robot.at(se2.compose(there, np.array((-0.12 * k, 0.0, 0.0)))).places
+        assert state.next_key == laid or places is not None
+        assert state.suspicion.fitted > 0 or state.suspicion.question is not None or places is not None
+    assert places is not None
+
+
+def test_an_answer_that_comes_late_counts_and_takes_what_was_laid_meanwhile_with_it() -> None:
+    """Loops are searched for before it, and boards are slow; the map goes on after two seconds."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    state, robot.late = robot.state, 45
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    x, y, yaw = there.tolist()
+    ahead = (x + np.cos(yaw), y + np.sin(yaw))
+    before, most, begun = state.next_key, 0, [0]
+    poses = way(((x, y), ahead, (0.0, 0.0), (1.0, 0.0), (-1.0, 0.5), (1.0, 0.5)), 0.08)
+    robot.at(poses[0], carried=True)
+    said = []
+    for T in poses[1:]:
+        said.append(robot.at(T).places)
+        robot.late = 3 if said[-1] is not None else robot.late
+        if said[-1] is None:
+            most, begun = state.next_key, [submap.first for submap in state.atlas.submaps.values()]
+    assert most > before, "the map has gone on"
+    assert before in begun, "in a submap of its own, or a part of it would stay in an older one"
+    assert said[-1] is not None
+    assert state.atlas.since >= most
+    assert not [key for key in state.keyframes if before <= key < most], "or it would be found there again"
+    assert all(submap.first < before or submap.first >= most for submap in state.atlas.submaps.values())
+
+
+def test_a_look_that_never_answers_is_made_again() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    assert set(stand(robot, there, 5)) == {None}
+    assert robot.state.suspicion.question is not None
+    robot.due = []
+    assert set(stand(robot, there, 90)) == {None}
+    assert stand(robot, there, 25)[-1] is not None
+
+
+def test_a_jump_while_a_look_is_under_way_is_not_forgotten() -> None:
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    doubt, asked = robot.state.suspicion, Question(False, True, False)
+    doubt.question, doubt.t_asked = asked, robot.t
+    there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
+    assert set(stand(robot, there, 6)) == {None}
+    fine = Fit(there, np.eye(3), 0.9, 0.0, 0.01, 1, np.zeros(3), Verdict.HOLDS)
+    suspicion.answered(robot.state, asked, Looked(None, (fine,), (), True, 0))  # type: ignore[arg-type]
+    assert stand(robot, there, 10)[-1] is not None
