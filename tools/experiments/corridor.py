@@ -198,6 +198,6 @@ def draw(done: list[tuple[Case, Outcome]], figure: Any) -> None:
         axes.axhspan(-5.0, 5.0, color="0.9", zorder=0)
         axes.set_title(case.name, fontsize=9)
         axes.set_ylabel("cm")
-        axes.set_ylim(-30.0, 30.0)
+        axes.set_ylim(-50.0, 50.0)
     panels[0].legend(fontsize=8, markerscale=6)
     panels[-1].set_xlabel("seconds since being switched on")

@@ -1,6 +1,6 @@
-"""Integrity: is what the daemon says of random drives ever wrong? ``python -m tools.experiments.integrity --count 10``.
+"""Integrity: is what the daemon says of random drives ever wrong?
 
-Resumable, one file a scenario.
+``python -m tools.experiments.integrity --count 10``; resumable, one file a scenario.
 
 Every scenario of :mod:`tools.experiments.integrity_scene` goes through the daemon's own cycle in virtual time; the
 published state is judged against the truth. Tracks are kept in ``<out>/<kind>-<seed>.npz`` and not made again; delete

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import beta
 
 from daemon.publish.snapshot import State
 from tools.experiments.integrity_run import COLUMNS
@@ -105,9 +106,8 @@ class Summary:
         told = told[told[:, _AT["state"]] == State.TRACKING]
         error, sigma = np.median(told[:, _AT["error_m"]]), np.median(told[:, _AT["sigma_m"]])
         turned, spread = np.median(told[:, _AT["error_rad"]]), np.median(told[:, _AT["sigma_rad"]])
-        proved = f"at most {3.0 / n:.2%} (95 %)" if self.wrong == 0 else "no bound, see below"
         return [
-            f"wrong: {self.wrong} of {n}; that proves {proved} of scenarios like these",
+            f"wrong: {self.wrong} of {n}: at most {proved_share(self.wrong, n):.2%} of scenarios like these (95 %)",
             f"TRACKING in clean drives {np.mean(clean) if clean else np.nan:.1%}, of recoverable time {recovered:.1%}",
             f"median error {100 * error:.1f} cm, median sigma {100 * sigma:.1f} cm ({sigma / error:.2f} times); "
             f"heading {np.degrees(turned):.2f} deg, {np.degrees(spread):.2f} deg ({spread / turned:.2f} times)",
@@ -144,6 +144,11 @@ class Summary:
             for e in sorted(odd, key=lambda e: (-e.wrong, -e.wrong_s, -e.beyond_bound))
         ]  # fmt: skip
         return ["", "listed apart:", *rows] if rows else []
+
+
+def proved_share(wrong: int, n: int) -> float:
+    """The largest share of which so few of ``n`` would still be seen once in twenty times (Clopper-Pearson)."""
+    return float(beta.ppf(0.95, wrong + 1, n - wrong)) if wrong < n else 1.0
 
 
 def report(out: Path, kinds: Iterable[str]) -> Summary:

@@ -104,7 +104,7 @@ def test_a_short_drive_tracks_and_is_kept(tmp_path: Path) -> None:
         )
     assert integrity.missing(["clean_unlit"], range(2), tmp_path) == []
     found = report(tmp_path, ["clean_unlit"])
-    assert "wrong: 0 of 2; that proves at most 150.00% (95 %)" in found.text()
+    assert "wrong: 0 of 2: at most 77.64% of scenarios like these (95 %)" in found.text()
     told = integrity.told(found, range(2))
     assert (told.figures[0].value, told.figures[0].ok) == (0.0, True)
     (picture,) = draw_pictures(told, tmp_path)
