@@ -179,7 +179,7 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
 
 
 def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
-    if now.lateness > STALLED_PERIODS * now.period:
+    if now.cycles and now.lateness > STALLED_PERIODS * now.period:  # while kernels are compiled it may well be late
         yield Fault.LOOP_STALLED
     if now.overruns - before.overruns > FEW + 0.05 * (now.cycles - before.cycles):
         yield Fault.OVERRUNS

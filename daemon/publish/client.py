@@ -256,8 +256,10 @@ def _links(reading: Reading) -> Iterator[dict[str, Any]]:
 def as_table(reading: Reading, stalled: bool) -> str:
     """The reading for a person: one line a subject."""
     flags = registers.decode_bits(registers.FLAGS, reading["flags"])
+    starting = reading["state"] == State.STARTING  # no cycle yet: nothing is published anew, no device judged
+    still = "  (STANDS STILL: no new snapshot)" if stalled and not starting else ""
     rows = [
-        ("state", _state(reading["state"]) + ("  (STANDS STILL: no new snapshot)" if stalled else "")),
+        ("state", _state(reading["state"]) + still),
         ("reason", _meaning("reason", reading["reason"])),
         ("fault", _meaning("fault", reading["fault"])),
         *_more_faults(reading),
@@ -272,7 +274,7 @@ def as_table(reading: Reading, stalled: bool) -> str:
         *_lights(reading),
         ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
         ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget{_left_out(reading)}"),
-        ("devices", _devices(reading["devices"])),
+        ("devices", _devices(reading["devices"], starting)),
         *_parts(reading),
         ("snapshot", f"{reading['seq']}, {_date(reading['t_utc'])}"),
     ]
@@ -421,11 +423,12 @@ def _loops(reading: Reading) -> str:
     return f"{reading['loop_counter']}, latest: keyframe {reading['loop_new']} to {reading['loop_old']}{fits}"
 
 
-def _devices(word: Value) -> str:
+def _devices(word: Value, starting: bool) -> str:
     bits = registers.decode_bits(registers.DEVICES, word)
-    names = ("lidar", "adc", "odometry")
-    fitted = [f"{name} {'ok' if bits[f'{name}_ok'] else 'NOT OK'}" for name in names if bits[f"{name}_fitted"]]
-    return ", ".join(fitted) or "none configured"
+    fitted = [name for name in ("lidar", "adc", "odometry") if bits[f"{name}_fitted"]]
+    if starting and fitted:
+        return f"{', '.join(fitted)}: told from the first cycle on"
+    return ", ".join(f"{name} {'ok' if bits[f'{name}_ok'] else 'NOT OK'}" for name in fitted) or "none configured"
 
 
 def _date(t_utc: Value) -> str:

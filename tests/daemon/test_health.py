@@ -76,6 +76,12 @@ def test_the_first_second_after_a_start_is_no_rate() -> None:
     assert assess(early, early) == assess(early, BEFORE) == ()
 
 
+def test_a_loop_that_is_late_while_kernels_are_compiled_is_no_fault() -> None:
+    loading = Vitals(1.0, link=Link.STREAMING, lateness=0.5)
+    assert assess(loading, loading) == ()
+    assert assess(replace(WELL, lateness=0.5), BEFORE) == (Fault.LOOP_STALLED,)
+
+
 def test_only_what_is_new_counts() -> None:
     old = replace(BEFORE, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3)
     now = replace(WELL, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3, odometry=True)

@@ -104,6 +104,16 @@ def test_a_daemon_whose_cycle_stands_still_is_shown_as_such(capsys: pytest.Captu
     assert "STANDS STILL" in capsys.readouterr().out
 
 
+def test_before_the_first_cycle_no_device_is_judged_and_nothing_is_said_to_stand_still(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run_against(snapshot(state=State.STARTING), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "devices    lidar, odometry: told from the first cycle on\n" in shown
+    assert "STANDS STILL" not in shown
+    assert "NOT OK" not in shown
+
+
 def test_what_is_not_known_reads_so(capsys: pytest.CaptureFixture[str]) -> None:
     empty = Snapshot(seq=0, t_mono=0.0, t_sent=0.0, t_utc=0.0, state=State.STARTING, reason=0)
     assert run_against(empty, advance=False) == 0
