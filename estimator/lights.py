@@ -207,11 +207,13 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
-        seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
-        x0, P0 = track.x[:3].copy(), track.P[:3, :3].copy()
-        likelihood = absorb(lights, track, seen, view_of(lights, back))
         if lights.course.wheels and len(lights.tracks) == 1 and lights.result is not None:
-            row.moderate(lights.catalogue, lights.result.accepted, x0, P0, track.x, track.P)
+            narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
+            lights.t_row = min(lights.t_row, middle) if narrow > row.SLIGHT else math.inf
+            if middle - lights.t_row >= row.LASTING_S:
+                row.loosen(narrow, angle, track.P)
+        seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
+        likelihood = absorb(lights, track, seen, view_of(lights, back))
         track.weight += likelihood * news
         views.append((track, seen))
     if len(lights.tracks) > 1:

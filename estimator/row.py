@@ -13,13 +13,16 @@ import numpy as np
 from estimator.lights_catalogue import Catalogue
 from estimator.linear3 import add_turned
 from estimator.records import Array
-from estimator.se2 import wrap
 
 ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2
 """Lamps less than the first off a line are a row; the second is allowed for across it, the third for the heading."""
 
 SIDE_M, SIDE_RAD = 0.5, 0.1
-"""What no number of looks at a row makes a pose surer than."""
+"""What no number of looks at a row makes surer than."""
+
+SLIGHT, LASTING_S = 0.1, 1.0
+"""A row by less than the first is none; nor is one that has not lasted so many seconds: other lamps are hidden for a
+moment, and come to be in use again."""
 
 KNOWN = 4096
 """So many sets of lamps are remembered."""
@@ -44,51 +47,34 @@ def doubt(catalogue: Catalogue, lamps: frozenset[int]) -> Array:
     return known
 
 
-def moderate(catalogue: Catalogue, lamps: frozenset[int], x0: Array, P0: Array, x: Array, P: Array) -> None:
-    """Keep looks at a row of lamps from making a pose surer, across it and in heading, than one of them makes it.
-
-    How far the lamps seem from the row is the same mistake in every epoch (walls beside, a common gain), and with it
-    the heading: believed twenty times a second it is soon held for certain, and is a mistake along the next row. Who
-    knew it better before, from other lamps and by wheels since, goes on knowing that.
-
-    Args:
-        catalogue: of all lamps.
-        lamps: those in use.
-        x0: pose (3,; m, m, rad in the survey's axes) before an epoch of them was taken in.
-        P0: its covariance then, (3, 3).
-        x: state after it, the pose first; changed in place.
-        P: its covariance; changed in place.
-    """
+def shape(catalogue: Catalogue, lamps: frozenset[int]) -> tuple[float, float]:
+    """How much lamps are a row (1: on one line; 0: not at all, or fewer than two are known), and its direction, rad."""
     at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, sorted(lamps)) if lamp is not None]
     if len(at) < 2:
-        return
-    _, across, angle = spread(at)
-    narrow = math.exp(-2.0 * across / ROW_M**2)
-    nx, ny = -math.sin(angle), math.cos(angle)
-    before = nx * nx * P0[0, 0] + 2.0 * nx * ny * P0[0, 1] + ny * ny * P0[1, 1]
-    after = nx * nx * P[0, 0] + 2.0 * nx * ny * P[0, 1] + ny * ny * P[1, 1]
-    share, lacks = refused(before, after, narrow * SIDE_M**2)
-    back = -share * (nx * (x[0] - x0[0]) + ny * (x[1] - x0[1]))
-    x[0] += back * nx
-    x[1] += back * ny
-    P[0, 0] += lacks * nx * nx
-    P[0, 1] += lacks * nx * ny
-    P[1, 0] = P[0, 1]
-    P[1, 1] += lacks * ny * ny
-    share, lacks = refused(P0[2, 2], P[2, 2], narrow * SIDE_RAD**2)
-    x[2] -= share * wrap(x[2] - x0[2])
-    P[2, 2] += lacks
-
-
-def refused(before: float, after: float, least: float) -> tuple[float, float]:
-    """Share of a step that is not believed, and the variance to be given back, so that it is not below ``least``.
-
-    What was below that before stays as it was.
-    """
-    lacks = min(before, least) - after
-    if lacks <= 0.0 or before <= after:
         return 0.0, 0.0
-    return lacks / (before - after), lacks
+    _, across, angle = spread(at)
+    return math.exp(-2.0 * across / ROW_M**2), angle
+
+
+def loosen(narrow: float, angle: float, P: Array) -> None:
+    """Keep a pose that a row of lamps has told from becoming surer across it than one look at them makes it.
+
+    How far the lamps seem from the row is the same mistake in every epoch (walls beside, a common gain), and with it
+    the heading: believed twenty times a second it is soon held for certain, and is a mistake along the next row.
+
+    Args:
+        narrow: how much the lamps in use are a row.
+        angle: its direction, rad; see `shape`.
+        P: covariance, its first three rows and columns those of the pose in the survey's axes; changed in place.
+    """
+    nx, ny = -math.sin(angle), math.cos(angle)
+    lacks = narrow * SIDE_M**2 - (nx * nx * P[0, 0] + 2.0 * nx * ny * P[0, 1] + ny * ny * P[1, 1])
+    if lacks > 0.0:
+        P[0, 0] += lacks * nx * nx
+        P[0, 1] += lacks * nx * ny
+        P[1, 0] = P[0, 1]
+        P[1, 1] += lacks * ny * ny
+    P[2, 2] += max(0.0, narrow * SIDE_RAD**2 - P[2, 2])
 
 
 def spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
