@@ -112,7 +112,8 @@ def open_log(path: Path) -> Source:
         return CaptureSource(path)
     for magic, what in FOREIGN.items():
         if begin.startswith(magic):
-            raise DataInvalid(str(path), f"is {what}, which cannot be replayed", _REMEDY)
+            remedy = "replay or export the recording that it was made of" if "MCAP" in what else _REMEDY
+            raise DataInvalid(str(path), f"is {what}, which cannot be replayed", remedy)
     return CarmenSource(path)
 
 

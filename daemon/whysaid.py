@@ -115,6 +115,9 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False)
         what = "nothing changes" if changed is None else "state, reason or fault first change in it"
         when = f"{when.partition('.')[0]}, the whole second: {what}"
     one = told[k]
+    apart = abs(one.utc - utc) - (SECOND_S if second else 0.0)
+    if apart > SECOND_S:
+        when = f"{when.partition(', the whole')[0]}, no cycle ran within {apart:.0f} s of it; the nearest"
     lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *_state(told, k)]
     lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]

@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     if args.mcap is None and args.tum is None and args.kitti is None:
         return cli.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", cli.USAGE)
     try:
-        if args.mcap is not None and _is_mcap(args.log):
+        if _is_mcap(args.log):
             return _save(args)
         return _export(args)
     except ModuleNotFoundError as error:
@@ -62,7 +62,10 @@ def _save(args: argparse.Namespace) -> int:
     from taps.recover import NotMcap, recover
 
     if args.tum or args.kitti:
-        return cli.fail(f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole", cli.USAGE)
+        told = f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole"
+        return cli.fail(f"{told}; trajectories are made of the recording itself", cli.USAGE)
+    if args.mcap.resolve() == args.log.resolve():
+        return cli.fail(f"--mcap {args.mcap}: is the file that is read; name another one", cli.USAGE)
     try:
         found = recover(args.log, args.mcap)
     except NotMcap as error:
@@ -92,11 +95,13 @@ def _export(args: argparse.Namespace) -> int:
     for path, text in ((args.tum, tum), (args.kitti, kitti)):
         if path is not None:
             write_whole(path, text(final))
-            cli.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}")
+            none = "" if len(final.stamps) else "; no cycle ran in the recording: the daemon was still starting"
+            cli.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}{none}")
     for sentence in told.source.report.sentences():
         cli.say(f"{args.log}: {sentence}")
     if told.rerun.comparison.differ:
-        cli.say(f"the replay is not the recorded run ({told.rerun.comparison.first}): other software, or records lost")
+        count, first = told.rerun.comparison.differ, told.rerun.comparison.first
+        cli.say(f"the replay is not the recorded run in {count} cycles: other software, or records lost; first {first}")
     return cli.fail(f"{stopped}; what was read until then is written") if stopped else cli.OK
 
 

@@ -56,6 +56,8 @@ def _wrong(args: argparse.Namespace) -> str:
     metres = args.accuracy, args.reach, args.spacing
     if not (all(0.0 < m < math.inf for m in metres) and 0.0 < args.share <= 100.0 and args.links >= 1):
         return "--accuracy, --reach, --spacing, --links have to be above 0 and finite, --share above 0 and at most 100"
+    if args.lamps is not None and args.survey is not None:
+        return "--lamps says how many are to be hung, --survey judges those that hang: name one of them"
     if args.lamps is not None and args.lamps < 1:
         return "--lamps: name one or more"
     return ""

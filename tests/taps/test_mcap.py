@@ -238,6 +238,19 @@ def test_what_is_no_mcap_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert not (tmp_path / "b").exists()
 
 
+def test_an_mcap_file_is_neither_written_over_itself_nor_made_into_a_trajectory(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "drive.mcap"
+    file.write_bytes((exported / "drive.mcap").read_bytes())
+    before = file.read_bytes()
+    assert cli.main(["export", str(file), "--mcap", str(tmp_path / "x" / ".." / "drive.mcap")]) == cli.USAGE
+    assert "name another one" in capsys.readouterr().err
+    assert cli.main(["export", str(file), "--tum", str(tmp_path / "t")]) == cli.USAGE
+    assert "made of the recording itself" in capsys.readouterr().err
+    assert file.read_bytes() == before
+
+
 @pytest.mark.system
 def test_a_dump_of_the_flight_recorder_opens_with_the_poses_that_were_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -206,6 +206,7 @@ def test_a_plan_that_lies_turned_in_the_map() -> None:
         (["--height", "0.4"], "not above the receiver"),
         (["--height", "99"], "name metres above the floor"),
         (["--lamps", "0"], "name one or more"),
+        (["--lamps", "3", "--survey", "none.toml"], "name one of them"),
         (["--accuracy", "0"], "have to be above 0"),
         (["--reach", "nan"], "have to be above 0"),
         (["--spacing", "inf"], "have to be above 0"),

@@ -210,6 +210,16 @@ def test_lamps_that_do_not_fit_the_place_dissent_though_what_is_left_agrees(agai
     assert "fits again" not in said
 
 
+def test_a_moment_without_a_cycle_is_said_to_have_none() -> None:
+    moment = Moment(100.0, State.DEGRADED, NOTHING, None, None, True, None, 0, ())
+    for second in (False, True):
+        head = report([moment], 50.0, "here", second).splitlines()[0]
+        assert "no cycle ran within" in head
+        assert "the nearest, cycle of" in head
+        assert "nothing changes" not in head
+    assert "no cycle ran" not in report([moment], 99.5, "here").splitlines()[0]
+
+
 def test_a_lamp_that_was_hidden_and_fits_again_is_said_to_wait() -> None:
     links = (LightLink(7, 7, LinkUse.OCCLUDED, 1e-9, 0.1), LightLink(8, 8, LinkUse.OCCLUDED, 1e-9, -0.9))
     shown = replace(NOTHING, pose=(1.0, 2.0, 0.0), light=LightPicture(links=links))
