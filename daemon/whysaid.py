@@ -115,9 +115,11 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False)
         what = "nothing changes" if changed is None else "state, reason or fault first change in it"
         when = f"{when.partition('.')[0]}, the whole second: {what}"
     one = told[k]
-    apart = abs(one.utc - utc) - (SECOND_S if second else 0.0)
+    begun, apart = when.partition(", the whole")[0], one.utc - utc
     if apart > SECOND_S:
-        when = f"{when.partition(', the whole')[0]}, no cycle ran within {apart:.0f} s of it; the nearest"
+        when = f"{begun}, no cycle had run yet; the first, {apart:.0f} s later"
+    elif apart < -SECOND_S:
+        when = f"{begun}, no cycle ran then; the last before it, {-apart:.0f} s earlier"
     lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *_state(told, k)]
     lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]

@@ -95,7 +95,7 @@ def _export(args: argparse.Namespace) -> int:
     for path, text in ((args.tum, tum), (args.kitti, kitti)):
         if path is not None:
             write_whole(path, text(final))
-            none = "" if len(final.stamps) else "; no cycle ran in the recording: the daemon was still starting"
+            none = "" if len(final.stamps) else "; no cycle in the recording had a pose"
             cli.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}{none}")
     for sentence in told.source.report.sentences():
         cli.say(f"{args.log}: {sentence}")

@@ -214,10 +214,11 @@ def test_a_moment_without_a_cycle_is_said_to_have_none() -> None:
     moment = Moment(100.0, State.DEGRADED, NOTHING, None, None, True, None, 0, ())
     for second in (False, True):
         head = report([moment], 50.0, "here", second).splitlines()[0]
-        assert "no cycle ran within" in head
-        assert "the nearest, cycle of" in head
+        assert "no cycle had run yet; the first, 50 s later, cycle of" in head
         assert "nothing changes" not in head
-    assert "no cycle ran" not in report([moment], 99.5, "here").splitlines()[0]
+        head = report([moment, replace(moment, utc=200.0)], 195.0, "here", second).splitlines()[0]
+        assert "no cycle ran then; the last before it, 95 s earlier, cycle of" in head
+    assert "no cycle" not in report([moment], 100.5, "here").splitlines()[0]
 
 
 def test_a_lamp_that_was_hidden_and_fits_again_is_said_to_wait() -> None:
