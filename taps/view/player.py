@@ -7,7 +7,7 @@ import math
 from typing import Any, Final, TypeGuard
 
 from taps.view.film import Film
-from taps.view.viewers import KEPT, ROWS, Tile, Viewer, frame
+from taps.view.viewers import LOOPS, ROWS, Tile, Viewer, frame
 
 TICK_S: Final = 0.04
 LOOK_S: Final = 0.2
@@ -73,7 +73,7 @@ class Player:
         self._shown.update(dict.fromkeys(viewer.forget(), UNTOLD))
         self._introduce()
         viewer.put("rewound", frame("rewound", None), once=True)
-        for kind, most in (("row", ROWS), ("loop", KEPT // 2)):
+        for kind, most in (("row", ROWS), ("loop", LOOPS)):
             reel = film.reels[kind]
             until = reel.upto(self.at)
             pieces = [film.piece(reel, index) for index in range(max(0, until - most), until)]

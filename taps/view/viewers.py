@@ -16,6 +16,8 @@ from taps.frames import TYPES, Data, Lights, MapTiles, Pose
 
 KEPT: Final = 64
 """Of what happens once."""
+LOOPS: Final = 32
+"""Of the latest, that a newcomer is told."""
 TILES_BYTES: Final = 64 << 10
 """Of tiles in one message."""
 ROWS: Final = 1200
@@ -136,7 +138,7 @@ class Hub:
         self.up, self.why = False, "not connected yet"
         self.history = History()
         self._latest: dict[str, bytes] = {}
-        self._loops: deque[bytes] = deque(maxlen=KEPT // 2)  # beside them a newcomer is told more that happens once
+        self._loops: deque[Data] = deque(maxlen=LOOPS)
         self._tiles: dict[Tile, bytes] = {}
         self._about: dict[str, object] = {}
         self._used: int | None = None
@@ -166,7 +168,7 @@ class Hub:
         topic = TOPIC_OF[type(data)]
         body, once = frame(topic, data), topic in ONCE
         if topic == "loop":
-            self._loops.append(body)
+            self._loops.append(data)
         elif not once:
             self._latest[topic] = body
         for viewer in self.viewers:
@@ -187,8 +189,8 @@ class Hub:
         self.viewers.add(viewer)
         viewer.put("daemon", frame("daemon", self._daemon()), once=True)
         viewer.put("history", frame("history", list(self.history.rows)), once=True)
-        for body in self._loops:
-            viewer.put("loop", body, once=True)
+        if self._loops:  # as what has been, not as what happens now
+            viewer.put("loops", frame("loops", list(self._loops)), once=True)
         for topic, body in self._latest.items():
             viewer.put(topic, body)
         viewer.put_tiles(self._about, self._tiles.items())

@@ -71,7 +71,7 @@ function banner(text) {
 function toast(text, cls = "") {
   const made = element("div", `toast ${cls}`, text);
   $("toasts").append(made);
-  while ($("toasts").children.length > 3) $("toasts").firstChild.remove();
+  while ($("toasts").children.length > 3) ($("toasts").querySelector(".loop") || $("toasts").firstChild).remove();
   setTimeout(() => made.remove(), TOAST_MS);
 }
 

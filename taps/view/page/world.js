@@ -50,8 +50,10 @@ export class World {
   on_faults(data) { this.faults = data.present; }
   on_map(data) { this.tiles.take(data); }
 
-  on_loop(data) {
-    this.loops.push({ ...data, since: performance.now() });
+  on_loops(loops) { for (const one of loops) this.on_loop(one, -Infinity); }
+
+  on_loop(data, since = performance.now()) {
+    this.loops.push({ ...data, since });
     if (this.loops.length > LOOPS) this.loops.shift();
   }
 

@@ -153,6 +153,12 @@ def test_an_old_tab_on_another_version_loads_itself_anew(browser: str, address: 
 
 def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -> None:
     async def body(page: Tab) -> None:
+        for number in range(9):  # in a building that the robot knows by heart
+            loop = f"{{counter: {number}, keyframe_new: {number}, keyframe_old: 0, residual: 0.01, reason: 0}}"
+            await page.js(f"lumiloop.link.told.frame('loop', {loop})")
+        said = await page.js("[...document.querySelectorAll('.toast')].map((one) => one.textContent)")
+        assert "That token is not the right one: read-only" in said
+        assert len(said) == 3
         assert await page.js("document.getElementById('card-orders').hidden")
         assert await shown(page, "mode") == "read-only"
 
@@ -168,6 +174,16 @@ def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -
             await page.until("document.getElementById('banner').textContent.includes('is the daemon running?')")
             await page.until("document.getElementById('state-name').textContent === 'NO DAEMON'")
             assert page.said == []
+        async with tab(browser, address, PHONE, phone=True) as page:  # the name of a socket is long, and has no gaps
+            await page.until("globalThis.lumiloop")
+            await page.until("document.getElementById('banner').textContent.includes('is the daemon running?')")
+            beside = await page.js(
+                "[document.getElementById('banner'), document.querySelector('.tools')].map((one) => ["
+                "one.scrollWidth - one.clientWidth, one.getBoundingClientRect().left,"
+                "one.getBoundingClientRect().right])"
+            )
+            assert beside[0][0] <= 0
+            assert beside[0][2] <= beside[1][1]
 
     with view(env, tmp_path) as address:
         asyncio.run(body(address))

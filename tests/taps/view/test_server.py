@@ -118,7 +118,7 @@ def test_what_the_stream_tells_is_handed_on(tmp_path: Path) -> None:
             rows = await late.until("history")
             assert rows[0][:4] == [pytest.approx(100.025), 0.01, 0.0, 0.1]
             assert rows[0][viewers.History.COLUMNS.index("used")] in (None, 2)
-            assert (await late.until("loop"))["counter"] == 1
+            assert [one["counter"] for one in await late.until("loops")] == [1]
             assert (await late.until("pose"))["seq"] == 2
 
     run(tmp_path, body)
@@ -302,9 +302,13 @@ def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Path) ->
         message = viewer.take()
         assert message is not None
         told = msgspec.msgpack.decode(message)
-        assert [one["topic"] for one in told[:2]] == ["daemon", "history"]
+        assert [one["topic"] for one in told] == ["daemon", "history", "loops"]  # no loop that happens now
         assert not told[0]["data"]["up"]
-        assert told[-1]["data"]["counter"] == 2 * viewers.KEPT - 1
+        assert [one["counter"] for one in told[2]["data"]][-1] == 2 * viewers.KEPT - 1
+        hub.take(Loop(t_mono=1e3, counter=1000))
+        message = viewer.take()
+        assert message is not None
+        assert [one["topic"] for one in msgspec.msgpack.decode(message)] == ["loop"]
 
     asyncio.run(body())
 
