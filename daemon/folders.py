@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import socket
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -31,6 +33,22 @@ def stream_path(name: str) -> Path:
     """Where the daemon of that ``name`` (of the configuration) serves its local stream: ours, else the service's."""
     own, service = runtime_folder() / f"{name}.stream", SERVICE / f"{name}.stream"
     return service if _there(service) and not _there(own) else own
+
+
+def daemons_in(folder: Path) -> list[str]:
+    """Names of the daemons whose local streams are served in a folder."""
+    try:
+        return sorted(path.stem for path in folder.glob("*.stream") if _served(path))
+    except OSError:
+        return []
+
+
+def _served(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock, contextlib.suppress(OSError):
+        sock.setblocking(False)
+        sock.connect(str(path))
+        return True
+    return False
 
 
 def _there(path: Path) -> bool:

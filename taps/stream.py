@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from daemon.folders import stream_path
+from daemon.folders import daemons_in, stream_path
 from daemon.publish.stream import TOPICS
 from taps import frames
 from taps.frames import LONGEST, Frame, NotTheStream, Refused
@@ -76,6 +76,8 @@ class Stream:
                     lost = f"{path}: the daemon has closed the stream"
             except OSError as error:
                 lost = f"{path}: {_why(error)}"
+                if not told and _nobody(error):
+                    lost += _others(path)
             if not told:
                 told = True
                 yield Lost(lost)
@@ -125,8 +127,18 @@ async def _body(reader: asyncio.StreamReader, patience_s: float | None) -> bytes
         raise OSError(f"nothing is said for {SILENT_S:.0f} s: the daemon stands") from None
 
 
+def _nobody(error: OSError) -> bool:
+    return isinstance(error, (FileNotFoundError, ConnectionRefusedError))
+
+
+def _others(path: Path) -> str:
+    """Daemons that may be meant: who forgets `--config` asks for the one of the default name."""
+    names = [name for name in daemons_in(path.parent) if name != path.stem]
+    return f"; {', '.join(names)} runs here: `--set name={names[0]}`, or `--config`" if names else ""
+
+
 def _why(error: OSError) -> str:
-    if isinstance(error, (FileNotFoundError, ConnectionRefusedError)):
+    if _nobody(error):
         return "nobody listens there; is the daemon running? its log names its stream"
     if isinstance(error, PermissionError):
         return "you may not open it; who may reach its folder may listen"

@@ -139,6 +139,20 @@ def test_one_that_is_not_patient_ends(tmp_path: Path) -> None:
     assert isinstance(lost, Lost)
 
 
+def test_a_daemon_of_another_name_is_named(tmp_path: Path) -> None:
+    (tmp_path / "old.stream").touch()  # nobody listens there either
+
+    async def body() -> str:
+        async with await asyncio.start_unix_server(lambda *_: None, str(tmp_path / "agv.stream")):
+            lost = await first(Stream(tmp_path / "lumiloop.stream", ("pose",)), Lost)
+            assert isinstance(lost, Lost)
+            return lost.text
+
+    said = asyncio.run(body())
+    assert "agv runs here: `--set name=agv`, or `--config`" in said
+    assert "old" not in said.partition("nobody listens there")[2]
+
+
 def serve(path: Path) -> asyncio.Task[None]:
     return asyncio.ensure_future(StreamServer(path, "agv", lambda _: ("", "")).run())
 
