@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import json
 import math
+import shutil
 import socket
 import struct
 import sys
@@ -207,20 +208,28 @@ def _watch(reader: Reader, as_json: bool) -> int:
             sys.stderr.write(f"lumiloop: {error}\n")
             before = None
         else:
-            if sys.stdout.isatty() and not as_json:
-                sys.stdout.write(_CLEAR)
-            _show(reading, as_json, reading["seq"] == before, who)
+            on_screen = sys.stdout.isatty() and not as_json
+            _show(reading, as_json, reading["seq"] == before, who, on_screen)
             before = reading["seq"]
         time.sleep(_REFRESH_S)
 
 
-def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose) -> None:
+def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose, on_screen: bool = False) -> None:
     if as_json:
         text = json.dumps(as_object(reading, stalled) | {"process": who.pid or None})
     else:
         text = (f"{'daemon':<10} {who}\n" if who.pid else "") + as_table(reading, stalled)
-    sys.stdout.write(text + "\n")
+    sys.stdout.write((_CLEAR + _fitted(text) if on_screen else text) + "\n")
     sys.stdout.flush()
+
+
+def _fitted(text: str) -> str:
+    """What a terminal has room for: the state, which stands first, is not to scroll away."""
+    size = shutil.get_terminal_size()
+    lines, room = [line[: size.columns] for line in text.splitlines()], max(2, size.lines - 1)
+    if len(lines) > room:
+        lines[room - 1 :] = [f"... {len(lines) - room + 1} more lines: a higher window"[: size.columns]]
+    return "\n".join(lines)
 
 
 def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:

@@ -339,6 +339,24 @@ def test_watching_shows_when_the_daemon_is_away(
     assert capsys.readouterr().err.count("nothing serves Modbus there") == 3
 
 
+def test_on_a_small_terminal_watching_keeps_the_first_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nap(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("daemon.publish.client.time.sleep", nap)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setattr("shutil.get_terminal_size", lambda *_: os.terminal_size((40, 8)))
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
+        status(address, watch=True)
+    lines = capsys.readouterr().out.removeprefix("\x1b[H\x1b[2J").splitlines()
+    assert lines[0] == "state      TRACKING"
+    assert len(lines) == 7  # and the cursor's
+    assert max(map(len, lines)) <= 40
+    assert lines[-1] == "... 9 more lines: a higher window"
+
+
 def test_on_a_terminal_watching_repaints(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def nap(_: float) -> None:
         raise KeyboardInterrupt
