@@ -22,6 +22,8 @@ from taps.fleet import drawing, messages
 from taps.fleet.roster import MOST_MAPS, MOST_ROBOTS, Roster
 from taps.zenohlink import BadEndpoint, answers, joined, parts, watched
 
+ROUTER_S: Final = 10.0
+"""For so long who asks once waits for the router."""
 ONCE_S: Final = 2.0
 """Who tells at all has told by then."""
 CLEAR: Final = "\x1b[H\x1b[2J"
@@ -36,6 +38,10 @@ MOST_ANSWERS: Final = 16
 """Of one robot, which has four topics."""
 
 
+class NoRouter(Exception):
+    """Who asks once has waited long enough; the text says so."""
+
+
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     roster = Roster()
@@ -43,6 +49,8 @@ def main(args: argparse.Namespace) -> int:
         asyncio.run(work_until_told(show(args, roster), seconds=0.0) if args.watch else show(args, roster))
     except BadEndpoint as error:
         return cli.fail(str(error), cli.USAGE)
+    except NoRouter as error:
+        return cli.fail(str(error))
     except OSError as error:
         return cli.fail(f"{args.picture}: {reason_of(error)}; name another file")
     return cli.OK if roster.members else cli.fail(f"no robot tells anything by way of {args.router}")
@@ -52,9 +60,17 @@ async def show(args: argparse.Namespace, roster: Roster) -> None:
     """Listen, and show what is known: once, or every second until cancelled.
 
     Raises:
-        BadEndpoint: no such router can be. OSError: the picture cannot be written.
+        BadEndpoint: no such router can be. NoRouter: none answers. OSError: the picture cannot be written.
     """
-    async with joined(args.router, args.zenoh) as session:
+    async with contextlib.AsyncExitStack() as stack:
+        try:
+            async with asyncio.timeout(None if args.watch else ROUTER_S):
+                session = await stack.enter_async_context(joined(args.router, args.zenoh))
+        except TimeoutError:
+            raise NoRouter(
+                f"no router answers at {args.router} within {ROUTER_S:g} s: "
+                "start one (`lumiloop fleet router`), or name it (--router)"
+            ) from None
         listener = Listener(session, roster)
         watching = asyncio.create_task(watched(session, args.router, listener.on_router))
         try:

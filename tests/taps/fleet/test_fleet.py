@@ -337,6 +337,16 @@ def test_messages_that_wait_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> Non
         asyncio.run(body(made))
 
 
+def test_who_asks_once_does_not_wait_for_ever(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("taps.fleet.show.ROUTER_S", 0.3)
+    assert cli.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == cli.FAILED
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "no router answers at tcp/127.0.0.1:1 within 0.3 s: start one (`lumiloop fleet router`)" in told.err
+
+
 def in_a_loop_of_its_own(words: list[str]) -> int:
     """The command, in a thread that cannot take signals."""
     args = cli.parser().parse_args(words)
