@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from importlib.util import find_spec
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,14 @@ from daemon.planning.hall import Array, Hall
 from daemon.planning.sight import worst
 from daemon.planning.walls import KNOWN_SIGMA_M
 
-_INCHES: Final = (15.0, 5.5)
+_LYING: Final = 0.4
+"""Floors that are longer than high by more than that lie one below the other."""
+_PANEL_IN: Final = 11.0
+"""Longest side of one of the three where it is tall, or lies."""
+_WIDE_IN: Final = 4.2
+_LEAST_IN: Final = 2.2
+_STAR_M: Final = 0.9
+_MARGIN_M: Final = 1.0
 _WORST_CM: Final = 25.0
 
 
@@ -23,40 +30,88 @@ def draw(hall: Hall, plan: Plan) -> bytes | None:
         return None
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=_INCHES, dpi=100, layout="constrained")
-    links, accuracy, blind = canvas.subplots(1, 3, sharex=True, sharey=True)
-    seen = _places(links, hall, plan, np.minimum(plan.links, 8), "RdYlGn", (0, 8))
-    links.set_title(f"{len(plan.lamps)} lamps: links that each place sees")
-    canvas.colorbar(seen, ax=links, shrink=0.5)
+    window = _window(hall, plan)
+    upright = window.height >= _LYING * window.width
+    canvas = Figure(figsize=_inches(window, upright), dpi=100, layout="constrained")
+    links, accuracy, blind = canvas.subplots(*((1, 3) if upright else (3, 1)), sharex=True, sharey=True)
+    seen = _places(links, hall, plan, window, np.minimum(plan.links, 8), "RdYlGn", (0, 8))
+    links.set_title(f"{len(plan.lamps)} lamps:\nlinks that each place sees", fontsize="medium")
+    bar = {"shrink": 0.7} if upright else {"shrink": 0.9, "aspect": 10}
+    canvas.colorbar(seen, ax=links, **bar)
     centimetres = np.minimum(100.0 * plan.light_sigma, _WORST_CM)
-    known = _places(accuracy, hall, plan, centimetres, "viridis_r", (0.0, _WORST_CM))
-    accuracy.set_title("deviation from light alone, worse axis, cm")
-    canvas.colorbar(known, ax=accuracy, shrink=0.5)
-    _axes(blind, hall, plan)
+    known = _places(accuracy, hall, plan, window, centimetres, "viridis_r", (0.0, _WORST_CM))
+    accuracy.set_title("deviation from light alone,\nworse axis, cm", fontsize="medium")
+    canvas.colorbar(known, ax=accuracy, **bar)
+    _axes(blind, hall, plan, window)
+    canvas.legend(*blind.get_legend_handles_labels(), loc="outside lower right", ncols=2, fontsize="small")
     out = io.BytesIO()
     canvas.savefig(out, format="png")
     return out.getvalue()
 
 
-def _walls(axes: Any, hall: Hall) -> None:
+class Window(NamedTuple):
+    """The part of the plan that holds anything of the floor, m in its frame."""
+
+    left: float
+    below: float
+    width: float
+    height: float
+
+
+def _window(hall: Hall, plan: Plan) -> Window:
+    points = np.concatenate((hall.places, plan.lamps)) if len(hall.places) else np.zeros((1, 2))
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    return Window(low[0], low[1], high[0] - low[0], high[1] - low[1])
+
+
+def _panel(window: Window) -> tuple[float, float]:
+    """Width and height of one of the three, inches."""
+    ratio = window.height / window.width
+    wide = min(_WIDE_IN, _PANEL_IN / ratio) if ratio >= _LYING else _PANEL_IN
+    return wide, wide * ratio
+
+
+def _inches(window: Window, upright: bool) -> tuple[float, float]:
+    """Width and height of a picture that the three fill."""
+    wide, high = _panel(window)
+    if upright:
+        return 3.0 * (max(wide, _LEAST_IN) + 0.8), max(high, _LEAST_IN) + 1.4
+    return wide + 1.2, 3.0 * (max(high, 0.5) + 0.9) + 0.4
+
+
+def _points_per_m(window: Window) -> float:
+    return 72.0 * _panel(window)[0] / window.width
+
+
+def _lamps(axes: Any, plan: Plan, window: Window) -> None:
+    """Stars, small enough to leave something to be seen between them."""
+    size = float(np.clip(_STAR_M * _points_per_m(window), 3.0, 9.0))
+    axes.plot(*plan.lamps.T, "*", color="black", markerfacecolor="gold", markersize=size, markeredgewidth=0.1 * size)
+
+
+def _walls(axes: Any, hall: Hall, window: Window) -> None:
     rows, columns = hall.solid.shape
     shade = np.where(hall.tall, 0.0, np.where(hall.solid, 0.5, np.nan))
     extent = (0.0, columns * hall.cell, 0.0, rows * hall.cell)
     axes.imshow(shade, origin="lower", extent=extent, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
+    axes.set_xlim(window.left, window.left + window.width)
+    axes.set_ylim(window.below, window.below + window.height)
     axes.set_aspect("equal")
 
 
-def _places(axes: Any, hall: Hall, plan: Plan, value: Array, colours: str, span: tuple[float, float]) -> Any:
-    _walls(axes, hall)
-    size = 40.0 * (hall.step / max(hall.cell * max(hall.solid.shape), 1e-9) * 25.0) ** 2
+def _places(
+    axes: Any, hall: Hall, plan: Plan, window: Window, value: Array, colours: str, span: tuple[float, float]
+) -> Any:
+    _walls(axes, hall, window)
+    size = (hall.step * _points_per_m(window)) ** 2
     drawn = axes.scatter(*hall.places.T, c=value, s=size, marker="s", cmap=colours, vmin=span[0], vmax=span[1], lw=0)
-    axes.plot(*plan.lamps.T, "*", color="black", markerfacecolor="gold", markersize=9)
+    _lamps(axes, plan, window)
     return drawn
 
 
-def _axes(axes: Any, hall: Hall, plan: Plan) -> None:
+def _axes(axes: Any, hall: Hall, plan: Plan, window: Window) -> None:
     """Lines along the axis that is not known: by the laser alone, and with lamps."""
-    _walls(axes, hall)
+    _walls(axes, hall, window)
     for info, colour, label in (
         (plan.walls, "tab:orange", "laser alone"),
         (plan.walls + plan.light, "tab:red", "laser and light"),
@@ -67,6 +122,5 @@ def _axes(axes: Any, hall: Hall, plan: Plan) -> None:
         ends = np.stack((hall.places[at] - half, hall.places[at] + half, np.full_like(half, np.nan)), axis=1)
         x, y = ends.reshape(-1, 2).T
         axes.plot(x, y, color=colour, lw=1.5, label=f"{label}: {100.0 * at.mean():.1f} %")
-    axes.plot(*plan.lamps.T, "*", color="black", markerfacecolor="gold", markersize=9)
-    axes.set_title(f"axes that are not known to {100 * KNOWN_SIGMA_M:.0f} cm")
-    axes.legend(loc="upper right")
+    _lamps(axes, plan, window)
+    axes.set_title(f"axes that are not known to {100 * KNOWN_SIGMA_M:.0f} cm", fontsize="medium")

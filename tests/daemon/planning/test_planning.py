@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from daemon import cli
 from daemon.planning.choose import Goals, Plan, choose, codes_for, plan_of
 from daemon.planning.command import report
 from daemon.planning.hall import Hall, NoHall, clear, hall_of, read_hall
+from daemon.planning.picture import draw
 from daemon.planning.sight import Fitting, information, seen_from, told, worst
 from daemon.planning.walls import KNOWN_SIGMA_M, wall_information
 from daemon.surveyfile import read_survey
@@ -192,6 +194,24 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
         line for line in again.splitlines() if line.startswith("laser and light")
     ]
     assert not (tmp_path / "b" / "lights.toml").exists()
+
+
+@pytest.mark.parametrize(("width", "depth"), [(40.0, 2.2), (2.2, 30.0)])
+def test_the_picture_of_a_long_floor_is_not_mostly_paper(width: float, depth: float) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread
+
+    floor = hall(width, depth)
+    along = np.linspace(1.0, max(width, depth) - 1.0, 8)
+    lamps = np.column_stack((along, np.full(8, 1.2)))
+    plan = plan_of(floor, FITTING, wall_information(floor), Goals(), lamps if width > depth else lamps[:, ::-1])
+    drawn = draw(floor, plan)
+    assert drawn is not None
+    pixels = imread(io.BytesIO(drawn))
+    paper = np.mean(np.all(pixels[:, :, :3] == 1.0, axis=2))
+    assert paper < 0.85
+    for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
+        assert np.all(edge[:, :3] == 1.0)  # nothing is cut off
 
 
 def test_a_plan_that_lies_turned_in_the_map() -> None:
