@@ -36,7 +36,7 @@ def draw(hall: Hall, plan: Plan) -> bytes | None:
     links, accuracy, blind = canvas.subplots(*((1, 3) if upright else (3, 1)), sharex=True, sharey=True)
     seen = _places(links, hall, plan, window, np.minimum(plan.links, 8), "RdYlGn", (0, 8))
     links.set_title(f"{len(plan.lamps)} lamps:\nlinks that each place sees", fontsize="medium")
-    bar = {"shrink": 0.7} if upright else {"shrink": 0.9, "aspect": 10}
+    bar: dict[str, Any] = {"shrink": 0.7} if upright else {"shrink": 0.9, "aspect": 10}
     canvas.colorbar(seen, ax=links, **bar)
     centimetres = np.minimum(100.0 * plan.light_sigma, _WORST_CM)
     known = _places(accuracy, hall, plan, window, centimetres, "viridis_r", (0.0, _WORST_CM))
