@@ -74,7 +74,7 @@ def _look_at_survey(settings: Config, profile: str | None, file: Path, wrong: li
         survey = read_survey(path, None if profile is None else PROFILES[profile])
         read_residuals(path)
     except SurveyError as error:
-        wrong.append((cli.USAGE, f"{error} (`lights.survey` in {file} names it)"))
+        wrong.append((cli.USAGE, f"{error} ({configfile.naming(file, 'lights.survey', path)})"))
         return []
     unused = [] if settings.photodiode.fitted else ["the survey is not used: `photodiode.bus` is empty"]
     return [f"{path}: good, {len(survey.lamps)} lamps", *unused]

@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from daemon.config import Config
-from daemon.configwords import MOVED, Option, Wrong, options, problems, value_text
+from daemon.configwords import MOVED, Option, Wrong, line_of, options, problems, value_text
 from daemon.endpoints import AUTO
 from daemon.wholefile import write_whole
 
@@ -112,6 +112,20 @@ def _anchored(config: Config, file: Path | None) -> Config:
             config, map=msgspec.structs.replace(config.map, folder=str(here / config.map.folder))
         )
     return config
+
+
+def naming(file: Path | None, key: str, path: Path) -> str:
+    """Who names a file that is wrong: ``FILE:LINE`` and the key; the key alone where ``--set`` names it."""
+    try:
+        text = file.read_text("utf-8") if file is not None else ""
+        told: Any = tomllib.loads(text)
+        for part in key.split("."):
+            told = told[part]
+        if file is not None and (file.resolve().parent / told) == path and (line := line_of(text, key)):
+            return f"{file}:{line} names it: `{key}`"
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # what is wrong with the configuration itself is told elsewhere
+    return f"`{key}` names it"
 
 
 def brought_up(tree: dict[str, Any]) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def problems(tree: dict[str, Any], name: str, text: str = "") -> list[Wrong]:
     def tell(problem: _Problem) -> None:
         path = ".".join(problem.keys)
         if not any(f"`{key}`" in problem.beside for key in gone):  # else it is about the value that stands in for that
-            line = _line_of(text, path)
+            line = line_of(text, path)
             found.append((line, Wrong(f"{name}:{line}: {problem.words}" if line else f"{name}: {problem.words}", path)))
         gone.append(path)
 
@@ -225,7 +225,7 @@ def _nearest(path: str, table: bool) -> str:
     return "; did you mean " + " or ".join(f"`{other}`" for other in near[:3]) + "?"
 
 
-def _line_of(text: str, path: str) -> int:
+def line_of(text: str, path: str) -> int:
     """Line of the assignment that holds the key at ``path``, or of its table; 0 where neither is written out."""
     table = ""
     best, best_length = 0, 0

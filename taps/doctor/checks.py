@@ -12,6 +12,7 @@ from typing import Final
 
 from daemon.check import Maps, implausible, look_at_maps
 from daemon.config import Config
+from daemon.configfile import naming
 from daemon.endpoints import ANYBODY, AUTO, parse_endpoint, subscription_port
 from daemon.folders import can_be_made, maps_folder, runtime_folder, state_folder, stream_path
 from daemon.probe import is_bus
@@ -281,10 +282,13 @@ def survey(case: Case) -> Iterator[Finding]:
                 "survey", "none: lamps that do not send their own place are of no use", "see `lumiloop survey`"
             )
         return
+    path = Path(settings.lights.survey)
     try:
-        found = read_survey(Path(settings.lights.survey), profile_of(settings.photodiode))
+        found = read_survey(path, profile_of(settings.photodiode))
     except SurveyError as error:
-        yield fix("survey", str(error), "mend it; `lumiloop check` reads it again")
+        named = naming(case.file, "lights.survey", path)
+        remedy = "mend it" if path.exists() else "put it there, or name another"
+        yield fix("survey", f"{error} ({named})", f"{remedy}; `lumiloop check` reads it again")
         return
     unused = "" if settings.photodiode.fitted else ", not used: photodiode.bus is empty"
     yield good("survey", f"{settings.lights.survey}: {len(found.lamps)} lamps{unused}")

@@ -118,6 +118,16 @@ def test_a_survey_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "lights.toml: no such survey" in capsys.readouterr().err
 
 
+def test_the_line_that_names_a_bad_survey_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write(tmp_path)
+    (tmp_path / "lights.toml").unlink()
+    assert cli.main(["check", str(file)]) == cli.USAGE
+    assert f"({file}:4 names it: `lights.survey`)" in capsys.readouterr().err
+    assert cli.main(["check", str(file), "--set", f"lights.survey={tmp_path}/none.toml"]) == cli.USAGE
+    assert "none.toml: no such survey" in (said := capsys.readouterr().err)
+    assert "(`lights.survey` names it)" in said
+
+
 def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path, bus="")
     assert cli.main(["check", str(file)]) == cli.OK

@@ -116,6 +116,14 @@ def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.Ca
     assert re.search(r"good +survey .* 16 lamps", said)
 
 
+def test_a_survey_that_is_not_there_is_named_with_its_line(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file.parent / "lights.toml").unlink()
+    assert asked(file, Computer()) == cli.FAILED
+    said = capsys.readouterr().out
+    assert f"no such survey (`lumiloop survey` makes one from a drive) ({file}:4 names it: `lights.survey`)" in said
+    assert "-> put it there, or name another; `lumiloop check` reads it again" in said
+
+
 def broken(**changes: object) -> Callable[[], Computer]:
     return lambda: Computer(**changes)  # type: ignore[arg-type]  # fields by name
 
