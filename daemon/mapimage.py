@@ -36,6 +36,14 @@ _JUMP_TIMES: Final = 8.0
 robot was carried, or found elsewhere. No line is drawn."""
 _DOT_PX: Final = 7.0
 _BAR_PX: Final = 3.0
+_LETTERS: Final = {
+    "0": (" ### ", "#   #", "#   #", "#   #", "#   #", "#   #", " ### "),
+    "1": (" #", "##", " #", " #", " #", " #", " #"),
+    "5": ("#####", "#    ", "#### ", "    #", "    #", "#   #", " ### "),
+    "m": ("       ", "       ", "###### ", "#  #  #", "#  #  #", "#  #  #", "#  #  #"),
+    " ": ("  ",) * 7,
+}
+_LETTER_PX: Final = 2
 _BAND: Final = 64
 """Rows of cells that are drawn at a time."""
 
@@ -134,6 +142,13 @@ def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> Non
     pixels += cover[..., None] * (paint - pixels)
 
 
+def lettered(text: str) -> npt.NDArray[np.bool_]:
+    """A length in pixels, (14, columns), true where there is ink; no font has to be installed for that."""
+    letters = [np.array([[pixel == "#" for pixel in row] for row in _LETTERS[letter]]) for letter in text]
+    word = np.concatenate([np.pad(letter, ((0, 0), (0, 1))) for letter in letters], axis=1)
+    return word.repeat(_LETTER_PX, axis=0).repeat(_LETTER_PX, axis=1)
+
+
 def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
     """A scale bar in the lower left corner, the longest of 1, 5, 10, 50, 100 m that takes at most a third."""
     rows, columns = pixels.shape[:2]
@@ -144,6 +159,10 @@ def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
     end = margin + round(length * pixels_per_metre)
     bottom = rows - margin
     pixels[bottom - round(_BAR_PX) : bottom, margin:end] = WALL
+    word = lettered(f"{length} m")
+    top = bottom - round(4 * _BAR_PX) - len(word)
+    if top >= 0 and margin + word.shape[1] <= columns:
+        pixels[top : top + len(word), margin : margin + word.shape[1]][word] = WALL
     for tick in np.linspace(margin, end - 1, (length if length <= 10 else 10) + 1):
         column = round(float(tick))
         pixels[bottom - round(3 * _BAR_PX) : bottom, column : column + 1] = WALL

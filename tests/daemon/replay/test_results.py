@@ -12,7 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from daemon.mapimage import draw
+from daemon.mapimage import WALL, draw, lettered
 from daemon.mapserver import FREE, OCCUPIED
 from daemon.png import encode_png
 from daemon.results import Folder, OutputRefused, Trajectory, greys, map_files, map_yaml, pgm, tum
@@ -96,6 +96,17 @@ def test_the_picture_shows_walls_free_space_and_the_path(tmp_path: Path) -> None
     assert at(2.5, 1.0) == [37, 99, 235]  # the start, blue
     assert at(5.5, 3.5) == [220, 38, 38]  # the end, red
     assert max(at(4.0, 1.0)) - min(at(4.0, 1.0)) > 60  # a coloured path between
+
+
+@pytest.mark.parametrize(
+    ("side_m", "length"), [(8.0, "1 m"), (20.0, "5 m"), (48.0, "10 m"), (160.0, "50 m"), (320.0, "100 m")]
+)
+def test_the_bar_says_how_long_it_is(side_m: float, length: str) -> None:
+    cells = round(side_m / 0.1)
+    pixels = draw(Grid(np.zeros(2), 0.1, np.zeros((cells, cells), np.float32)), np.zeros((0, 2)))
+    corner = np.all(pixels[-60:, :80] == WALL, axis=2)
+    windows = np.lib.stride_tricks.sliding_window_view(corner, (word := lettered(length)).shape)
+    assert np.all(windows == word, axis=(2, 3)).sum() == 1, "letter by letter"
 
 
 def test_a_picture_is_drawn_in_a_few_times_its_size() -> None:
