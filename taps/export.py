@@ -7,7 +7,9 @@ early is said, and what was read until then is kept.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +31,8 @@ if TYPE_CHECKING:  # needs an extra, which who wants a trajectory alone does not
 GROWTH: Final = 1.25
 """The map is written when it has so many times the keyframes of the one before: a long drive has few pictures of it."""
 FIRST_MAP: Final = 5
+IN_A_LOG_S: Final = 10.0
+"""So often progress is told where it is no line that writes over itself."""
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 
 
@@ -37,9 +41,8 @@ def main(args: argparse.Namespace) -> int:
     if args.mcap is None and args.tum is None and args.kitti is None:
         return cli.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", cli.USAGE)
     try:
-        if _is_mcap(args.log):
-            return _save(args)
-        return _export(args)
+        with _stoppable():
+            return _save(args) if _is_mcap(args.log) else _export(args)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
             raise
@@ -106,6 +109,23 @@ def _export(args: argparse.Namespace) -> int:
 
 
 @contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM ends it as Ctrl-C does: nothing half made stays behind."""
+
+    def stop(number: int, _: object) -> None:
+        sys.exit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():  # which alone may say what a signal does
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     """A path beside, which takes its place when all went well."""
     part = path.with_name(f".{path.name}.part")
@@ -118,7 +138,8 @@ def _beside(path: Path) -> Iterator[Path]:
 
 def _run(told: Retold, translator: Translator | None, file: McapFile | None) -> str:
     """Play it; returns why it ended before its end, empty if it did not."""
-    due, shown = FIRST_MAP, time.monotonic()
+    due, begun = FIRST_MAP, time.monotonic()
+    shown, every = begun, 1.0 if sys.stderr.isatty() else IN_A_LOG_S
     try:
         for frame in told.frames(raw=file is not None):
             if translator is None or file is None:
@@ -128,15 +149,24 @@ def _run(told: Retold, translator: Translator | None, file: McapFile | None) -> 
             if told.rerun.ledger.keyframes >= due:
                 due = int(GROWTH * told.rerun.ledger.keyframes) + 1
                 _draw(told, translator, file)
-            if time.monotonic() - shown > 1.0:
+            if time.monotonic() - shown > every:
                 shown = time.monotonic()
-                _say(f"export: {100 * told.source.done // max(1, told.source.total)} %")
+                _say(progress(told.source.done, told.source.total, shown - begun))
     except HalError as error:
         return str(error)
     finally:
         if sys.stderr.isatty():
             _say("")
     return ""
+
+
+def progress(done: int, total: int, seconds: float) -> str:
+    """How much has been done in so many seconds, and how long the rest takes at that pace."""
+    share = done / max(1, total)
+    if share < 0.01:  # what is opened first tells nothing of the pace
+        return "export: 0 %"
+    left = seconds * (1.0 - share) / share
+    return f"export: {100 * share:.0f} %, {f'{left:.0f} s' if left < 100.0 else f'{left / 60.0:.0f} min'} left"
 
 
 def _draw(told: Retold, translator: Translator, file: McapFile) -> None:

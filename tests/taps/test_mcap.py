@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from taps import export
 from taps.mcapfile import McapFile
 from taps.recover import NotMcap, recover
 from taps.ros import TOPICS, Out
@@ -175,6 +178,33 @@ def fill(file: McapFile, count: int) -> None:
     noise = np.random.default_rng(1)
     for number in range(count):
         file.write(Out("/lumiloop/raw", 10**18 + number * 25_000_000, noise.bytes(200)))
+
+
+def test_an_export_that_is_told_to_stop_leaves_nothing_half_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(args: argparse.Namespace) -> int:
+        with export._beside(args.tum) as part:
+            part.write_bytes(b"half of it")
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5.0)
+        return 0
+
+    monkeypatch.setattr(export, "_export", stopped)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended:
+        export.main(argparse.Namespace(log=tmp_path, mcap=None, kitti=None, tum=tmp_path / "a.tum"))
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(
+    ("done", "seconds", "said"),
+    [(0, 2.0, "export: 0 %"), (25, 10.0, "export: 25 %, 30 s left"), (2, 10.0, "export: 2 %, 8 min left")],
+)
+def test_an_export_says_how_long_it_goes_on(done: int, seconds: float, said: str) -> None:
+    assert export.progress(done, 100, seconds) == said
 
 
 def test_of_a_killed_writer_all_but_the_last_half_second_is_there(tmp_path: Path) -> None:
