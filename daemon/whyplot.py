@@ -18,6 +18,8 @@ from estimator.records import Array
 
 _INCHES: Final = (14.0, 8.0)
 _MARGIN_M: Final = 4.0
+LAST_S: Final = 0.05
+"""How long the last cycle is drawn."""
 COLOURS: Final = {
     State.TRACKING: "tab:green",
     State.MAPPING: "tab:blue",
@@ -49,7 +51,7 @@ def draw(told: Sequence[Moment], utc: float, grid: Grid) -> bytes | None:
     _light(rows[3], told, seconds)
     for row in rows:
         row.axvline(0.0, color="k", linewidth=0.8)
-        row.set_xlim(seconds[0], seconds[-1])
+        row.set_xlim(seconds[0], max(seconds[-1], seconds[0] + LAST_S))
     rows[-1].set_xlabel("seconds from the moment")
     out = io.BytesIO()
     canvas.savefig(out, format="png")
@@ -105,9 +107,15 @@ def _lamps(axes: Any, one: Moment) -> None:
         axes.plot(x + 2 * light.sigma[0] * np.cos(turn), y + 2 * light.sigma[1] * np.sin(turn), color="goldenrod")
 
 
+def _empty(axes: Any, why: str) -> None:
+    """In place of curves without a point."""
+    axes.set_yticks([])
+    axes.text(0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, fontsize=8)
+
+
 def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     """Strips: state, axes, scans that came to nothing."""
-    ends = np.append(seconds[1:], seconds[-1] + 0.05)
+    ends = np.append(seconds[1:], seconds[-1] + LAST_S)
     for moment, begin, end in zip(told, seconds.tolist(), ends.tolist(), strict=True):
         axes.barh(0, end - begin, left=begin, color=COLOURS[moment.state], height=0.8)
         for axis in range(3):
@@ -122,6 +130,9 @@ def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
 def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     sigma = [math.nan if (P := one.snapshot.covariance) is None else math.sqrt(max(P[0], P[2])) for one in told]
     bound = [math.nan if (m := one.snapshot.trust.horizontal_m) is None else m for one in told]
+    if np.isnan([*sigma, *bound]).all():
+        _empty(axes, "no sigma and no bound was told")
+        return
     axes.plot(seconds, sigma, label="sigma of the place, m")
     axes.plot(seconds, bound, label="bound on its error, m")
     axes.set_yscale("log")
@@ -131,6 +142,9 @@ def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
 def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     apart = np.array([(math.nan, math.nan) if one.wheels is None else one.wheels.apart for one in told])
     odd = np.array([one.wheels is not None and not one.wheels.agree for one in told])
+    if np.isnan(apart).all():
+        _empty(axes, "wheels and laser could not be compared")
+        return
     axes.plot(seconds, apart[:, 0], label="wheels from laser, m")
     axes.plot(seconds, apart[:, 1], label="rad")
     axes.plot(seconds[odd], apart[odd, 0], ".", color="tab:red", label="they dissent")
@@ -139,10 +153,13 @@ def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
 
 def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     if all(one.snapshot.light is None for one in told):
-        axes.set_title("no photodiode", fontsize=8)
+        _empty(axes, "no photodiode")
         return
     away = [math.nan if (far := light_apart(one)) is None else far[0] for one in told]
     gap = [math.nan if (g := one.snapshot.trust.gap) is None else math.sqrt(g) for one in told]
+    if np.isnan([*away, *gap]).all():
+        _empty(axes, "light told no place")
+        return
     axes.plot(seconds, away, label="light from pose, m")
     axes.plot(seconds, gap, label="in deviations")
     axes.axhline(math.sqrt(GAP), color="tab:red", linewidth=0.8)

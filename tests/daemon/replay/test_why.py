@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import blackbox, cli, disk
+from daemon import blackbox, cli, disk, whyplot
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
 from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
@@ -17,6 +17,7 @@ from daemon.reasons import Reason
 from daemon.why import NoMoment, Span, find, meant, whole_second
 from daemon.whysaid import Moment, report
 from daemon.witness import Told
+from estimator.grid import Grid
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
 from tests.daemon.replay.test_dump import let_write, unplugged
@@ -208,6 +209,21 @@ def test_lamps_that_do_not_fit_the_place_dissent_though_what_is_left_agrees(agai
     assert f"light   {word}: its place is 0.02 m" in line
     assert (f"{against} speak against the place" in line) is (against > 0)
     assert "fits again" not in said
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_picture_of_nothing_says_so_in_place_of_curves(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    said: list[str] = []
+    monkeypatch.setattr(whyplot, "_empty", lambda _, why: said.append(why))
+    shown = replace(NOTHING, light=LightPicture())
+    moment = Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())
+    assert whyplot.draw([moment], 0.0, Grid(np.zeros(2), 0.05, np.zeros((0, 0), np.float32))) is not None
+    assert said == [
+        "no sigma and no bound was told",
+        "wheels and laser could not be compared",
+        "light told no place",
+    ]
 
 
 def test_a_moment_without_a_cycle_is_said_to_have_none() -> None:
