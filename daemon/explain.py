@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from daemon import configfile
 from daemon.cli import FAILED, OK, fail
+from daemon.config import Config
 from daemon.faults import FAULTS
 from daemon.publish import holding, integrity, registers
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
@@ -33,6 +34,14 @@ _BITS: Final = (
     ("bit of `devices`", registers.DEVICES),
     ("bit of `witnesses`", integrity.WITNESSES),
 )
+_PORTS: Final = (
+    (Config().modbus.port, "MODBUS_PORT", "where the daemon answers Modbus, UDP and TCP", "`modbus.port` sets another"),
+    (8090, "WEB_PAGE", "where `lumiloop view` serves the web page", "`--port` sets another"),
+    (8765, "FOXGLOVE", "where `lumiloop foxglove` serves the Foxglove app", "`--listen` sets another"),
+    (9464, "METRICS", "where `lumiloop metrics` serves Prometheus", "`--listen` sets another"),
+    (7447, "ZENOH_ROUTER", "where `lumiloop fleet` and `lumiloop ros2` look for it", "`--router` sets another"),
+)
+"""Ports that are used where nobody has said otherwise."""
 _MOST: Final = 12
 """Explanations shown for one word; a whole table of keys has fewer."""
 
@@ -76,7 +85,8 @@ def _hint(asked: str, everything: Sequence[Entry]) -> str:
     near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.6)
     if near:
         return f"did you mean {' or '.join(near)}?"
-    return "ask for a key, a state, a fault, a reason, a command, a register or a bit, as in: fault 302, TRACKING, bind"
+    kinds = "a key, a state, a fault, a reason, a command, a register, a bit or a port"
+    return f"ask for {kinds}, as in: fault 302, TRACKING, bind"
 
 
 def entries() -> Iterator[Entry]:
@@ -95,6 +105,8 @@ def entries() -> Iterator[Entry]:
     yield from _names("link use", USES)
     yield from _names("loop reason", LOOPS)
     yield from _names("command", COMMANDS)
+    for port, name, text, remedy in _PORTS:
+        yield Entry("port", name, range(port, port + 1), text, remedy)
     yield from _registers()
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.cli import FAILED, OK, main
+from daemon.cli import FAILED, OK, main, parser
+from daemon.config import Config
 from daemon.configfile import options
 from daemon.explain import entries, find
 from daemon.faults import FAULTS
@@ -49,6 +50,27 @@ def test_a_bare_number_gives_all_that_it_stands_for(capsys: pytest.CaptureFixtur
     told = _told(capsys, "202")
     assert "fault 202" in told
     assert "input register" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["view"], "port"),
+        (["foxglove"], "listen"),
+        (["metrics"], "listen"),
+        (["ros2"], "router"),
+        (["fleet"], "router"),
+        (["run"], None),
+    ],
+)
+def test_a_port_says_who_uses_it(words: list[str], option: str | None, capsys: pytest.CaptureFixture[str]) -> None:
+    default = Config().modbus.port if option is None else getattr(parser().parse_args(words), option)
+    port = str(default[1] if isinstance(default, tuple) else default).rpartition(":")[2]
+    told = _told(capsys, port)
+    assert f"port {port}: " in told
+    assert "sets another" in told
+    if option is not None:
+        assert f"`lumiloop {words[0]}`" in told
 
 
 def test_a_register_in_the_middle_of_a_value_is_that_value(capsys: pytest.CaptureFixture[str]) -> None:
