@@ -137,6 +137,8 @@ def test_a_phone(browser: str, address: str) -> None:
         assert small == []  # a finger finds them
         edge = await page.js("document.getElementById('theme').getBoundingClientRect().right")
         assert edge <= PHONE[0]
+        await page.click("[data-order=save_map]")  # not behind the map, which stays where it is
+        await page.until("document.getElementById('told').textContent.includes('map')")
 
     look(browser, address, body, size=PHONE, phone=True)
 
