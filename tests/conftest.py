@@ -12,6 +12,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+UNTRACED = ("faults", "fuzz", "hil", "logs", "tools")
+"""Folders of storms and drives: they go over the same lines a million times, for which tracing takes two to five times
+as long, and reach hardly one that the other tests do not (`tools.floors` tells)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -29,6 +32,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     hil.addoption("--walk-s", type=float, default=60.0, help="seconds of the calibration walk on a real robot")
     hil.addoption("--hil-report", metavar="DIR", help="write report.html, junit.xml and results.json of tests/hil")
     hil.addoption("--against", metavar="OLD", help="results.json of another run; what is worse makes this one fail")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.relative_to(ROOT / "tests").parts[0] in UNTRACED:
+            item.add_marker(pytest.mark.no_cover)
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,7 @@ from tools.sim.lightrun import LightRun, room_run
 from tools.sim.odometry import Wheels
 from tools.sim.robot import Body, Drive, Route
 
-pytestmark = pytest.mark.jit
+pytestmark = [pytest.mark.jit, pytest.mark.no_cover]
 
 
 def room(seed: int, seconds: float) -> LightRun:

@@ -16,6 +16,8 @@ from tools.bench._scenes import Scene, bearings, office, paper_room, round_room
 from tools.bench._trials import SETTINGS, Case, given, ours, run
 from tools.bench.accuracy import claimed, endless
 
+pytestmark = pytest.mark.no_cover
+
 ROOMS = pytest.mark.parametrize("scene", [paper_room(), office()], ids=["room", "office"])
 MANY = pytest.param(1000, marks=pytest.mark.slow)
 

@@ -12,7 +12,7 @@ from estimator.lamps import Lamp, Survey
 from estimator.result import Fix, LightsResult, LinkState
 from tests.estimator.light_room import LAMPS, RECEIVER, SURVEY, Room, circle, drive
 
-pytestmark = pytest.mark.jit
+pytestmark = [pytest.mark.jit, pytest.mark.no_cover]
 
 
 def follow(filter_: lf.Lights, room: Room, seconds: float, start: float = 0.0) -> list[LightsResult]:

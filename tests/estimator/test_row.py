@@ -17,6 +17,8 @@ from estimator.records import UNLIMITED, LightEpoch
 from tools.experiments.corridor import CASES, drive_of
 from tools.experiments.loop_drives import half, room_drive
 
+pytestmark = pytest.mark.no_cover
+
 
 def catalogue(places: list[tuple[float, float]]) -> Catalogue:
     known = Catalogue(1.0, Receiver())

@@ -17,6 +17,8 @@ from estimator.timelag import DEPTH, LAGS, TimeLag
 from tests.estimator.driven import records
 from tools.sim.scene import Scenario, SimulatedScene
 
+pytestmark = pytest.mark.no_cover
+
 DT = 0.002
 SECONDS = 40.0
 Rate = Callable[[np.random.Generator, Array], Array]

@@ -124,6 +124,7 @@ def judge(bench: Bench, scan: RawScan, late: float) -> None:
     assert error < max(late, 3.0 * scan.t_sigma), (scan.seq, scan.t_rx, scan.t_mono - true_time, scan.t_sigma)
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("case", "model"),
     [

@@ -68,6 +68,7 @@ def check(times: list[ScanTime | None], s: Sensor, rms: float = 0.3) -> None:
 NOMINAL = {0.02505: 0.025, 0.1002: 0.1, 0.025: 0.025, 0.1: 0.1, 0.100003: 0.1, 0.05: 0.05, 0.028: 0.028}
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("ppm", [-1000, -50, 0, 50, 1000])
 @pytest.mark.parametrize("period_s", NOMINAL)
 def test_stamps_are_right_to_a_fraction_of_the_millisecond(ppm: float, period_s: float) -> None:
@@ -87,6 +88,7 @@ def test_stamps_are_right_to_a_fraction_of_the_millisecond(ppm: float, period_s:
         assert clock.period_s == pytest.approx(period_s, rel=1e-3)
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("ppm", [-1000, pytest.param(1000, marks=pytest.mark.slow)])
 def test_three_wraps(ppm: float) -> None:
     """14 hours: every tenth revolution of a 10 Hz sensor."""
