@@ -25,11 +25,17 @@ MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 """Flags of mlockall(2). On fault: only what is touched is kept; stacks and arenas are mostly never."""
 
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Parameters of mallopt(3)."""
 
 LARGE, SLACK = 1 << 20, 1 << 20
 """Blocks of so many bytes are mapped each by itself; so much may be free at the end of the heap."""
+RESERVE, OBJECTS = 16 << 20, 3 << 20
+"""Bytes of the heap, and of the interpreter's own, that are there before the first cycle: what a map fills up."""
+ARENA, SMALL = 1 << 20, 400
+"""The interpreter takes and gives back its memory by so many bytes; an object that lies in it."""
+_stakes: list[bytes] = []
+"""An object in each part of the interpreter's reserve: what is empty is given back."""
 
 
 def give_back() -> None:
@@ -37,12 +43,35 @@ def give_back() -> None:
 
     By itself, glibc takes the first large block that is freed for a sign that more of that size will come, and carves
     those out of the heap from then on, where one small block behind them keeps them: a robot that was lost for a second
-    kept 30 MB for good.
+    kept 30 MB for good. And it gives each thread a heap of its own, so that what one of them frees, others cannot use:
+    what loading the kernels leaves free would hold a map for hours.
     """
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallopt"):
+        libc.mallopt(M_ARENA_MAX, 1)
         libc.mallopt(M_MMAP_THRESHOLD, LARGE)
         libc.mallopt(M_TRIM_THRESHOLD, SLACK)
+
+
+def reserve() -> None:
+    """Have the next memory that is needed at hand, where the C library is glibc: a map that grows meets no page fault.
+
+    It is taken, written to and freed again: objects of the interpreter's, and blocks smaller than those that are mapped
+    each by itself. Both heaps keep it from then on.
+    """
+    objects = [bytes(SMALL) for _ in range(OBJECTS // SMALL)]
+    _stakes.extend(objects[:: ARENA // SMALL // 2])
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "mallopt"):
+        return
+    libc.mallopt(M_TRIM_THRESHOLD, RESERVE + SLACK)
+    libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+    libc.free.argtypes = [ctypes.c_void_p]
+    piece = LARGE // 2
+    for block in [libc.malloc(piece) for _ in range(RESERVE // piece)]:
+        if block:  # none: there is no memory left, and nothing to be had at hand
+            ctypes.memset(block, 0, piece)
+            libc.free(block)
 
 
 def claim() -> tuple[str, ...]:
@@ -51,6 +80,8 @@ def claim() -> tuple[str, ...]:
     Threads made later do not inherit it (SCHED_RESET_ON_FORK): only the loop is in a hurry. They get their place from
     :func:`line_up`.
     """
+    if not _stakes:
+        reserve()
     said = _schedule(resource.getrlimit(resource.RLIMIT_RTPRIO)[0])
     line_up()
     return said, _lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0])

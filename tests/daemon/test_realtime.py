@@ -134,3 +134,36 @@ print(resident() - before)
 def test_what_a_large_job_has_needed_is_given_back() -> None:
     assert float(said_by(HELD.format(call=""))) > 15.0, "glibc has become wiser: the call can go"
     assert float(said_by(HELD.format(call="realtime.give_back()"))) < 1.0
+
+
+GROWN = """
+import ctypes, threading
+from daemon import realtime
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
+
+kept = []
+
+def grow():
+    for _ in range(600):
+        ctypes.memset(libc.malloc(16_000), 1, 16_000)
+    kept.extend(bytes(200) for _ in range(9_000))
+
+{call}
+before = resident()
+thread = threading.Thread(target=grow)
+thread.start(); thread.join()
+print(resident() - before)
+"""
+
+
+@pytest.mark.parametrize("call", ["", "realtime.give_back()", "realtime.reserve()"])
+def test_a_map_that_grows_needs_more_memory_without_either(call: str) -> None:
+    assert float(said_by(GROWN.format(call=call))) > 8.0, "one of the two calls is enough: the other can go"
+
+
+def test_a_map_that_grows_takes_what_was_reserved_whichever_thread_makes_it() -> None:
+    assert float(said_by(GROWN.format(call="realtime.give_back(); realtime.reserve()"))) < 1.0
