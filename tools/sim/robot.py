@@ -10,6 +10,8 @@ import numpy as np
 from tools.sim.world import Array
 
 STEP_M: Final = 0.01
+SHARP_RAD: Final = 0.075
+"""A step of the route that turns by more is a turn on the spot: it takes as long as the turn does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ class Drive:
         self._s = np.concatenate([[0.0], np.cumsum(step)])
         self._xy = points
         self._yaw, curvature = _headings(points, step)
-        self._v = _speeds(self._s, curvature, body)
+        self._v = _speeds(self._s, _sharpened(curvature, self._yaw, step), body)
         self._curvature = curvature
         self._t = np.concatenate([[0.0], np.cumsum(2.0 * step / (self._v[1:] + self._v[:-1]))])
         self.body = body
@@ -149,6 +151,17 @@ def _headings(points: Array, step: Array) -> tuple[Array, Array]:
     bend = np.concatenate([[yaw[-1] - yaw[-2]], np.diff(yaw), [yaw[1] - yaw[0]]])
     span = np.concatenate([step[-1:], step, step[:1]])
     return yaw, (bend[1:] + bend[:-1]) / (span[1:] + span[:-1])
+
+
+def _sharpened(curvature: Array, yaw: Array, step: Array) -> Array:
+    """The curvature by which speed is limited: at either end of a turn on the spot that of the turn itself.
+
+    Its mean with the steps beside it would let the robot leave the turn before it is round.
+    """
+    turn = np.abs(np.diff(yaw))
+    bend = np.where(turn > SHARP_RAD, turn / np.maximum(step, 1e-9), 0.0)
+    ends = np.maximum(np.concatenate([bend[-1:], bend]), np.concatenate([bend, bend[:1]]))
+    return np.maximum(np.abs(curvature), ends)
 
 
 def _speeds(s: Array, curvature: Array, body: Body) -> Array:
