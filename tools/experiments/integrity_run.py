@@ -143,8 +143,8 @@ def scans(scene: Scenario) -> Iterator[RawScan]:
 
     for k in range(int((scene.seconds - sweep_s) / PERIOD_S)):
         t = k * PERIOD_S
-        if t < FIRST_S:
-            continue
+        if t < FIRST_S or any(t < off < t + sweep_s for off in scene.restarts):
+            continue  # nobody has seen half of a scan before the robot was switched off, and the rest after
         legs = crowd.legs(t, scene.pose(np.array([t]))[0])
         posture = Posture(0.3, *scene.tilt(t))
         ranges = np.rint(1000.0 * scanner.measure(t, lidar, legs, posture).range_m[:, 0]).astype(np.int32)

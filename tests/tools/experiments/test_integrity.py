@@ -10,7 +10,7 @@ import pytest
 from daemon.publish.snapshot import State
 from tools.experiments import integrity
 from tools.experiments.integrity_report import COLUMNS, Array, Summary, judged, longest, report
-from tools.experiments.integrity_run import run
+from tools.experiments.integrity_run import run, scans
 from tools.experiments.integrity_scene import KINDS, draw
 from tools.experiments.report import draw as draw_pictures
 
@@ -44,6 +44,16 @@ def test_a_wrong_state_counts_once_it_has_lasted() -> None:
     assert judged("a-0", rows, ALL, (False, False, "")).wrong, "the heading counts too"
     rows[:, AT["state"]] = State.DEGRADED
     assert not judged("a-0", rows, ALL, (True, False, "")).wrong
+
+
+def test_no_scan_is_half_of_before_the_robot_was_switched_off() -> None:
+    """It would be half of one place and half of another, and the lidar is switched off with the robot."""
+    scene = draw("restart_unlit", 6)
+    (off,) = scene.restarts
+    scene.seconds = off + 1.0
+    seen = [(scan.t_mono, scan.t_rx) for scan in scans(scene)]
+    assert seen[-1][0] > off
+    assert not [begin for begin, end in seen if begin < off < end - 0.002]
 
 
 def test_bounds_and_shares_are_counted() -> None:
