@@ -43,8 +43,8 @@ def test_drive_keeps_the_body_s_limits(name: str) -> None:
 
 
 def test_where_the_route_turns_back_it_turns_no_faster_than_it_can() -> None:
-    """A corner of 170 deg rounded over a metre is a turn on the spot, half a turn within a centimetre or two."""
-    drive = Drive(Route(((0.0, 0.0), (5.0, 0.0), (0.4, 0.8), (4.0, 1.2), (0.0, 4.0)), 1.2), BODY)
+    """Corners of 170 deg rounded over a metre are turns on the spot, half a turn within centimetres."""
+    drive = Drive(Route(((0.0, 0.0), (5.0, 0.0), (1.3, 0.1), (2.3, 3.0), (0.0, 4.0)), 1.2), BODY)
     t = np.arange(0.0, drive.lap_s, 0.02)
     assert np.abs(np.diff(drive.pose(t)[:, 2])).max() / 0.02 < 1.7 * BODY.turn_rate
 
