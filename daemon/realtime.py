@@ -78,7 +78,7 @@ def claim() -> tuple[str, ...]:
     """Take what the limits allow, for the calling thread and its process; what was taken, or why not, a phrase each.
 
     Threads made later do not inherit it (SCHED_RESET_ON_FORK): only the loop is in a hurry. They get their place from
-    :func:`line_up`.
+    :func:`line_up`. The memory of :func:`reserve` is taken whatever the limits say.
     """
     if not _stakes:
         reserve()

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from daemon.folders import daemons_in, stream_path
+from daemon.folders import SERVICE, daemons_in, stream_path
 from daemon.publish.stream import TOPICS
 from taps import frames
 from taps.frames import LONGEST, Frame, NotTheStream, Refused
@@ -133,8 +133,9 @@ def _nobody(error: OSError) -> bool:
 
 def _others(path: Path) -> str:
     """Daemons that may be meant: who forgets `--config` asks for the one of the default name."""
-    names = [name for name in daemons_in(path.parent) if name != path.stem]
-    return f"; {', '.join(names)} runs here: `--set name={names[0]}`, or `--config`" if names else ""
+    names = sorted({name for folder in {path.parent, SERVICE} for name in daemons_in(folder)} - {path.stem})
+    runs = "runs" if len(names) == 1 else "run"
+    return f"; {', '.join(names)} {runs} here: `--set name={names[0]}`, or `--config`" if names else ""
 
 
 def _why(error: OSError) -> str:

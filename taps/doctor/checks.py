@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -287,7 +288,8 @@ def survey(case: Case) -> Iterator[Finding]:
         found = read_survey(path, profile_of(settings.photodiode))
     except SurveyError as error:
         named = naming(case.file, "lights.survey", path)
-        remedy = "mend it" if path.exists() else "put it there, or name another"
+        there = os.path.exists(path)  # noqa: PTH110  Path.exists raises where no file can have that name
+        remedy = "mend it" if there else "put it there, or name another"
         yield fix("survey", f"{error} ({named})", f"{remedy}; `lumiloop check` reads it again")
         return
     unused = "" if settings.photodiode.fitted else ", not used: photodiode.bus is empty"

@@ -124,6 +124,14 @@ def test_a_survey_that_is_not_there_is_named_with_its_line(file: Path, capsys: p
     assert "-> put it there, or name another; `lumiloop check` reads it again" in said
 
 
+def test_a_survey_by_a_name_that_no_file_can_have_is_told_as_any_other(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(CONFIG.replace("lights.toml", "x" * 300))
+    assert asked(file, Computer()) == cli.FAILED
+    assert re.search(r"FIX +survey", capsys.readouterr().out)
+
+
 def broken(**changes: object) -> Callable[[], Computer]:
     return lambda: Computer(**changes)  # type: ignore[arg-type]  # fields by name
 

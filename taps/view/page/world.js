@@ -50,7 +50,7 @@ export class World {
   on_faults(data) { this.faults = data.present; }
   on_map(data) { this.tiles.take(data); }
 
-  on_loops(loops) { for (const one of loops) this.on_loop(one, -Infinity); }
+  on_loops(loops) { this.loops = []; for (const one of loops) this.on_loop(one, -Infinity); }
 
   on_loop(data, since = performance.now()) {
     this.loops.push({ ...data, since });
