@@ -20,6 +20,9 @@ from taps.zenohlink import BEAT_S, Say, listed, withdraw
 ALONE_S: Final = 5.0
 """A name is taken from nobody before its speaker has been gone for so long, with the router there: after a router's
 death some are back later than others."""
+SURE_S: Final = 1.0
+"""Two that join at once, or whose router has just come back, have heard of each other by then: before that none of them
+is said to be in the fleet."""
 
 
 class Claim:
@@ -41,17 +44,21 @@ class Claim:
         self._token: zenoh.LivelinessToken | None = None
         self._instance = ""
         self._listening: zenoh.Subscriber[None] | None = None
+        self._said = False  # that it is ours
+        self._alone = 0.0  # s since when nobody has it before us, or since it was settled whose it is
 
     async def run(self) -> None:
         """Have the name whenever nobody else has it, until cancelled."""
-        alone = 0.0
         try:
             await self._begin()
             while True:
                 await asyncio.sleep(BEAT_S)
                 free = not self._before() and bool(self._session.info.routers_zid())
-                alone = alone + BEAT_S if free else 0.0
-                if alone >= ALONE_S and not self.mine:
+                self._alone = self._alone + BEAT_S if free else 0.0
+                if self.mine and not self._said and self._alone >= SURE_S:
+                    self._said = True
+                    self._say(f"{self._robot} is in the fleet")
+                elif self._alone >= ALONE_S and not self.mine:
                     self._settle(True)
         finally:
             if self._listening is not None:
@@ -92,11 +99,10 @@ class Claim:
 
     def _settle(self, mine: bool) -> None:
         """The name is ours from now on, or is not."""
-        self.mine = mine
+        self.mine, self._alone = mine, 0.0
         self._put(messages.alive if mine else messages.waiting)
-        if mine:
-            self._say(f"{self._robot} is in the fleet")
-        else:
+        if not mine:
+            self._said = False
             self._say(
                 f"the fleet has a robot {self._robot} already, on {messages.host_of(self._before())}; this one, on "
                 f"{self._host}, tells nothing until that one has gone: give one of them another `name`"

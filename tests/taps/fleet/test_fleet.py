@@ -18,7 +18,7 @@ import zenoh
 from daemon import cli
 from taps import zenohlink
 from taps.fleet import messages, robot, show
-from taps.fleet.claim import Claim
+from taps.fleet.claim import SURE_S, Claim
 from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import MOST_ROBOTS, Roster
@@ -131,6 +131,7 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
 
     with served(tmp_path / "s"), served(tmp_path / "other", place=(9.0, 9.0, 0.0)), router() as made:
         asyncio.run(beside(body(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
+        capsys.readouterr()  # what was said of it before
         roster, heard = Roster(), Heard(capsys)
         asyncio.run(beside(without_router(made), looking(made, roster), speaking(made, tmp_path / "s", "agv")))
         roster = Roster()
@@ -146,13 +147,15 @@ def test_of_two_that_have_spoken_the_first_keeps_the_name(
 
     async def body(made: Router) -> None:
         await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
+        await until(lambda: heard("agv is in the fleet"))
         with zenoh.open(config("client", made.address)) as session:
-            session.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
+            token = session.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
             await until(lambda: heard("the fleet has a robot agv already, on cart"))
             await asyncio.sleep(0.2)
             last = roster.members["agv"].pose
             await asyncio.sleep(0.5)
             assert roster.members["agv"].pose is last
+            token.undeclare()
         await until(lambda: heard("agv is in the fleet", 2))
         await until(lambda: roster.members["agv"].pose is not last)
 
@@ -180,6 +183,37 @@ def test_who_leaves_while_the_name_is_asked_for_does_not_keep_it(monkeypatch: py
 
     with router() as made:
         asyncio.run(body(made))
+
+
+def test_only_who_is_in_the_fleet_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has the name is heard of a moment after it was asked for: as when two join at once."""
+    monkeypatch.setattr("taps.fleet.claim.ALONE_S", 1.0)
+    mine: list[bool] = []
+    said: list[str] = []
+
+    async def listed(*asked: Any) -> list[str]:
+        return []
+
+    monkeypatch.setattr("taps.fleet.claim.listed", listed)
+
+    async def body(made: Router) -> None:
+        async with joined(made.address) as session, joined(made.address) as other:
+            token = other.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
+            await asyncio.sleep(0.2)
+
+            async def seen() -> None:
+                await until(lambda: mine[-1:] == [False] and said)
+                await asyncio.sleep(2.0 * SURE_S)
+                token.undeclare()
+                await until(lambda: "agv is in the fleet" in said)
+
+            await beside(seen(), Claim(session, "agv", "here", mine.append, said.append).run())
+
+    with router() as made:
+        asyncio.run(body(made))
+    assert mine == [True, False, True]
+    assert said[0].startswith("the fleet has a robot agv already, on cart")
+    assert said[1:] == ["agv is in the fleet"]
 
 
 def test_a_router_that_dies_is_said_and_all_go_on_when_it_is_back(
