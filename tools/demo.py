@@ -31,7 +31,7 @@ from typing import Any, Final
 
 from daemon.publish.client import NoAnswer, Reader, Reading
 from daemon.publish.snapshot import State
-from tools.demo_acts import NAMES, ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
+from tools.demo_acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
 from tools.demo_score import READY, Score, Track, pose_of, summary, verdict
 
 ROOT: Final = Path(__file__).parents[1]
@@ -335,12 +335,9 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
             f"largest while TRACKING {100 * score.tracking_m:.1f} cm"
         )
     for act in score.acts:
-        seen, back, right = (("never" if t is None else f"after {t:.1f} s") for t in (act.seen, act.back, act.right))
+        print(act.words)
         if act.device == ROBOT:
-            print(f"robot lifted: not TRACKING {seen}; put down: pose right {right}, TRACKING {back}")
             print(f"map jumps counted: {act.jumps[0]} before, {act.jumps[1]} at the end")
-        else:
-            print(f"{NAMES[act.device]} off: not TRACKING {seen}; on again: TRACKING {back}")
     (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
     print(f"figures: {out / 'summary.json'}")
     if wrong:

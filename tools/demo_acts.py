@@ -40,6 +40,7 @@ class Act:
     """One sensor is off, or the robot in the air, from ``begin`` to ``end``, seconds since the robot drove off.
 
     Attributes:
+        tracked: whether the state was TRACKING when it began; where it was not, it could not be lost either.
         seen: s after ``begin`` until the state was not TRACKING any more. back: s after ``end`` until it was again.
         right: s after ``end`` until the pose was right and stayed so. jumps: of the map pose, before and by now.
     """
@@ -48,10 +49,30 @@ class Act:
     begin: float
     end: float
     state: str = "to come"
+    tracked: bool = False
     seen: float | None = None
     back: float | None = None
     right: float | None = None
     jumps: tuple[int, int] = (0, 0)
+
+    @property
+    def words(self) -> str:
+        """What became of the state, for people."""
+        began, ended = ("lifted", "put down") if self.device == ROBOT else ("off", "on again")
+        name = f"{NAMES[self.device]} {began}"
+        if self.state == "to come":
+            return f"{name}: it did not come to that"
+        lost = f"TRACKING lost after {self.seen:.1f} s" if self.seen is not None else "TRACKING was not lost"
+        told = f"{name}: {lost if self.tracked else 'the state was not TRACKING before'}"
+        if self.state == "off":
+            return f"{told}; not {ended} by the end"
+        if self.device != ROBOT and self.tracked and self.seen is None:
+            return told
+        back = "not TRACKING since" if self.back is None else f"TRACKING after {self.back:.1f} s"
+        if self.device != ROBOT:
+            return f"{told}; {ended}: {back}"
+        right = "the pose is not right since" if self.right is None else f"pose right after {self.right:.1f} s"
+        return f"{told}; {ended}: {right}, {back}"
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -59,12 +80,12 @@ class Act:
         if self.device == ROBOT:
             return {
                 "what": NAMES[self.device], "lifted_s": round(self.begin, 2), "put_down_s": round(self.end, 2),
-                "not_tracking_after_s": self.seen, "right_again_after_s": self.right,
+                "tracking_before": self.tracked, "not_tracking_after_s": self.seen, "right_again_after_s": self.right,
                 "tracking_again_after_s": self.back, "jumps": list(self.jumps),
             }  # fmt: skip
         return {
             "what": NAMES[self.device], "off_from_s": round(self.begin, 2), "off_until_s": round(self.end, 2),
-            "degraded_after_s": self.seen, "tracking_again_after_s": self.back,
+            "tracking_before": self.tracked, "degraded_after_s": self.seen, "tracking_again_after_s": self.back,
         }  # fmt: skip
 
 
@@ -101,7 +122,7 @@ class Stage:
             carried = act.device == ROBOT
             if act.state == "to come" and t >= act.begin:
                 self._order(f"order {CARRY}" if carried else f"order off where={act.device}")
-                act.state = "off"
+                act.state, act.tracked = "off", state == State.TRACKING
                 told.append(AWAY if carried else f"the {NAMES[act.device]} is switched off")
             if act.state == "off" and t >= act.end:
                 if not carried:
@@ -145,10 +166,11 @@ class Stage:
 
 
 def _note(act: Act, t: float, tracking: bool) -> None:
-    unseen = act.seen is None and act.state == ("off" if act.device != ROBOT else act.state)
+    unseen = act.tracked and act.seen is None and act.state == ("off" if act.device != ROBOT else act.state)
     if t >= act.begin and unseen and not tracking:
         act.seen = round(t - act.begin, 2)
-    if act.state == "on again" and act.back is None and tracking and (act.seen is not None or act.device != ROBOT):
+    lost = act.seen is not None or not act.tracked
+    if act.state == "on again" and act.back is None and tracking and (lost or act.device != ROBOT):
         act.back = round(t - act.end, 2)
 
 
@@ -173,13 +195,14 @@ def complaint(acts: list[Act]) -> str:
     for act in acts:
         if act.state != "on again":
             continue
-        if act.seen is None and act.device == ROBOT:
+        stayed = act.tracked and act.seen is None
+        if stayed and act.device == ROBOT:
             return "the robot was carried away and the state stayed TRACKING"
         if act.back is None and act.device == ROBOT:
             return "the robot was put down again, but the state has not become TRACKING since"
         if act.right is None and act.device == ROBOT:
             return "the robot was put down again, and its pose is not right since"
-        if act.seen is None:
+        if stayed:
             return f"the {NAMES[act.device]} was off for {act.end - act.begin:.0f} s and the state stayed TRACKING"
         if act.back is None:
             return f"{NAMES[act.device]} on again, but the state has not become TRACKING since"

@@ -20,7 +20,7 @@ import pytest
 
 from daemon.publish.snapshot import State
 from tools.demo import free_port, line, links, write_config
-from tools.demo_acts import OrderRefused, Stage, complaint, programme
+from tools.demo_acts import ROBOT, Act, OrderRefused, Stage, complaint, programme
 from tools.demo_score import Score, Track, in_map, summary, verdict
 from tools.sim.robot import Body
 
@@ -147,6 +147,43 @@ def test_the_programme_switches_each_sensor_off_and_on_and_notes_what_became_of_
     assert "stayed TRACKING" in complaint(acts)
     acts[0].seen, acts[1].back = 0.5, None
     assert "has not become TRACKING" in complaint(acts)
+
+
+@pytest.mark.parametrize(
+    ("states", "words"),
+    [
+        ("TTDDDTT", "photodiode off: TRACKING lost after 1.0 s; on again: TRACKING after 1.0 s"),
+        ("RRRRRRT", "photodiode off: the state was not TRACKING before; on again: TRACKING after 2.0 s"),
+        ("RRTTDDD", "photodiode off: the state was not TRACKING before; on again: not TRACKING since"),
+        ("TTTTTTT", "photodiode off: TRACKING was not lost"),
+        ("TTDD", "photodiode off: TRACKING lost after 1.0 s; not on again by the end"),
+        ("T", "photodiode off: it did not come to that"),
+    ],
+)
+def test_it_is_told_what_became_of_tracking_and_not_that_what_was_not_there_was_lost(
+    tmp_path: Path, states: str, words: str
+) -> None:
+    """Off from the second instant to the fifth, a second apart each."""
+    meant = {"T": State.TRACKING, "D": State.DEGRADED, "R": State.RELOCATING}
+    [act] = acts = [Act("adc", 1.0, 4.0)]
+    with simulator(tmp_path / "control", "ok"):
+        stage = Stage(tmp_path / "control", acts)
+        for t, letter in enumerate(states):
+            stage.play(float(t), int(meant[letter]))
+    assert act.words == words
+    assert bool(complaint(acts)) == (act.state == "on again" and ("since" in words or "was not lost" in words))
+
+
+def test_a_robot_that_did_not_know_its_place_does_not_lose_it_in_the_air(tmp_path: Path) -> None:
+    [act] = acts = [Act(ROBOT, 1.0, 3.0)]
+    with simulator(tmp_path / "control", "ok"):
+        stage = Stage(tmp_path / "control", acts)
+        for t, letter in enumerate("RRRRRT"):
+            stage.play(float(t), int(State.TRACKING if letter == "T" else State.RELOCATING), 0.04)
+    assert act.words == (
+        "robot lifted: the state was not TRACKING before; put down: pose right after 0.0 s, TRACKING after 2.0 s"
+    )
+    assert complaint(acts) == ""
 
 
 def test_a_key_switches_a_sensor_off_and_the_same_key_on_again(tmp_path: Path) -> None:
