@@ -6,6 +6,8 @@ import asyncio
 import math
 from typing import Any, Final, TypeGuard
 
+import msgspec
+
 from taps.view.film import Film
 from taps.view.viewers import LOOPS, ROWS, Tile, Viewer, frame
 
@@ -16,6 +18,13 @@ EMPTY: Final = b""
 """Stands for a tile in which there is nothing yet."""
 UNTOLD: Final = -2
 """What is shown of a tile that was on its way when the time leapt: nobody knows, so it is told again."""
+
+
+class _Piece(msgspec.Struct):
+    data: msgspec.Raw
+
+
+_piece: Final = msgspec.msgpack.Decoder(_Piece).decode
 
 
 class Player:
@@ -73,13 +82,17 @@ class Player:
         self._shown.update(dict.fromkeys(viewer.forget(), UNTOLD))
         self._introduce()
         viewer.put("rewound", frame("rewound", None), once=True)
-        for kind, most in (("row", ROWS), ("loop", LOOPS)):
-            reel = film.reels[kind]
-            until = reel.upto(self.at)
-            pieces = [film.piece(reel, index) for index in range(max(0, until - most), until)]
-            viewer.put(kind, _together(pieces), once=True)
+        viewer.put("row", _together(self._past("row", ROWS)), once=True)
+        if loops := self._past("loop", LOOPS):  # as what has been, not as what happens now
+            viewer.put("loops", frame("loops", [_piece(loop).data for loop in loops]), once=True)
         self._latest(-math.inf)
         self._tiles()
+
+    def _past(self, kind: str, most: int) -> list[bytes]:
+        """The latest pieces of a kind by now."""
+        reel = self._film.reels[kind]
+        until = reel.upto(self.at)
+        return [self._film.piece(reel, index) for index in range(max(0, until - most), until)]
 
     def go_on(self, seconds: float) -> None:
         """Some time has passed."""
