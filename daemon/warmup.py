@@ -1,14 +1,14 @@
-"""Loads the estimator once, under a lock: the first start ever compiles its kernels, every later one loads them.
+"""Loads the estimator once: the first start ever compiles its kernels, under a lock, every later one loads them.
 
 Importing the estimator is what compiles. Two processes that do so at once could spoil the cache's index, hence the
-lock; and the daemon wants to go on talking to its devices meanwhile, hence the thread.
+lock (`daemon.kernellock`), which who finds all of them there does not need; and the daemon wants to go on talking to
+its devices meanwhile, hence the thread.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import gc
 import hashlib
 import logging
@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from daemon.kernellock import KernelLock, before_compiling, waits
 from hal.beside import beside
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ TIMED_TURNS: Final = 5
 
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
+_one: Final = threading.Lock()
+"""Of those that load in one process."""
 LOOK_S: Final = 0.5
 """Seconds between two looks for the first kernel that has been compiled."""
 
@@ -82,14 +85,17 @@ async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | N
 
 
 def load(lights: Lights | None = None) -> Warmth:
-    """Import and exercise the estimator under the lock. Blocks; for a thread, or for a command that may wait.
+    """Import and exercise the estimator. Blocks; for a thread, or for a command that may wait.
+
+    Where kernels are missing it waits until no other process compiles any; where none are, for nobody.
 
     Raises:
         CannotLoad: nowhere to keep compiled kernels, or memory must not be made executable here.
     """
     begun = time.monotonic()
     try:
-        return _load_locked(begun, lights)
+        with _one:
+            return _load(begun, lights)
     except PermissionError as error:  # raised by the compiler under the service manager's MemoryDenyWriteExecute=
         remedy = "the process must be allowed to make memory executable"
         raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
@@ -178,22 +184,33 @@ def is_warm(lights: bool) -> bool:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
 
 
-def _load_locked(begun: float, lights: Lights | None) -> Warmth:
+def _load(begun: float, lights: Lights | None) -> Warmth:
     with _uncollected(True):
         from estimator.kernel import CACHE_DIR
 
-    with (CACHE_DIR / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        what = _what(lights is not None)
-        cold = not is_marked(what)
+    what = _what(lights is not None)
+    with KernelLock(CACHE_DIR) as lock:
+        compiled = False
+        if not is_marked(what):
+            lock.take()
+            compiled = not is_marked(what)  # who had the lock may have compiled them all
+        cold = compiled
         if cold:
             count = kernel_count(lights is not None)
             log.info("first start of this version: compiling %d kernels, which takes a minute or two", count)
-        with _uncollected(not cold):
+
+        def missing() -> None:
+            """A kernel is not there, whatever the mark says."""
+            nonlocal compiled
+            lock.take()
+            compiled = True
+
+        with _uncollected(not cold), before_compiling(missing):
             _exercise()
             code_us = 0.0 if lights is None else _exercise_lights(lights)
-        mark_of(what).touch()
-    return Warmth(cold, time.monotonic() - begun, code_us)
+        if cold:
+            mark_of(what).touch()
+    return Warmth(compiled, time.monotonic() - begun, code_us)
 
 
 @contextlib.contextmanager
@@ -261,11 +278,13 @@ def _exercise_lights(lights: Lights) -> float:
 
 
 def _progress_line(seconds: float, lights: bool = False) -> str:
-    """How far compiling has come after ``seconds``; empty until the compiler is loaded."""
+    """How far compiling has come after ``seconds``, or what is waited for; empty until the compiler is loaded."""
     kernel = sys.modules.get("estimator.kernel")
     directory: Path | None = getattr(kernel, "CACHE_DIR", None)
     if directory is None:
         return ""
+    if waits.is_set():
+        return f"waiting for another process, which compiles kernels, after {seconds:.0f} s"
     since = time.time() - seconds
     count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
     if count == 0:

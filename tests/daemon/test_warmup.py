@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import gc
+import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from daemon import warmup
+from daemon.kernellock import waits
 from daemon.lights import Lights
 from daemon.warmup import Warmth, kernel_count, warm_up
 from estimator.cdma_profile import PROFILE_A
@@ -104,19 +111,71 @@ def test_warm_means_loaded_frozen_and_quick() -> None:
     assert gc.get_freeze_count() > 1000
 
 
-def test_two_starts_at_once_wait_for_each_other() -> None:
-    """The second process waits as long as the first holds the lock."""
-    import fcntl
+LOAD = (
+    "import logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+    "from daemon import warmup; print(warmup.load().compiled)"
+)
 
-    warmup.load()
-    code = "from daemon import warmup; warmup.load(); print('loaded')"
-    with (CACHE_DIR / "lock").open("w") as lock:
+
+@contextmanager
+def another_compiles(folder: Path) -> Iterator[None]:
+    """As if another process did."""
+    with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        second = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        yield
+
+
+def test_a_start_whose_kernels_are_there_waits_for_nobody() -> None:
+    """Whoever compiles: for a copy of these sources elsewhere, or for a command that needs others."""
+    warmup.load()
+    with another_compiles(CACHE_DIR):
+        done = subprocess.run([sys.executable, "-c", LOAD], cwd=ROOT, capture_output=True, text=True, timeout=60.0)
+    assert done.stdout == "False\n"
+    assert done.stderr == ""
+
+
+@pytest.mark.jit
+def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_path: Path) -> None:
+    """The mark says that all are there: nothing is written beside somebody who compiles, nor is half a file read."""
+    warmup.load()
+    folder = tmp_path / CACHE_DIR.name
+    room = f"estimator_{hashlib.sha1(str(ROOT / 'estimator').encode()).hexdigest()}"  # as numba names it
+    shutil.copytree(CACHE_DIR / room, folder / room)
+    shutil.copy(warmup.mark_of("warm"), folder)
+    missing = min((folder / room).glob("scanpoints.*.nbc"))
+    missing.unlink()
+    half = missing.with_name(f"{missing.name}.tmp.0123456789abcdef")
+    half.write_bytes(b"of somebody who compiles")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    words, pipe = [sys.executable, "-c", LOAD], subprocess.PIPE
+    with another_compiles(folder):
+        second = subprocess.Popen(words, cwd=ROOT, env=environment, stdout=pipe, stderr=pipe, text=True)
         with pytest.raises(subprocess.TimeoutExpired):
-            second.communicate(timeout=3.0)
-    output, _ = second.communicate(timeout=60.0)
-    assert output == "loaded\n"
+            second.communicate(timeout=6.0)
+        assert not missing.exists()
+    output, said = second.communicate(timeout=120.0)
+    assert output == "True\n", said
+    assert "waiting for another process, which compiles kernels" in said
+    assert missing.exists()
+
+
+def test_a_first_start_waits_for_another_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr(warmup, "_exercise", lambda: None)
+    caplog.set_level("INFO")
+    with ThreadPoolExecutor(1) as pool:
+        with another_compiles(tmp_path):
+            loading = pool.submit(warmup.load)
+            assert waits.wait(10.0)
+            assert warmup._progress_line(12.0) == "waiting for another process, which compiles kernels, after 12 s"
+            (tmp_path / "one.nbc").touch()
+            warmup.mark_of("warm").touch()  # it has compiled all of them
+            assert not loading.done()
+        assert not loading.result(10.0).compiled
+    assert not waits.is_set()
+    assert f"it holds {tmp_path / 'lock'}" in caplog.text
 
 
 def test_a_start_loads_nothing_it_does_not_use() -> None:
