@@ -20,7 +20,7 @@ from daemon.png import encode_png
 from daemon.results import Folder, OutputRefused, Trajectory, finest, map_yaml, pgm, tum
 from daemon.store_file import BadMap
 from daemon.store_image import image_from, meta_of, packed
-from daemon.versions import versions
+from daemon.versions import release
 from estimator import se2
 from estimator.floorplan import image_of_cells
 from estimator.grid import Grid
@@ -77,7 +77,7 @@ def take_in(args: argparse.Namespace) -> int:
         identity = Identity(1 + secrets.randbelow(2**32 - 1), named)
         origin = np.array(described.origin)
         image = image_of_cells(cells, described.resolution, origin, identity)
-        content = packed(image, meta_of(image, time.time(), "", versions()["lumiloop"]))
+        content = packed(image, meta_of(image, time.time(), "", release()))
         path = keep(args.settings, content, identity.map_id) if args.out is None else put(args.out, content)
     except (BadMapServer, BadMap, Refused, OSError) as error:
         return cli.fail(str(error))

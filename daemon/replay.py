@@ -32,7 +32,7 @@ from daemon.sources import Source, open_log, sha256_of
 from daemon.store import START, NoMap, Start, recorded_start, started
 from daemon.store_file import BadMap
 from daemon.store_image import meta_of, packed
-from daemon.versions import versions
+from daemon.versions import release, versions
 from estimator.grid import Grid
 from estimator.mapimage import Identity
 from hal.errors import DataInvalid, HalError
@@ -289,7 +289,7 @@ def _map(outcome: Outcome) -> bytes:
     """The map as ``lumiloop run`` keeps it, the same each time."""
     map_id = zlib.crc32(outcome.source.path.name.encode()) | 1
     image = outcome.rerun.image(Identity(map_id, outcome.source.path.name[:LONGEST_NAME], session=1))
-    return packed(image, meta_of(image, 0.0, outcome.config.name, versions()["lumiloop"]))
+    return packed(image, meta_of(image, 0.0, outcome.config.name, release()))
 
 
 def _loops(ledger: Ledger) -> bytes:

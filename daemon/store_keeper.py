@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 from daemon.store import Start, Store, said
 from daemon.store_file import BadMap
-from daemon.versions import versions
+from daemon.versions import release
 from hal.clock import Clock
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
@@ -281,7 +281,7 @@ class Keeper:
     def _packed(self, image: MapImage) -> bytes:
         from daemon.store_image import meta_of, packed
 
-        meta = meta_of(image, self._clock.utc(), self._about.robot, versions()["lumiloop"])
+        meta = meta_of(image, self._clock.utc(), self._about.robot, release())
         return packed(image, meta, partial(time.sleep, BREATH_S))
 
     def _end(self, revision: Revision, waiting: list[Told], path: Path | None, error: str) -> None:

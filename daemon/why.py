@@ -26,6 +26,7 @@ from daemon.replay import NOTHING_GIVEN, config_for, lights_for, start_for
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused
 from daemon.sources import RecordingSource, Turn
+from daemon.versions import made_elsewhere
 from daemon.whysaid import Moment
 from hal.errors import DataInvalid, HalError
 from hal.replay.recording import SUFFIX, open_recording
@@ -47,12 +48,17 @@ class NoMoment(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A recording, and the time (UTC) that it covers; ``utc_at_zero``: of its monotonic clock."""
+    """A recording, and the time (UTC) that it covers.
+
+    Attributes:
+        utc_at_zero: of its monotonic clock. made: with what, where that is not what runs now; empty otherwise.
+    """
 
     path: Path
     begin: float
     end: float
     utc_at_zero: float
+    made: str = ""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -64,7 +70,7 @@ def main(args: argparse.Namespace) -> int:
         span, utc = find(spans(folder), args.time, folder)
         told, rerun = moments(span, utc)
         second = whole_second(args.time)
-        sys.stdout.write(whysaid.report(told, utc, span.path.name, second))
+        sys.stdout.write(whysaid.report(told, utc, span.path.name, second, span.made))
         if rerun.comparison.differ:
             cli.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
@@ -111,7 +117,7 @@ def _span(path: Path) -> Span:
     begin = begun if source.begin is None else source.begin.t_mono
     last = open_recording(recording.segments[-1])
     end = max((frame.t_mono for frame in last.frames(LogReport())), default=begin)
-    return Span(path, utc + begin, utc + end, utc)
+    return Span(path, utc + begin, utc + end, utc, made_elsewhere(recording.header))
 
 
 def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:

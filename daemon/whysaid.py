@@ -104,8 +104,11 @@ def _key(one: Moment) -> tuple[State, Reason, int]:
     return one.state, one.reason, one.snapshot.fault
 
 
-def report(told: Sequence[Moment], utc: float, where: str, second: bool = False) -> str:
-    """The text of an instant; ``second``: of the whole second that begins then, at the first change in it."""
+def report(told: Sequence[Moment], utc: float, where: str, second: bool = False, made: str = "") -> str:
+    """The text of an instant; ``second``: of the whole second that begins then, at the first change in it.
+
+    ``made``: a line on what the recording was made with, where there is something to say of it.
+    """
     k = last = at(told, utc)
     when = clock(utc)
     if second:
@@ -120,7 +123,7 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False)
         when = f"{begun}, no cycle had run yet; the first, {apart:.0f} s later"
     elif apart < -SECOND_S:
         when = f"{begun}, no cycle ran then; the last before it, {-apart:.0f} s earlier"
-    lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *_state(told, k)]
+    lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *([made] if made else []), *_state(told, k)]
     lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
     if one.snapshot.light is not None:

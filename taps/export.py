@@ -20,6 +20,7 @@ from daemon import cli, warmup
 from daemon.extras import how_to_install
 from daemon.replay import Given
 from daemon.results import OutputRefused, kitti, tum
+from daemon.versions import made_elsewhere
 from daemon.wholefile import write_whole
 from hal.errors import HalError
 from taps.inside import Retold
@@ -80,6 +81,8 @@ def _save(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
     told = Retold(args.log, args.settings, Given(args.config is not None, keys))
+    if made := made_elsewhere(told.source.header):
+        cli.say(f"{args.log}: {made}")
     stopped = ""
     if args.mcap is None:
         stopped = _run(told, None, None)

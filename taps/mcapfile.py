@@ -9,7 +9,7 @@ from typing import IO, Final, Self
 
 from mcap.writer import CompressionType, Writer
 
-from daemon.versions import versions
+from daemon.versions import release
 from taps import rostypes
 from taps.ros import TOPICS, Out
 
@@ -57,7 +57,7 @@ class McapFile:
         self._guard()
         self._stream: IO[bytes] = path.open("wb")
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(PROFILE, f"lumiloop {versions()['lumiloop']}")
+        self._writer.start(PROFILE, f"lumiloop {release()}")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._begun = -1

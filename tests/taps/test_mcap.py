@@ -20,6 +20,7 @@ from daemon import blackbox, cli, disk
 from daemon.flight import DUMP
 from daemon.publish.snapshot import State
 from daemon.results import Trajectory, kitti, tum
+from daemon.versions import build
 from hal.replay.recording import Kind, open_recording
 from hal.replay.report import LogReport
 from tests.daemon.replay.room import read_tum
@@ -178,6 +179,20 @@ def fill(file: McapFile, count: int) -> None:
     noise = np.random.default_rng(1)
     for number in range(count):
         file.write(Out("/lumiloop/raw", 10**18 + number * 25_000_000, noise.bytes(200)))
+
+
+def test_an_export_of_another_build_s_recording_says_so(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["export", str(recording), "--tum", str(tmp_path / "drive.tum")]
+    assert cli.main(words) == cli.OK
+    assert "recorded with" not in capsys.readouterr().err
+    built = build()
+    monkeypatch.setattr("daemon.versions.build", lambda: "of today")
+    assert cli.main(words) == cli.OK
+    said = capsys.readouterr()
+    assert f"{recording}: recorded with build {built}; this is build of today: the replay may differ" in said.err
+    assert said.out == ""
 
 
 def test_an_export_that_is_told_to_stop_leaves_nothing_half_made(

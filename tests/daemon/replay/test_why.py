@@ -14,6 +14,7 @@ from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
 from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
 from daemon.reasons import Reason
+from daemon.versions import build
 from daemon.why import NoMoment, Span, find, meant, whole_second
 from daemon.whysaid import Moment, report
 from daemon.witness import Told
@@ -119,6 +120,17 @@ def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]
     assert "x       UNKNOWN since" in said
     assert "TRACKING: the pose is confirmed" in said
     assert "NO_LIDAR: no valid scan" in said
+
+
+def test_a_recording_of_another_build_is_said_to_be_one(
+    recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
+    assert "recorded with" not in asked("9", dump, capsys)
+    built = build()
+    monkeypatch.setattr("daemon.versions.build", lambda: "of today")
+    made = next(line for line in asked("9", dump, capsys).splitlines() if line.startswith("recorded with"))
+    assert made == f"recorded with build {built}; this is build of today: the replay may differ from what ran then"
 
 
 def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
