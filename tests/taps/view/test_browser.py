@@ -19,6 +19,20 @@ pytestmark = [
 ]
 POSE = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose"
 PHONE = (390, 844)
+NARROWEST, TABLET = 320, 768
+HEAD = """(() => {
+  scrollTo(0, 0);
+  document.getElementById("state-name").textContent = "RELOCATING";  // the longest
+  const name = document.getElementById("name"), inside = ({ left, right, top, width }) =>
+    width > 20 && left >= 0 && right <= innerWidth && top >= 0;
+  const all = [name, ...document.querySelectorAll("header .chip, header .tag, header .round")];
+  return [
+    name.textContent, all.every((one) => inside(one.getBoundingClientRect())), name.scrollWidth - name.clientWidth,
+    document.querySelector("header").getBoundingClientRect().bottom,
+    parseFloat(getComputedStyle(document.getElementById("stage")).top),
+  ];
+})()"""
+"""The robot's name, whether all of the head is in view, what is cut off of the name, where head ends and map stays."""
 FIRST_PAINT_MS, SHOWN_MS = 1000.0, 150.0
 SLACK = 4.0
 """Of times that are measured on a machine that others use."""
@@ -139,6 +153,15 @@ def test_a_phone(browser: str, address: str) -> None:
         assert edge <= PHONE[0]
         await page.click("[data-order=save_map]")  # not behind the map, which stays where it is
         await page.until("document.getElementById('told').textContent.includes('map')")
+        for width in (PHONE[0], NARROWEST, TABLET):
+            await page.ask(
+                "Emulation.setDeviceMetricsOverride", width=width, height=700, deviceScaleFactor=2, mobile=True
+            )
+            name, within, cut, end, below = await page.js(HEAD)
+            assert name.startswith("demo-")  # which of several robots this is
+            assert within, width
+            assert cut <= 0
+            assert end == below  # and the map stays below the head
 
     look(browser, address, body, size=PHONE, phone=True)
 
