@@ -41,6 +41,7 @@ def command(folder: Path, name: str, words: str) -> None:
     path.chmod(0o755)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.realtime
 def test_two_robots_on_one_map(tmp_path: Path) -> None:
