@@ -16,6 +16,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Keyframe
+from estimator.leap import Leap
 from estimator.records import Array
 from estimator.relocate import Fit, Looked, Terrain, Verdict, same
 
@@ -209,11 +210,13 @@ class Question:
 
     Attributes:
         jumped: the pose did. holds: the place does, in the local map. again: an earlier search had to be ended.
+        leapt: what is seen did.
     """
 
     jumped: bool
     holds: bool
     again: bool
+    leapt: bool = False
 
 
 @dataclass(slots=True, eq=False)
@@ -230,6 +233,7 @@ class Suspicion:
         question: what the look under way decides, None: there is none. job: its ID. t_asked: when it was asked for.
         again: the next one may search more.
         since: ID of the first keyframe that may be of another place, 0: none.
+        leap: what is remembered of the latest scans. leapt: what is seen has changed all at once.
     """
 
     fitted: int = 0
@@ -245,9 +249,13 @@ class Suspicion:
     t_asked: float = -math.inf
     again: bool = False
     since: int = 0
+    leap: Leap = field(default_factory=Leap)
+    leapt: bool = False
 
     def end(self) -> None:
         """Suspect nothing, and wait for no answer."""
+        self.leap.forget()
+        self.leapt = False
         self.fitted, self.jumped, self.odd, self.question, self.again, self.since = 0, False, False, None, False, 0
 
 

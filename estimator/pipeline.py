@@ -96,7 +96,7 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
     points = nothing_of(scan) if why else virtual_frame(state, scan)
     walk(state)
     match = match_scan(state, scan, points, limits, why)
-    carried = suspicion.raised(state, match)
+    carried = suspicion.raised(state, scan, points, match)
     fuse(state, match)
     timelag.on_match(state.lag, scan, match)
     if carried:

@@ -5,10 +5,12 @@ is suspected where physics says that something else than driving has happened:
 
 * a match moves the pose farther than any driving can have in that time;
 * the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
-  seen afterwards is not what was seen before.
+  seen afterwards is not what was seen before;
+* what is seen changes from one scan to the next, all at once (`leap`).
 
-One look in the whole map then decides: if another place fits nearly as well the robot is adrift. So it is after a jump
-where the place does not hold, there or in the local map; all else may have been a door, or somebody who sat and left.
+One look in the whole map then decides: if another place fits nearly as well the robot is adrift, and after a leap also
+if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the local
+map; all else may have been a door, a table that was carried away, or somebody who sat and left.
 Until the answer has come nothing is laid into the map. While light tells the place light is the witness, see
 `adrift.doubt`.
 """
@@ -26,6 +28,8 @@ from estimator.atlas import LOOK
 from estimator.commands import forget
 from estimator.fusion import noise_of
 from estimator.hypotheses import BEHIND, Question
+from estimator.keyframe import unturned
+from estimator.leap import glance
 from estimator.linear3 import invert3
 from estimator.records import Array, Odometry, Scan
 from estimator.relocate import Looked, Piece, Query, Verdict
@@ -79,7 +83,7 @@ def waits(state: State) -> bool:
     return looking or doubt.fitted > 0
 
 
-def raised(state: State, match: MatchResult) -> bool:
+def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
     """Whether the place is to be looked for now; to be asked before the match is fused."""
     doubt, atlas = state.suspicion, state.atlas
     if not match.ok or state.local is None:
@@ -93,12 +97,16 @@ def raised(state: State, match: MatchResult) -> bool:
     made = se2.between(state.T_odom_scan, match.T_odom_base)  # wheels that lie move the prediction, not the robot
     jump = odd and all(too_far(T, state.fused.t_mono - state.t_match) for T in (match.correction, made))
     doubt.jumped |= jump
-    if doubt.fitted or alone or jump or state.failures >= ROW:
+    eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
+    beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
+    doubt.leap.take(glance(scan.t_end, eye, beams), noise_of(state, scan), doubt.period_s)
+    doubt.leapt |= doubt.leap.seen
+    if doubt.fitted or alone or jump or state.failures >= ROW or doubt.leap.seen:
         doubt.odd |= odd
-        doubt.fitted += 1
+        doubt.fitted = max(doubt.fitted + 1, ROW if doubt.leap.seen else 0)
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
-    if doubt.fitted >= ROW and not doubt.odd and share > doubt.share - CHANGED:
+    if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
         doubt.fitted = 0  # the same picture from the same place
     if doubt.question is not None and state.fused.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
@@ -111,6 +119,7 @@ def give_up(state: State, question: Question) -> None:
     state.atlas.asked.pop(doubt.job, None)
     doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
     doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
+    doubt.leapt |= question.leapt
 
 
 def unwatched(state: State) -> bool:
@@ -147,8 +156,8 @@ def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> No
     against = localmap.contradicted(state.local, frame.T_odom_lidar, frame.beams(), noise_of(state, scan))
     share = match.inliers / max(1, match.queries)
     holds = relocate.judged(match, share, against, told) is Verdict.HOLDS
-    asked = Question(doubt.jumped, holds, doubt.again)
-    doubt.fitted, doubt.jumped, doubt.odd, doubt.again = 0, False, False, False
+    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt)
+    doubt.fitted, doubt.jumped, doubt.odd, doubt.again, doubt.leapt = 0, False, False, False, False
     doubt.since = doubt.since or state.next_key
     older = [one for one in atlas.settled() if one.first < doubt.since]
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
@@ -175,6 +184,10 @@ def answered(state: State, asked: Question, payload: object) -> None:
     doubt.question = None
     here = payload.guesses[0]
     least = max(relocate.LEAST, here.share - BEHIND)
+    if (
+        asked.leapt
+    ):  # then any place will do that is not ruled out, if its own is; and who does not match, as in a corridor
+        least = 0.0 if here.verdict is Verdict.NO else here.share - BEHIND
     alone = all(fit.share < least for fit, _ in payload.fresh)
     holds = asked.holds or not asked.jumped or here.verdict is Verdict.HOLDS
     if not (alone and holds):
@@ -184,7 +197,7 @@ def answered(state: State, asked: Question, payload: object) -> None:
     elif asked.jumped or asked.again:
         carried_off(state)
     else:
-        doubt.fitted, doubt.odd, doubt.again = ROW, True, True
+        doubt.fitted, doubt.odd, doubt.again, doubt.leapt = ROW, True, True, asked.leapt
 
 
 def carried_off(state: State) -> None:

@@ -20,6 +20,8 @@ pytestmark = pytest.mark.jit
 
 IMAGE = Scene(np.array(box(-3.0, -2.0, 3.0, 2.0), dtype=np.float64), (-2.5, -1.5), (2.5, 1.5))
 """Turned by half a turn it looks the same from everywhere."""
+CUPBOARD = Scene(np.vstack((IMAGE.walls, np.array(box(2.2, 1.3, 3.0, 2.0)))), IMAGE.low, IMAGE.high)
+"""But for one thing in a corner."""
 ABOUT = ((-1.5, -1.0), (1.5, -1.0), (1.5, 1.0), (-1.5, 1.0), (-1.5, -1.0), (1.5, -1.0), (1.5, 0.5))
 OTHER_END = np.array((0.0, 0.0, np.pi))
 HALL = ((1.0, 6.0), (10.8, 6.0))
@@ -76,6 +78,26 @@ def test_put_down_close_to_the_image_of_its_place_while_the_lidar_was_covered() 
     said = stand(robot, there, 15)
     assert said[-1] is not None
     assert said[-1] == 2
+
+
+def test_put_down_where_it_fits_to_a_hair_and_only_a_cupboard_is_missing() -> None:
+    """No pose jumps, wheels and lidar tell nothing: what is seen has changed, from one scan to the next."""
+    robot = driven(CUPBOARD, ABOUT)
+    assert robot.T is not None
+    said = stand(robot, se2.compose(OTHER_END, robot.T), 20)
+    assert said[-1] is not None
+
+
+def test_a_cupboard_that_is_carried_away_takes_nothing_from_a_place_that_is_like_no_other() -> None:
+    """Not even if nobody was seen to do it: the place still holds, and there is no other."""
+    plain = furnished()
+    chest = Scene(np.vstack((plain.walls, np.array(box(6.6, 6.15, 7.4, 6.9)))), plain.low, plain.high)
+    robot = driven(chest, TOUR)
+    assert robot.T is not None
+    asked = robot.state.suspicion.t_asked
+    robot.scene = plain
+    assert set(stand(robot, robot.T, 20)) == {None}
+    assert robot.state.suspicion.t_asked > asked, "it has looked for itself"
 
 
 def test_in_a_map_of_which_nothing_is_finished_a_jump_is_enough_and_a_covered_lidar_is_not() -> None:
@@ -276,3 +298,50 @@ def test_a_jump_while_a_look_is_under_way_is_not_forgotten() -> None:
     fine = Fit(there, np.eye(3), 0.9, 0.0, 0.01, 1, np.zeros(3), Verdict.HOLDS)
     suspicion.answered(robot.state, asked, Looked(None, (fine,), (), True, 0))  # type: ignore[arg-type]
     assert stand(robot, there, 10)[-1] is not None
+
+
+@pytest.mark.parametrize(
+    ("own", "share", "others", "complete", "carried"),
+    [
+        (Verdict.HOLDS, 0.9, (), True, False),
+        (Verdict.NO, 0.9, (), True, False),  # a table between two scans; there is nowhere else to be
+        (Verdict.NO, 0.9, (0.5,), True, True),  # though that fits with fewer beams than its own
+        (Verdict.OPEN, 0.9, (0.5,), True, False),
+        (Verdict.OPEN, 0.9, (0.8,), True, True),
+        (Verdict.OPEN, 0.0, (0.0,), True, True),  # a corridor, in which nothing holds the match
+        (Verdict.HOLDS, 0.9, (), False, None),
+    ],
+)
+def test_after_a_leap_it_is_adrift_where_another_place_fits(
+    own: Verdict, share: float, others: tuple[float, ...], complete: bool, carried: bool | None
+) -> None:
+    """None: it is asked once more, and then what has not been found out counts against the place."""
+    robot = driven(IMAGE, ABOUT)
+    assert robot.T is not None
+    state = robot.state
+    said = Looked(
+        None,  # type: ignore[arg-type]
+        (Fit(robot.T, np.eye(3), share, 0.1, 0.01, 1, np.zeros(3), own),),
+        tuple((Fit(OTHER_END, np.eye(3), other, 0.0, 0.01, 1, np.zeros(3), Verdict.OPEN), ()) for other in others),
+        complete,
+        0,
+    )
+    state.suspicion.question = asked = Question(False, True, False, True)
+    suspicion.answered(state, asked, said)
+    assert (state.atlas.adrift is not None) is bool(carried)
+    if carried is None:
+        assert state.suspicion.fitted > 0
+        assert state.suspicion.leapt
+        state.suspicion.question = again = Question(False, True, True, True)
+        suspicion.answered(state, again, said)
+        assert state.atlas.adrift is not None
+
+
+def test_a_leap_in_a_map_of_which_nothing_is_finished_is_let_go() -> None:
+    """There is nothing to be searched, and a leap proves nothing alone."""
+    robot = driven(CUPBOARD, ABOUT[:2], young=True)
+    assert robot.T is not None
+    robot.scene = IMAGE
+    assert set(stand(robot, robot.T, 20)) == {None}
+    assert robot.state.suspicion.question is None
+    assert not robot.state.suspicion.leapt

@@ -56,8 +56,15 @@ async def long(bench: Bench) -> None:
         let_write(0.05)
 
 
+async def longer(bench: Bench) -> None:
+    """Long enough for three states, of which each may be as large as what was recorded since the one before."""
+    await long(bench)
+    await bench.drive(4.0)
+    let_write(0.05)
+
+
 def test_every_state_is_a_beginning(tmp_path: Path) -> None:
-    bench = record(tmp_path / "rec", long)
+    bench = record(tmp_path / "rec", longer)
     assert not bench.recorder.failing
     (run,) = (tmp_path / "rec").iterdir()
     found = states(tmp_path / "rec")
