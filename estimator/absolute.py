@@ -56,6 +56,9 @@ SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
+BENT_M = 0.7
+"""A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
+is off by says nothing of that."""
 ANY_HEADING = math.pi**2 / 3.0
 """Variance of a heading that may be any, rad^2."""
 BLIND_S, BLIND_PERIODS, SLOWEST_S = 0.5, 1.5, 3.0
@@ -159,7 +162,7 @@ def on_lights(state: State, lights: LightsResult) -> None:
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    lights = across_the_row(state, doubted(tie, lights, state.fused.odometry))
+    lights = across_the_row(state, doubted(tie, lights, guided(state)))
     held = holds_heading(state)
     if held:
         lights = without_heading(lights)
@@ -215,6 +218,7 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     tie.fresh = max(0.0, tie.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
+    straighten(state)
     before = R @ tie.P @ R.T
     L_before = invert3(before)
     after = _symmetric(invert3(L_before + positive_part(G)))
@@ -226,6 +230,15 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
         if tie.since == 0 and state.atlas.kept:  # a stored map has come along for the last time
             rehang(state, 0)
         tie.since = state.next_key
+
+
+def straighten(state: State) -> None:
+    """Without wheels, let a place that is hardly known say nothing of the heading, nor the heading of the place."""
+    tie = state.absolute
+    assert tie is not None
+    if not state.fused.odometry and tie.P[0, 0] + tie.P[1, 1] > BENT_M**2:
+        for A in (tie.P, tie.X):
+            A[2, :2] = A[:2, 2] = 0.0
 
 
 def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
@@ -278,7 +291,7 @@ def virtual(state: State) -> Virtual | None:
     tie = state.absolute
     if tie is None or state.light is None or state.light.result.fix is not Fix.GOOD:
         return None
-    wheels = state.fused.odometry
+    wheels = guided(state)
     lights = across_the_row(state, state.light.result)
     _, factor = doubted_covariance(tie, lights, wheels)
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
@@ -322,6 +335,11 @@ def doubted_covariance(tie: Absolute, lights: LightsResult, wheels: bool = True)
     return P, factor
 
 
+def guided(state: State) -> bool:
+    """Whether `lights` knows how the robot moves, by wheels or by the laser."""
+    return state.fused.odometry or (state.light is not None and state.light.filter.course.wheels)
+
+
 def holds_heading(state: State) -> bool:
     """Whether the laser holds a heading that light has proved, and light has nothing as good.
 
@@ -330,7 +348,7 @@ def holds_heading(state: State) -> bool:
     """
     tie = state.absolute
     assert tie is not None
-    return tie.proved and not tie.broken and not blind(state) and not state.fused.odometry
+    return tie.proved and not tie.broken and not blind(state) and not guided(state)
 
 
 def without_heading(lights: LightsResult) -> LightsResult:
@@ -368,6 +386,11 @@ def tells(state: State) -> bool:
     if tie is None or light is None or not tie.placed:
         return False
     return state.fused.t_mono - light.filter.t_used <= max(SILENT_S, SILENT_PERIODS * tie.light_s)
+
+
+def told_last(state: State) -> float:
+    """When a link was used for the last time; -inf without a photodiode."""
+    return -math.inf if state.light is None else state.light.filter.t_used
 
 
 def pose_at(state: State, t_mono: float) -> Array:

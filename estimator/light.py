@@ -33,11 +33,12 @@ class LightsSetup:
 
 
 class Light:
-    """What is known from light, without the laser.
+    """What is known from light, without a place by the laser.
 
     Attributes:
         setup: as given. decoder: of the photodiode's blocks. filter: see estimator/lights.py. result: after the latest
-            epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself.
+            epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself. guided:
+            instant and pose (odom frame) of the latest scan, if its match may tell how the robot moves; see `guide`.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
@@ -49,13 +50,22 @@ class Light:
         self.result = lights.result(self.filter)
         self.epoch: LightEpoch | None = None
         self.glimpse: tuple[LightEpoch, tuple[Place, ...]] | None = None
+        self.guided: tuple[float, Array] | None = None
         self._decoded = self._decoded_before = False
         self._spared = 0
 
     def predict(self, record: Record) -> None:
-        """Move the `lights` filter with the robot; it never hears of the laser."""
+        """Move the `lights` filter with the robot, by what wheels and gyro say."""
         if isinstance(record, Odometry | Imu):
             lights.predict(self.filter, record)
+
+    def move(self, record: Odometry) -> None:
+        """Where no wheels tell how the robot moves: move the `lights` filter by what matches say of it."""
+        lights.move(self.filter, record)
+
+    def turn(self, t_mono: float, heading: float) -> None:
+        """Where neither wheels nor a gyro tell how it turns: by the heading (odom frame) of a match, nan: of none."""
+        lights.turn(self.filter, t_mono, heading)
 
     def take(self, record: SampleBlock | LightEpoch) -> LightsResult:
         """Decode a block, if it is one, and take the epoch into the filter."""

@@ -1,4 +1,4 @@
-"""The `lights` filter: odometry and lamps, never laser; pose, heading, and what the lamps and sensors are off by.
+"""The `lights` filter: odometry and lamps, no place by laser; pose, heading, and what lamps and sensors are off by.
 
     predict -> (start) -> name the lamps -> linearise -> gate -> absorb -> decide -> result
 
@@ -32,11 +32,13 @@ __all__ = [
     "Pause",
     "carry_to",
     "lean",
+    "move",
     "new_lights",
     "place",
     "predict",
     "reset",
     "result",
+    "turn",
     "update",
 ]
 
@@ -83,6 +85,32 @@ def predict(lights: Lights, record: Odometry | Imu) -> None:
         lights_motion.on_odometry(lights, record)
     else:
         lights_motion.on_imu(lights, record)
+
+
+def move(lights: Lights, record: Odometry) -> None:
+    """Move as the laser has, where no wheels tell it; not while the lamps in use are a row."""
+    if not in_a_row(lights, record.t_end):
+        lights_motion.on_odometry(lights, record)
+
+
+def turn(lights: Lights, t_mono: float, heading: float) -> None:
+    """Turn as the laser does, where neither wheels nor a gyro tell it; not while the lamps in use are a row.
+
+    Args:
+        lights: all of the filter.
+        t_mono: instant of the heading, not before the latest.
+        heading: rad, in a frame that never jumps; nan where the laser does not know it.
+    """
+    lights_motion.on_heading(lights, t_mono, math.nan if in_a_row(lights, t_mono) else heading)
+
+
+def in_a_row(lights: Lights, t_mono: float) -> bool:
+    """Whether the lamps in use have been one row for long enough to count as such.
+
+    What a row tells of the distance from it, and of the heading, is the same mistake in every epoch: who also knows the
+    way and the turn to a hair soon believes it.
+    """
+    return t_mono - lights.t_row >= row.LASTING_S
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:
@@ -207,10 +235,10 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
-        if lights.course.wheels and len(lights.tracks) == 1 and lights.result is not None:
+        if len(lights.tracks) == 1 and lights.result is not None:
             narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
             lights.t_row = min(lights.t_row, middle) if narrow > row.SLIGHT else math.inf
-            if middle - lights.t_row >= row.LASTING_S:
+            if lights.course.wheels and in_a_row(lights, middle):
                 row.loosen(narrow, angle, track.P)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
         likelihood = absorb(lights, track, seen, view_of(lights, back))

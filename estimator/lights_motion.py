@@ -20,6 +20,8 @@ CARRY_S: Final = 0.5
 """Odometry older than that is not missed for a moment; it has ended, and constant velocity takes over."""
 TRAIL_S: Final = 1.0
 GYRO_FRESH_S: Final = 0.1
+HEADING_FRESH_S: Final = 0.3
+"""Three scans of the slowest lidar may be missed."""
 UNSEEN: Final = 0.5
 """m/s and rad/s of a robot that nobody watches."""
 REVERSE_M_S: Final = 0.1
@@ -90,6 +92,31 @@ def on_imu(lights: Lights, record: Imu) -> None:
     glide(lights, record.t_end, float(record.dyaw) * share, noise.gyro)
 
 
+def on_heading(lights: Lights, t_mono: float, heading: float) -> None:
+    """Turn as the laser has turned since it last told its heading, where neither wheels nor a gyro tell it.
+
+    The turn is carried ahead at its last rate, and what that was wrong by is put right with the next heading.
+    """
+    course = lights.course
+    carry_to(lights, t_mono)
+    dt, turned = t_mono - course.t_heading, se2.wrap(heading - course.heading)
+    told = math.isfinite(heading)
+    course.t_heading, course.heading = (t_mono, heading) if told else (-math.inf, 0.0)
+    done = course.turned_on
+    course.turned_on = float(course.velocity[2]) * min(course.t_mono - t_mono, CARRY_S)
+    if not (told and 0.0 < dt < CARRY_S and abs(turned) < AT_MOST[2] * dt) or course.wheels or gyro(lights):
+        return
+    course.velocity[2] = turned / dt
+    made = np.array((0.0, 0.0, turned - (done - course.turned_on)))
+    move_all(lights, made, np.zeros(7), np.zeros(3), course.t_mono)
+
+
+def turns_with_laser(lights: Lights) -> bool:
+    """Whether the laser tells how the robot turns, and nothing else does."""
+    course = lights.course
+    return not (course.wheels or gyro(lights)) and course.t_mono - course.t_heading < HEADING_FRESH_S
+
+
 def carry_to(lights: Lights, t_mono: float) -> None:
     """Bring the poses to an instant at the velocity; an instant in the past changes nothing."""
     course = lights.course
@@ -103,6 +130,10 @@ def carry_to(lights: Lights, t_mono: float) -> None:
     if gyro(lights) or course.wheels:
         spread = lights.settings.motion.gyro if gyro(lights) else lights.settings.motion.angular
         glide(lights, t_mono, float(course.velocity[2]) * min(t_mono - course.t_mono, CARRY_S), spread)
+    elif turns_with_laser(lights):
+        turn = float(course.velocity[2]) * min(t_mono - course.t_mono, CARRY_S)
+        course.turned_on += turn
+        glide(lights, t_mono, turn, lights.settings.motion.matched)
     else:
         glide(lights, t_mono, None, lights.settings.motion.angular)
 

@@ -24,6 +24,7 @@ from estimator import (
 from estimator.commands import obey
 from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.grid import Grid
+from estimator.guide import guide
 from estimator.keyframe import hanging, unturned
 from estimator.linear3 import invert3
 from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
@@ -98,6 +99,7 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
     match = match_scan(state, scan, points, limits, why)
     carried = suspicion.raised(state, scan, points, match)
     fuse(state, match)
+    guide(state, match)
     timelag.on_match(state.lag, scan, match)
     if carried:
         suspicion.look(state, scan, points, match)

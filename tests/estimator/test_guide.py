@@ -1,0 +1,179 @@
+"""Without wheels the `lights` filter hears from the laser how the robot moves, and never where it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimator import absolute, guide, lights, se2
+from estimator.light import Light
+from estimator.matching import no_match
+from estimator.records import Array, Odometry, Record
+from estimator.result import Fix, MatchResult, Reason
+from estimator.row import LASTING_S
+from tests.estimator.light_room import SURVEY, Room, circle
+from tests.estimator.lit import lit_state, play, scans, together
+from tools.sim.lightrun import LightRun, room_run
+
+pytestmark = [pytest.mark.jit, pytest.mark.no_cover]
+
+FRAME = np.array((3.0, -2.0, 1.0))
+"""Where the frame of the matches begins: nobody may take it for the survey's."""
+
+
+def matched(t: float) -> Array:
+    return se2.compose(FRAME, se2.compose(se2.inverse(circle(0.0)), circle(t)))
+
+
+def led(move: bool, turn: bool, seconds: float = 25.0) -> tuple[lights.Lights, float, float]:
+    """A filter after a round drive, with the medians of its errors (m, rad) since 10 s."""
+    filter_, errors = lights.new_lights(SURVEY), []
+    for k in range(1, round(10.0 * seconds) + 1):
+        t = 0.1 * k
+        result = lights.update(filter_, Room(seed=k).epoch(t - 0.03, circle(t - 0.03)))
+        if move:
+            lights.move(filter_, Odometry(t - 0.1, t, se2.between(matched(t - 0.1), matched(t))))
+        if turn:
+            lights.turn(filter_, t, float(matched(t)[2]))
+        off = result.T_map_base - circle(result.t_pose)
+        errors.append((math.hypot(off[0], off[1]), abs(se2.wrap(float(off[2])))))
+    assert result.fix is Fix.GOOD
+    metres, radians = np.median(errors[100:], axis=0).tolist()
+    return filter_, metres, radians
+
+
+def test_what_matches_say_of_way_and_turn_is_as_good_as_wheels() -> None:
+    _, alone_m, alone_rad = led(False, False)
+    turned, turned_m, turned_rad = led(False, True)
+    moved, moved_m, moved_rad = led(True, True)
+    assert alone_rad > math.radians(2.0)
+    assert turned_rad < math.radians(1.5)
+    assert moved_rad < math.radians(1.0)
+    assert moved_m < 0.6 * alone_m
+    assert turned_m < 0.8 * alone_m
+    assert moved.course.wheels
+    assert not turned.course.wheels
+
+
+def test_a_turn_that_was_carried_ahead_wrongly_is_put_right_with_the_next_heading() -> None:
+    filter_ = lights.new_lights(SURVEY)
+    lights.place(filter_, np.array((5.0, 5.0, 0.5)), np.diag((0.01, 0.01, 0.01)))
+    lights.carry_to(filter_, 0.0)
+    headings = [2.6, 2.6, 2.7, 2.9, 3.0, -3.1, -2.8, -2.7, -2.9]
+    for k, heading in enumerate(headings):
+        lights.carry_to(filter_, 0.1 * k + 0.06 if k % 2 else 0.1 * k - 0.01)  # epochs come before a scan and after it
+        lights.turn(filter_, 0.1 * k + 0.02, heading)
+        if k > 0 and not k % 2:
+            assert se2.wrap(float(filter_.tracks[0].x[2]) - 0.5 - heading + headings[0]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_heading_that_is_unknown_ends_it_and_a_gap_is_no_turn() -> None:
+    filter_ = lights.new_lights(SURVEY)
+    lights.place(filter_, np.array((5.0, 5.0, 0.5)), np.diag((0.01, 0.01, 0.01)))
+    for t, heading in ((0.1, 0.0), (0.2, math.nan), (0.3, 1.0), (2.0, 2.0)):
+        lights.turn(filter_, t, heading)
+    assert filter_.tracks[0].x[2] == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("since", [0.0, LASTING_S])
+def test_under_a_row_of_lamps_nothing_is_taken(since: float) -> None:
+    filter_ = lights.new_lights(SURVEY)
+    lights.place(filter_, np.array((5.0, 5.0, 0.5)), np.diag((0.01, 0.01, 0.01)))
+    lights.carry_to(filter_, 1.0)
+    filter_.t_row = 1.0
+    t = 1.0 + since
+    for k in range(2):
+        lights.turn(filter_, t + 0.1 * k, 0.2 * k)
+    lights.move(filter_, Odometry(t + 0.1, t + 0.2, np.array((0.1, 0.0, 0.0))))
+    assert filter_.course.wheels is (since == 0.0)
+    assert bool(abs(filter_.tracks[0].x[2] - 0.7) < 1e-6) is (since == 0.0)
+
+
+class Told:
+    """What a `Light` was told."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.moves, self.headings = list[Odometry](), list[float]()
+        monkeypatch.setattr(Light, "move", lambda _, record: self.moves.append(record))
+        monkeypatch.setattr(Light, "turn", lambda _, _t, heading: self.headings.append(heading))
+
+
+def scanned(axes: tuple[int, int, int] = (1, 1, 1), information: float = 1e6) -> MatchResult:
+    known = np.array(axes, dtype=np.float64)
+    found = no_match(np.zeros(3), 300, Reason.NO_MAP)
+    return replace(found, reason=Reason.CONVERGED, information=np.diag(information * known), known_axes=known)
+
+
+def test_the_way_is_told_where_every_axis_holds_and_the_turn_where_that_one_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told, state = Told(monkeypatch), lit_state(room_run(seed=1, people=0))
+    steps: list[Any] = [
+        (scanned(), 0.1, 0.05, 0, False),
+        (scanned(), 0.2, 0.10, 1, False),
+        (scanned((1, 0, 1)), 0.3, 0.15, 1, False),  # a corridor
+        (scanned(), 0.4, 0.20, 1, False),
+        (scanned(), 0.5, 0.25, 2, False),
+        (no_match(np.zeros(3), 300, Reason.NO_MAP), 0.6, 0.30, 2, True),
+        (scanned((1, 1, 0)), 0.7, 0.35, 2, True),  # a round room
+        (scanned(), 0.8, 0.40, 2, False),
+        (scanned(), 0.9, 2.40, 2, False),  # nothing indoors drives so fast: it was carried
+        (scanned(), 1.0, 2.45, 3, False),
+    ]
+    for match, t, x, moves, unknown in steps:
+        state.fused.t_mono, state.fused.T_odom_base = t, np.array((x, 0.0, 0.3))
+        guide.guide(state, match)
+        assert len(told.moves) == moves
+        assert math.isnan(told.headings[-1]) is unknown
+    assert (told.moves[1].t_begin, told.moves[1].t_end) == (0.4, 0.5)
+    assert told.moves[1].delta.tolist() == pytest.approx([0.05 * math.cos(0.3), -0.05 * math.sin(0.3), 0.0])
+
+
+def test_while_wheels_tell_the_way_the_laser_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    told, state = Told(monkeypatch), lit_state(room_run(seed=1, people=0))
+    state.fused.odometry = True
+    for k in range(3):
+        state.fused.t_mono = 0.1 * k
+        guide.guide(state, scanned())
+    assert not told.moves
+    assert not told.headings
+
+
+def blind_drive(seed: int) -> tuple[LightRun, Iterator[Record]]:
+    run = replace(room_run(seed=seed, people=0), seconds=20.0)
+    return run, together(run.light(), scans(run))
+
+
+def test_without_wheels_the_pose_is_known_as_soon_as_with_them() -> None:
+    """Without a guide one of these four drives ends before it is, and 6 deg off."""
+    logs = []
+    for seed in range(4, 8):
+        run, records = blind_drive(seed)
+        state = lit_state(run)
+        logs.append(play(state, records, run.truth))
+        assert absolute.guided(state)
+        assert not state.fused.odometry
+        known = next(r.t_mono for r in logs[-1].results if r.placed and r.covariance[2, 2] < 0.04**2)
+        assert known < 16.0, "rad, where TRACKING begins"
+    for begin, metres, degrees in ((8.0, 0.25, 2.0), (12.0, 0.15, 1.5)):
+        rmse = np.sqrt(np.mean(np.square([log.rmse(begin) for log in logs]), axis=0))
+        assert rmse[0] < metres
+        assert np.degrees(rmse[1]) < degrees
+        assert np.mean([log.nees(begin) for log in logs]) < 6.0
+
+
+def test_a_place_that_is_hardly_known_without_wheels_says_nothing_of_the_heading() -> None:
+    state = lit_state(room_run(seed=1, people=0))
+    tie = state.absolute
+    assert tie is not None
+    P = np.array(((1.0, 0.0, 0.1), (0.0, 0.01, 0.0), (0.1, 0.0, 0.02)))
+    for wheels, spread, kept in ((False, 1.0, False), (True, 1.0, True), (False, 0.1, True)):
+        tie.P, state.fused.odometry = spread * P, wheels
+        absolute.straighten(state)
+        assert bool(tie.P[0, 2]) is kept
+        assert tie.P[2, 2] == spread * 0.02
