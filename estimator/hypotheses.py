@@ -233,7 +233,8 @@ class Suspicion:
         question: what the look under way decides, None: there is none. job: its ID. t_asked: when it was asked for.
         again: the next one may search more.
         since: ID of the first keyframe that may be of another place, 0: none.
-        leap: what is remembered of the latest scans. leapt: what is seen has changed all at once.
+        leap: what is remembered of the latest scans. t_leap: instant of one that nobody has judged yet. leapt: what is
+            seen has changed all at once.
     """
 
     fitted: int = 0
@@ -250,11 +251,11 @@ class Suspicion:
     again: bool = False
     since: int = 0
     leap: Leap = field(default_factory=Leap)
+    t_leap: float = -math.inf
     leapt: bool = False
 
     def end(self) -> None:
         """Suspect nothing, and wait for no answer."""
-        self.leap.forget()
         self.leapt = False
         self.fitted, self.jumped, self.odd, self.question, self.again, self.since = 0, False, False, None, False, 0
 

@@ -88,7 +88,7 @@ def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> 
     doubt, atlas = state.suspicion, state.atlas
     if not match.ok or state.local is None:
         return False
-    alone = unwatched(state)
+    alone, leapt = unwatched(state), leaps(state, scan, points, match)
     if absolute.tells(state) or atlas.adrift is not None or state.settings.loops is None:
         doubt.end()
         atlas.own = 0
@@ -97,13 +97,10 @@ def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> 
     made = se2.between(state.T_odom_scan, match.T_odom_base)  # wheels that lie move the prediction, not the robot
     jump = odd and all(too_far(T, state.fused.t_mono - state.t_match) for T in (match.correction, made))
     doubt.jumped |= jump
-    eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
-    beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-    doubt.leap.take(glance(scan.t_end, eye, beams), noise_of(state, scan), doubt.period_s)
-    doubt.leapt |= doubt.leap.seen
-    if doubt.fitted or alone or jump or state.failures >= ROW or doubt.leap.seen:
+    doubt.leapt |= leapt
+    if doubt.fitted or alone or jump or state.failures >= ROW or leapt:
         doubt.odd |= odd
-        doubt.fitted = max(doubt.fitted + 1, ROW if doubt.leap.seen else 0)
+        doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
@@ -111,6 +108,23 @@ def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> 
     if doubt.question is not None and state.fused.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
     return doubt.fitted >= ROW and doubt.question is None
+
+
+def leaps(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
+    """Whether what is seen has changed all at once, now or while light still told the place, and not since.
+
+    Where the robot is put down there may be no lamp, and for a moment nobody knows that it has been one.
+    """
+    doubt = state.suspicion
+    eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
+    beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
+    doubt.leap.take(glance(scan.t_end, eye, beams), noise_of(state, scan), doubt.period_s)
+    if doubt.leap.seen:
+        doubt.t_leap = scan.t_end
+    if absolute.tells(state) or not doubt.t_leap > absolute.told_last(state):
+        return False
+    doubt.t_leap = -math.inf
+    return True
 
 
 def give_up(state: State, question: Question) -> None:

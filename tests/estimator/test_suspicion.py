@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from estimator import relocate, se2, suspicion
+from estimator import absolute, relocate, se2, suspicion
 from estimator.hypotheses import Question
 from estimator.light import LightsSetup
 from estimator.pipeline import new_state
@@ -345,3 +345,19 @@ def test_a_leap_in_a_map_of_which_nothing_is_finished_is_let_go() -> None:
     assert set(stand(robot, robot.T, 20)) == {None}
     assert robot.state.suspicion.question is None
     assert not robot.state.suspicion.leapt
+
+
+@pytest.mark.parametrize("since", [True, False])
+def test_a_leap_while_light_told_the_place_is_judged_when_it_tells_no_more(
+    since: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Put down where there are no lamps; those that are received afterwards (``since``) know better than any leap."""
+    robot = driven(CUPBOARD, ABOUT)
+    assert robot.T is not None
+    here, lit, last = robot.T, [True], [robot.t]
+    monkeypatch.setattr(absolute, "tells", lambda _: lit[0])
+    monkeypatch.setattr(absolute, "told_last", lambda _: last[0])
+    there = se2.compose(OTHER_END, here)
+    assert set(stand(robot, there, 10)) == {None}
+    lit[0], last[0] = False, robot.t if since else last[0]
+    assert (stand(robot, robot.T, 20)[-1] is None) is since
