@@ -62,7 +62,11 @@ def begin(state: State) -> bool:
         return False
     if atlas.adrift is not None:
         forget_adrift(state)
+    elif state.absolute is not None and state.absolute.placed:
+        R = se2.rotation(state.T_map_odom[2])
+        atlas.askew = R @ state.absolute.P @ R.T
     state.suspicion.end()
+    state.suspicion.leap.forget()
     atlas.cut(state.next_key)
     atlas.seek = Seek()
     return True
@@ -360,6 +364,7 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
         tie.gap, tie.odd_since = None, None
     elif tie.placed or told(state):  # the map's frame is the survey's
         absolute.hang_on_anchor(state)
+        tie.P = tie.P + R @ atlas.askew @ R.T  # the map is no surer in the survey's frame than when it was laid
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start

@@ -9,7 +9,7 @@ import pytest
 
 from estimator import se2
 from estimator.absolute import Absolute, on_lights
-from estimator.adrift import local_map_lost
+from estimator.adrift import begin, local_map_lost, resettle
 from estimator.atlas import OWN, SETTLE
 from estimator.light import LightsSetup
 from estimator.pipeline import Settings, keyframe_poses, new_state, step
@@ -75,6 +75,25 @@ def test_light_holds_a_robot_that_lost_its_local_map_only_while_it_tells(
     state.fused.t_mono, state.light.filter.t_used = 100.0 + dark_s, 100.0
     local_map_lost(state)
     assert (state.atlas.adrift is None) is told
+
+
+def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_when_it_was_left() -> None:
+    """Else a map that light had laid 5 deg askew, and had known it, comes to be believed."""
+    state, _ = driven(laps=0.6)
+    state.next_key, yaw = 1000, 0.7
+    state.T_map_odom = np.array((1.0, 2.0, yaw))
+    state.absolute = tie = Absolute(placed=True, P=np.diag((0.04, 0.01, 0.02)))
+    assert begin(state)
+    R = se2.rotation(yaw)
+    np.testing.assert_allclose(state.atlas.askew, R @ tie.P @ R.T)
+    tie.P = np.eye(3)
+    assert begin(state), "carried on: of the place meanwhile nobody knew anything"
+    np.testing.assert_allclose(state.atlas.askew[2, 2], 0.02)
+    state.T_map_odom = np.array((0.0, 0.0, -0.4))
+    resettle(state, next(reversed(state.keyframes.values())), 1e-6 * np.eye(3))
+    R = se2.rotation(-0.4)
+    assert (np.linalg.eigvalsh(R @ tie.P @ R.T - state.atlas.askew) > 0.0).all()
+    assert tie.P[2, 2] < 0.03
 
 
 def test_what_is_adrift_leaves_the_older_map_as_it_is() -> None:

@@ -172,3 +172,5 @@ def test_a_lit_state_is_restored_with_its_gains(mapped: State) -> None:
     assert state.absolute is not None
     assert state.light.filter.gains[LAMPS[0].lamp_id][0][0] == 0.2
     assert state.absolute.since == state.next_key
+    np.testing.assert_array_equal(state.atlas.askew, image.P)
+    assert image.P.any()
