@@ -257,12 +257,15 @@ def test_an_order_places_the_map_and_light_takes_it_from_there() -> None:
 
 
 def test_without_wheels_light_and_laser_find_the_heading_and_a_gap_of_the_laser_moves_nothing() -> None:
-    run = room(1, 36.0)
-    log = play(lit_state(run), without(together(run.light(), scans(run)), Scan, 15.0, 28.0), run.truth)
-    assert log.rmse(10.0, 15.0)[0] < 0.25
-    assert log.rmse(10.0, 15.0)[1] < 0.15  # not the mirror image that reverses
-    assert log.rmse(29.0)[0] < 0.3
-    assert log.rmse(29.0)[1] < 0.15
+    runs = [room(seed, 36.0) for seed in (1, 2, 3)]
+    logs = [
+        play(lit_state(run), without(together(run.light(), scans(run)), Scan, 15.0, 28.0), run.truth) for run in runs
+    ]
+    for log in logs:
+        assert log.rmse(10.0, 15.0)[1] < 0.15  # not the mirror image that reverses
+        assert log.rmse(29.0)[0] < 0.3
+        assert log.rmse(29.0)[1] < 0.15
+    assert np.sqrt(np.mean([log.rmse(10.0, 15.0)[0] ** 2 for log in logs])) < 0.2
 
 
 def test_reset_at_a_pose_after_a_blind_drive_leaves_an_honest_covariance() -> None:
@@ -318,12 +321,12 @@ def test_what_light_says_of_a_keyframe_is_as_doubtful_across_a_row(driven: tuple
     assert told.accepted == {1, 2, 3, 4}
 
 
-def test_without_wheels_light_says_nothing_of_a_keyframes_heading(driven: tuple[State, Log]) -> None:
+def test_with_nobody_to_tell_the_way_light_says_nothing_of_a_keyframes_heading(driven: tuple[State, Log]) -> None:
     """It may have settled the wrong way round, and the submap's origin is found from here by that heading."""
     state = copy.deepcopy(driven[0])
     assert state.light is not None
     T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    state.fused.odometry = False
+    state.fused.odometry = state.light.filter.course.wheels = False
     state.light.result = lights_at(T + np.array((0.02, -0.01, np.pi)), frozenset((1, 4, 13, 16)), state)
     told = absolute.virtual(state)
     assert told is not None
