@@ -79,7 +79,8 @@ class Absolute:
     Attributes:
         placed: light has told where the map lies. proved: it was sure of that, or a person said so. broken: the laser
             has let go of the pose since, or begun its map anew.
-        P, X: see above, both 3x3, odom-aligned axes.
+        P, X: see above, both 3x3, odom-aligned axes. P_match: P at the latest match; what it has grown by since is of
+            the way, and not of the map that the match was with.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
         elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
@@ -99,6 +100,7 @@ class Absolute:
     broken: bool = False
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    P_match: Array = field(default_factory=lambda: np.zeros((3, 3)))
     gap: float | None = None
     odd_since: float | None = None
     elsewhere_since: float | None = None
@@ -146,6 +148,7 @@ def on_match(state: State, T_before: Array, P_before: Array, lacked: Array) -> N
     mended = np.empty((3, 3, 3))
     mend_tie(tie.P, tie.X, lacked, P_before, moving.P, mended)
     tie.P, tie.X, share = mended[0], mended[1], mended[2]
+    tie.P_match = tie.P
     made = moving.T_odom_base - T_before
     made[2] = se2.wrap(made[2])
     T_map_base = se2.compose(state.T_map_odom, T_before) + se2.rotation(state.T_map_odom[2]) @ (share @ made)
@@ -237,6 +240,7 @@ def straighten(state: State) -> None:
     tie = state.absolute
     assert tie is not None
     if not state.fused.odometry and tie.P[0, 0] + tie.P[1, 1] > BENT_M**2:
+        tie.P, tie.X = tie.P.copy(), tie.X.copy()
         for A in (tie.P, tie.X):
             A[2, :2] = A[:2, 2] = 0.0
 

@@ -62,14 +62,19 @@ def begin(state: State) -> bool:
         return False
     if atlas.adrift is not None:
         forget_adrift(state)
-    elif state.absolute is not None and state.absolute.placed:
-        R = se2.rotation(state.T_map_odom[2])
-        atlas.askew = R @ state.absolute.P @ R.T
+    else:
+        leave_map(state)
     state.suspicion.end()
     state.suspicion.leap.forget()
     atlas.cut(state.next_key)
     atlas.seek = Seek()
     return True
+
+
+def leave_map(state: State) -> None:
+    """Keep how surely the map lies in the survey, as of the latest match with it; zero where light has not told it."""
+    tie, R = state.absolute, se2.rotation(state.T_map_odom[2])
+    state.atlas.askew = np.zeros((3, 3)) if tie is None or not tie.placed else R @ tie.P_match @ R.T
 
 
 def local_map_lost(state: State) -> None:
@@ -105,6 +110,8 @@ def disown(state: State, first: int, since: int) -> None:
     Else the robot would find itself again in what it has laid there. ``first``: key of the first submap of that,
     ``since``: ID of its first keyframe.
     """
+    if state.atlas.adrift is None:
+        leave_map(state)
     state.atlas.adrift, state.atlas.since, state.atlas.stale = first, since, True
     livemap.forget(state, first)
 
@@ -364,7 +371,7 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
         tie.gap, tie.odd_since = None, None
     elif tie.placed or told(state):  # the map's frame is the survey's
         absolute.hang_on_anchor(state)
-        tie.P = tie.P + R @ atlas.askew @ R.T  # the map is no surer in the survey's frame than when it was laid
+        tie.P = tie.P + R @ atlas.askew @ R.T  # the map is no surer in the survey's frame than when it was left
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start

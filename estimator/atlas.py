@@ -150,8 +150,8 @@ class Atlas:
             that was found.
         kept: ID of this session's first keyframe, where the map is one that was restored; else 0. held: that map is
             only used; see `Settings.localise`. foreign: that map does not lie in the light survey's frame, and the
-            robot's place in it has not been found yet. askew: covariance (m, m, rad; map axes) of the place, and so of
-            that map, in the survey's frame when it was last known.
+            robot's place in it has not been found yet. askew: covariance (m, m, rad; map axes) of the place that light
+            had told, and so of that map, in the survey's frame at the last match before the place was lost.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 

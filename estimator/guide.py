@@ -30,6 +30,10 @@ def guide(state: State, match: MatchResult) -> None:
     turn_known = match.ok and bool(match.known_axes[2])
     if match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None:
         light.guided = now, T
-        if before is not None and not too_far(made := se2.between(before[1], T), now - before[0]):
-            light.move(Odometry(before[0], now, made))
+        if before is not None:
+            made = se2.between(before[1], T)
+            if too_far(made, now - before[0]):
+                turn_known = False  # it was carried
+            else:
+                light.move(Odometry(before[0], now, made))
     light.turn(now, float(T[2]) if turn_known else math.nan)

@@ -90,7 +90,7 @@ def predict(lights: Lights, record: Odometry | Imu) -> None:
 def move(lights: Lights, record: Odometry) -> None:
     """Move as the laser has, where no wheels tell it; not while the lamps in use are a row."""
     if not in_a_row(lights, record.t_end):
-        lights_motion.on_odometry(lights, record)
+        lights_motion.on_odometry(lights, record, matched=True)
 
 
 def turn(lights: Lights, t_mono: float, heading: float) -> None:
@@ -145,13 +145,13 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
     keep_gains(lights)
     zeros = np.zeros((ekf.SIZE, ekf.SIZE))
     lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old, zeros)]
-    lights.t_lost, lights.t_odd, lights.lost = math.inf, math.inf, False
+    lights.t_lost, lights.t_odd, lights.t_row, lights.lost = math.inf, math.inf, math.inf, False
 
 
 def reset(lights: Lights) -> None:
     """Forget the place and everything learned about lamps; those that described themselves stay known."""
     lights.tracks, lights.gains, lights.absent, lights.before = [], {}, {}, None
-    lights.t_lost, lights.t_odd, lights.lost, lights.result = math.inf, math.inf, False, None
+    lights.t_lost, lights.t_odd, lights.t_row, lights.lost, lights.result = math.inf, math.inf, math.inf, False, None
 
 
 def update(lights: Lights, epoch: LightEpoch) -> LightsResult:

@@ -9,6 +9,7 @@ import numpy as np
 from estimator import ekf
 from estimator.lamps import Lamp
 from estimator.lights_links import settled
+from estimator.lights_motion import scales
 from estimator.lights_state import Lights, Track
 from estimator.records import Array
 
@@ -53,7 +54,10 @@ def sensors_known(lights: Lights) -> tuple[Array, Array] | None:
     known = lights.tracks[0] if len(lights.tracks) == 1 and settled(lights.tracks[0]) else lights.before
     if known is None:
         return None
-    return known.x[SENSORS].copy(), np.diag(known.P)[SENSORS].copy()
+    mean, variance = known.x[SENSORS].copy(), np.diag(known.P)[SENSORS].copy()
+    if lights.course.matched:  # what it knows of scales is about matches, and would be taken for that of wheels
+        mean[:3], variance[:3] = 0.0, scales(lights)
+    return mean, variance
 
 
 def recall(lights: Lights, gains: Learned, sensors: tuple[Array, Array] | None, lamps: tuple[Lamp, ...]) -> None:

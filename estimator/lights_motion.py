@@ -29,12 +29,17 @@ STILL: Final = 0.08
 """m/s; without odometry a slower robot is taken to stand."""
 AT_MOST: Final = (5.0, 5.0, 10.0)
 """m/s, m/s and rad/s of any indoor robot. What is faster has moved so far, but not in the time that its stamps say."""
+TURNED_RAD, TURNED_RAD_S = 0.2, 2.0
+"""A heading that has turned by more between two scans was carried, or its match is wrong; as `suspicion.too_far`."""
 FASTEST: Final = 20.0
 """m or rad within one record. More is not a motion but a counter that has jumped."""
 
 
-def on_odometry(lights: Lights, record: Odometry) -> None:
-    """Move by what the wheels say, less what was carried ahead; turn by the gyro where that covers the stretch."""
+def on_odometry(lights: Lights, record: Odometry, matched: bool = False) -> None:
+    """Move by what the wheels say, less what was carried ahead; turn by the gyro where that covers the stretch.
+
+    ``matched``: matches say it, in the place of wheels.
+    """
     course, noise = lights.course, lights.settings.motion
     delta = np.array(record.delta, dtype=np.float64)
     dt = record.t_end - record.t_begin
@@ -43,6 +48,9 @@ def on_odometry(lights: Lights, record: Odometry) -> None:
         return
     if not course.wheels:
         settle(lights)
+    if course.matched is not matched:
+        course.matched = matched
+        begin_scales(lights)
     by_gyro = dt > 0.0 and abs(course.gyro_span - dt) < 0.3 * dt
     if by_gyro:
         delta = np.array((delta[0], delta[1], course.gyro_turned * dt / course.gyro_span))
@@ -104,7 +112,8 @@ def on_heading(lights: Lights, t_mono: float, heading: float) -> None:
     course.t_heading, course.heading = (t_mono, heading) if told else (-math.inf, 0.0)
     done = course.turned_on
     course.turned_on = float(course.velocity[2]) * min(course.t_mono - t_mono, CARRY_S)
-    if not (told and 0.0 < dt < CARRY_S and abs(turned) < AT_MOST[2] * dt) or course.wheels or gyro(lights):
+    possible = told and 0.0 < dt < CARRY_S and abs(turned) < TURNED_RAD + TURNED_RAD_S * dt
+    if not possible or course.wheels or gyro(lights):
         return
     course.velocity[2] = turned / dt
     made = np.array((0.0, 0.0, turned - (done - course.turned_on)))
@@ -219,6 +228,21 @@ def settle(lights: Lights) -> None:
     lights.course.wheels = True
     for track in lights.tracks:
         set_speed(track, np.zeros(3), (0.0, 0.0, 0.0))
+
+
+def begin_scales(lights: Lights) -> None:
+    """Another source tells the way: of its scales, and how it curves, nothing is known."""
+    prior = scales(lights)
+    for track in lights.tracks:
+        for j, variance in enumerate(prior.tolist(), start=ekf.SCALE):
+            ekf.cut(track.P, track.n, j)
+            track.x[j], track.P[j, j] = 0.0, variance
+
+
+def scales(lights: Lights) -> Array:
+    """Variances of the scales of way and turn, and of the curve, of wheels that nobody has compared with lamps."""
+    noise = lights.settings.motion
+    return np.array((noise.scale, noise.turn_scale, noise.curve)) ** 2
 
 
 def release(lights: Lights) -> None:

@@ -179,8 +179,8 @@ class Course:
 
     Attributes:
         t_mono: instant of the tracks' poses. t_odometry: end of the latest odometry. t_gyro: of the latest gyro.
-        wheels: whether odometry is alive. velocity: (v_x, v_y, yaw rate) by odometry and gyro. ahead: motion already
-            applied beyond the last odometry.
+        wheels: whether odometry is alive. matched: it was matches that told it last, not wheels. velocity: (v_x, v_y,
+            yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
         gyro_turned, gyro_span: added up since the last odometry.
         t_heading, heading: latest heading by the laser, -inf where it tells none. turned_on: rad turned beyond it.
         T, trail: dead-reckoned pose since the start, and its last second as (instant, pose).
@@ -191,6 +191,7 @@ class Course:
     t_odometry: float = -math.inf
     t_gyro: float = -math.inf
     wheels: bool = False
+    matched: bool = False
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     ahead: Array = field(default_factory=se2.identity)
     gyro_turned: float = 0.0

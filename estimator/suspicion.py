@@ -198,9 +198,7 @@ def answered(state: State, asked: Question, payload: object) -> None:
     doubt.question = None
     here = payload.guesses[0]
     least = max(relocate.LEAST, here.share - BEHIND)
-    if (
-        asked.leapt
-    ):  # then any place will do that is not ruled out, if its own is; and who does not match, as in a corridor
+    if asked.leapt:  # any place will do that is not ruled out, if its own is; and in a corridor nothing holds a match
         least = 0.0 if here.verdict is Verdict.NO else here.share - BEHIND
     alone = all(fit.share < least for fit, _ in payload.fresh)
     holds = asked.holds or not asked.jumped or here.verdict is Verdict.HOLDS
@@ -211,7 +209,7 @@ def answered(state: State, asked: Question, payload: object) -> None:
     elif asked.jumped or asked.again:
         carried_off(state)
     else:
-        doubt.fitted, doubt.odd, doubt.again, doubt.leapt = ROW, True, True, asked.leapt
+        doubt.fitted, doubt.odd, doubt.again, doubt.leapt = ROW, True, True, doubt.leapt or asked.leapt
 
 
 def carried_off(state: State) -> None:

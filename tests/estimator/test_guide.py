@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from estimator import absolute, guide, lights, se2
+from estimator import absolute, ekf, guide, lights, se2
 from estimator.light import Light
+from estimator.lights_memory import sensors_known
+from estimator.lights_motion import scales
 from estimator.matching import no_match
 from estimator.records import Array, Odometry, Record
 from estimator.result import Fix, MatchResult, Reason
@@ -122,7 +124,7 @@ def test_the_way_is_told_where_every_axis_holds_and_the_turn_where_that_one_does
         (no_match(np.zeros(3), 300, Reason.NO_MAP), 0.6, 0.30, 2, True),
         (scanned((1, 1, 0)), 0.7, 0.35, 2, True),  # a round room
         (scanned(), 0.8, 0.40, 2, False),
-        (scanned(), 0.9, 2.40, 2, False),  # nothing indoors drives so fast: it was carried
+        (scanned(), 0.9, 2.40, 2, True),  # nothing indoors drives so fast: it was carried
         (scanned(), 1.0, 2.45, 3, False),
     ]
     for match, t, x, moves, unknown in steps:
@@ -177,3 +179,27 @@ def test_a_place_that_is_hardly_known_without_wheels_says_nothing_of_the_heading
         absolute.straighten(state)
         assert bool(tie.P[0, 2]) is kept
         assert tie.P[2, 2] == spread * 0.02
+
+
+def test_wheels_that_come_later_are_not_believed_as_matches_were() -> None:
+    """Of their scale nothing is known; nor is it kept for the next run what lamps said of that of matches."""
+    filter_, _, _ = led(True, True, 20.0)
+    track = filter_.tracks[0]
+    prior = scales(filter_)
+    assert track.P[ekf.SCALE, ekf.SCALE] < 0.5 * prior[0]
+    kept = sensors_known(filter_)
+    assert kept is not None
+    assert kept[0][:3].tolist() == [0.0, 0.0, 0.0]
+    assert kept[1][:3] == pytest.approx(prior)
+    now = filter_.course.t_mono
+    lights.predict(filter_, Odometry(now, now + 0.1, np.array((0.04, 0.0, 0.016))))
+    assert track.x[ekf.SCALE : ekf.CURVE + 1].tolist() == [0.0, 0.0, 0.0]
+    assert np.diag(track.P)[ekf.SCALE : ekf.CURVE + 1] == pytest.approx(prior)
+
+
+def test_reset_and_a_given_place_forget_that_lamps_were_a_row() -> None:
+    filter_ = lights.new_lights(SURVEY)
+    for forget in (lights.reset, lambda one: lights.place(one, np.zeros(3), np.eye(3))):
+        filter_.t_row = 0.0
+        forget(filter_)
+        assert filter_.t_row == math.inf
