@@ -26,7 +26,7 @@ from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
-from estimator.row import doubt
+from estimator.row import doubt, straighten
 from estimator.state import State
 from estimator.trail import KEPT_S
 
@@ -56,9 +56,6 @@ SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
-BENT_M = 0.7
-"""A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
-is off by says nothing of that."""
 ANY_HEADING = math.pi**2 / 3.0
 """Variance of a heading that may be any, rad^2."""
 BLIND_S, BLIND_PERIODS, SLOWEST_S = 0.5, 1.5, 3.0
@@ -221,7 +218,8 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     tie.fresh = max(0.0, tie.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
-    straighten(state)
+    if not state.fused.odometry:
+        tie.P, tie.X = straighten(tie.P, tie.X)
     before = R @ tie.P @ R.T
     L_before = invert3(before)
     after = _symmetric(invert3(L_before + positive_part(G)))
@@ -233,16 +231,6 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
         if tie.since == 0 and state.atlas.kept:  # a stored map has come along for the last time
             rehang(state, 0)
         tie.since = state.next_key
-
-
-def straighten(state: State) -> None:
-    """Without wheels, let a place that is hardly known say nothing of the heading, nor the heading of the place."""
-    tie = state.absolute
-    assert tie is not None
-    if not state.fused.odometry and tie.P[0, 0] + tie.P[1, 1] > BENT_M**2:
-        tie.P, tie.X = tie.P.copy(), tie.X.copy()
-        for A in (tie.P, tie.X):
-            A[2, :2] = A[:2, 2] = 0.0
 
 
 def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:

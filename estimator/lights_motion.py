@@ -21,7 +21,7 @@ CARRY_S: Final = 0.5
 TRAIL_S: Final = 1.0
 GYRO_FRESH_S: Final = 0.1
 HEADING_FRESH_S: Final = 0.3
-"""Three scans of the slowest lidar may be missed."""
+"""Two scans of a lidar at 10 Hz may be missed."""
 UNSEEN: Final = 0.5
 """m/s and rad/s of a robot that nobody watches."""
 REVERSE_M_S: Final = 0.1

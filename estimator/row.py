@@ -24,6 +24,10 @@ SLIGHT, LASTING_S = 0.1, 1.0
 """A row by less than the first is none; nor is one that has not lasted so many seconds: other lamps are hidden for a
 moment, and come to be in use again."""
 
+BENT_M = 0.7
+"""A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
+is off by says nothing of that."""
+
 KNOWN = 4096
 """So many sets of lamps are remembered."""
 
@@ -75,6 +79,21 @@ def loosen(narrow: float, angle: float, P: Array) -> None:
         P[1, 0] = P[0, 1]
         P[1, 1] += lacks * ny * ny
     P[2, 2] += max(0.0, narrow * SIDE_RAD**2 - P[2, 2])
+
+
+def straighten(P: Array, X: Array) -> tuple[Array, Array]:
+    """Of a place that is hardly known, without wheels: it says nothing of the heading, nor the heading of the place.
+
+    Args:
+        P: covariance (3, 3) of the place; not changed.
+        X: its covariance (3, 3) with another error; not changed.
+    """
+    if P[0, 0] + P[1, 1] <= BENT_M**2:
+        return P, X
+    P, X = P.copy(), X.copy()
+    for A in (P, X):
+        A[2, :2] = A[:2, 2] = 0.0
+    return P, X
 
 
 def spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
