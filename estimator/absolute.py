@@ -76,8 +76,8 @@ class Absolute:
     Attributes:
         placed: light has told where the map lies. proved: it was sure of that, or a person said so. broken: the laser
             has let go of the pose since, or begun its map anew.
-        P, X: see above, both 3x3, odom-aligned axes. P_match: P at the latest match; what it has grown by since is of
-            the way, and not of the map that the match was with.
+        P, X: see above, both 3x3, odom-aligned axes. matched: T_odom_base and P at the latest match; what P has
+            grown by since is of the way, and not of the map that the match was with.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
         elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
@@ -97,7 +97,7 @@ class Absolute:
     broken: bool = False
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    P_match: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    matched: tuple[Array, Array] = field(default_factory=lambda: (se2.identity(), np.zeros((3, 3))))
     gap: float | None = None
     odd_since: float | None = None
     elsewhere_since: float | None = None
@@ -145,7 +145,7 @@ def on_match(state: State, T_before: Array, P_before: Array, lacked: Array) -> N
     mended = np.empty((3, 3, 3))
     mend_tie(tie.P, tie.X, lacked, P_before, moving.P, mended)
     tie.P, tie.X, share = mended[0], mended[1], mended[2]
-    tie.P_match = tie.P
+    tie.matched = moving.T_odom_base, tie.P
     made = moving.T_odom_base - T_before
     made[2] = se2.wrap(made[2])
     T_map_base = se2.compose(state.T_map_odom, T_before) + se2.rotation(state.T_map_odom[2]) @ (share @ made)
@@ -218,7 +218,7 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     tie.fresh = max(0.0, tie.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
-    if not state.fused.odometry:
+    if not on_wheels(state):
         tie.P, tie.X = straighten(tie.P, tie.X)
     before = R @ tie.P @ R.T
     L_before = invert3(before)
@@ -328,8 +328,13 @@ def doubted_covariance(tie: Absolute, lights: LightsResult, wheels: bool = True)
 
 
 def guided(state: State) -> bool:
-    """Whether `lights` knows how the robot moves, by wheels or by the laser."""
-    return state.fused.odometry or (state.light is not None and state.light.filter.course.wheels)
+    """Whether `lights` hears how the robot moves, by wheels or by the laser."""
+    return state.light is not None and state.light.filter.course.wheels
+
+
+def on_wheels(state: State) -> bool:
+    """Whether it is wheels that tell it."""
+    return guided(state) and state.light is not None and not state.light.filter.course.matched
 
 
 def holds_heading(state: State) -> bool:

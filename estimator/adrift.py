@@ -20,7 +20,7 @@ from estimator.closing import join
 from estimator.globalsearch import Around
 from estimator.hypotheses import WATCH_M, Hypothesis, Seek, Watch
 from estimator.keyframe import Keyframe
-from estimator.linear3 import invert3
+from estimator.linear3 import invert3, swing
 from estimator.loop import Found
 from estimator.mapframe import move_map, rehang, shift_map, unlist
 from estimator.records import Array
@@ -73,8 +73,12 @@ def begin(state: State) -> bool:
 
 def leave_map(state: State) -> None:
     """Keep how surely the map lies in the survey, as of the latest match with it; zero where light has not told it."""
-    tie, R = state.absolute, se2.rotation(state.T_map_odom[2])
-    state.atlas.askew = np.zeros((3, 3)) if tie is None or not tie.placed else R @ tie.P_match @ R.T
+    tie, R, atlas = state.absolute, se2.rotation(state.T_map_odom[2]), state.atlas
+    if tie is None or not tie.placed:
+        atlas.askew = np.zeros((3, 3))
+        return
+    T_odom_base, P = tie.matched
+    atlas.askew, atlas.T_askew = R @ P @ R.T, se2.compose(state.T_map_odom, T_odom_base)
 
 
 def local_map_lost(state: State) -> None:
@@ -371,7 +375,10 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
         tie.gap, tie.odd_since = None, None
     elif tie.placed or told(state):  # the map's frame is the survey's
         absolute.hang_on_anchor(state)
-        tie.P = tie.P + R @ atlas.askew @ R.T  # the map is no surer in the survey's frame than when it was left
+        off = se2.compose(state.T_map_odom, state.fused.T_odom_base) - atlas.T_askew
+        askew = atlas.askew.copy()
+        swing(float(off[0]), float(off[1]), askew)
+        tie.P = tie.P + R @ askew @ R.T  # the map is no surer in the survey's frame than when it was left
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start

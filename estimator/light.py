@@ -63,9 +63,9 @@ class Light:
         """Where no wheels tell how the robot moves: move the `lights` filter by what matches say of it."""
         lights.move(self.filter, record)
 
-    def turn(self, t_mono: float, heading: float) -> None:
-        """Where neither wheels nor a gyro tell how it turns: by the heading (odom frame) of a match, nan: of none."""
-        lights.turn(self.filter, t_mono, heading)
+    def left_alone(self) -> None:
+        """Matches do not tell that any more."""
+        lights.left_alone(self.filter)
 
     def take(self, record: SampleBlock | LightEpoch) -> LightsResult:
         """Decode a block, if it is one, and take the epoch into the filter."""

@@ -38,7 +38,6 @@ __all__ = [
     "predict",
     "reset",
     "result",
-    "turn",
     "update",
 ]
 
@@ -89,19 +88,16 @@ def predict(lights: Lights, record: Odometry | Imu) -> None:
 
 def move(lights: Lights, record: Odometry) -> None:
     """Move as the laser has, where no wheels tell it; not while the lamps in use are a row."""
-    if not in_a_row(lights, record.t_end):
+    if in_a_row(lights, record.t_end):
+        left_alone(lights)
+    else:
         lights_motion.on_odometry(lights, record, matched=True)
 
 
-def turn(lights: Lights, t_mono: float, heading: float) -> None:
-    """Turn as the laser does, where neither wheels nor a gyro tell it; not while the lamps in use are a row.
-
-    Args:
-        lights: all of the filter.
-        t_mono: instant of the heading, not before the latest.
-        heading: rad, in a frame that never jumps; nan where the laser does not know it.
-    """
-    lights_motion.on_heading(lights, t_mono, math.nan if in_a_row(lights, t_mono) else heading)
+def left_alone(lights: Lights) -> None:
+    """The laser does not tell any more how the robot moves: from now on its speeds are guessed at."""
+    if lights.course.wheels and lights.course.matched:
+        lights_motion.release(lights)
 
 
 def in_a_row(lights: Lights, t_mono: float) -> bool:

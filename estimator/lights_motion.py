@@ -20,8 +20,6 @@ CARRY_S: Final = 0.5
 """Odometry older than that is not missed for a moment; it has ended, and constant velocity takes over."""
 TRAIL_S: Final = 1.0
 GYRO_FRESH_S: Final = 0.1
-HEADING_FRESH_S: Final = 0.3
-"""Two scans of a lidar at 10 Hz may be missed."""
 UNSEEN: Final = 0.5
 """m/s and rad/s of a robot that nobody watches."""
 REVERSE_M_S: Final = 0.1
@@ -29,8 +27,6 @@ STILL: Final = 0.08
 """m/s; without odometry a slower robot is taken to stand."""
 AT_MOST: Final = (5.0, 5.0, 10.0)
 """m/s, m/s and rad/s of any indoor robot. What is faster has moved so far, but not in the time that its stamps say."""
-TURNED_RAD, TURNED_RAD_S = 0.2, 2.0
-"""A heading that has turned by more between two scans was carried, or its match is wrong; as `suspicion.too_far`."""
 FASTEST: Final = 20.0
 """m or rad within one record. More is not a motion but a counter that has jumped."""
 
@@ -38,6 +34,7 @@ FASTEST: Final = 20.0
 def on_odometry(lights: Lights, record: Odometry, matched: bool = False) -> None:
     """Move by what the wheels say, less what was carried ahead; turn by the gyro where that covers the stretch.
 
+    What comes late, when light has already carried the pose beyond its stamp, is carried on to there again.
     ``matched``: matches say it, in the place of wheels.
     """
     course, noise = lights.course, lights.settings.motion
@@ -55,7 +52,10 @@ def on_odometry(lights: Lights, record: Odometry, matched: bool = False) -> None
     if by_gyro:
         delta = np.array((delta[0], delta[1], course.gyro_turned * dt / course.gyro_span))
     follows = abs(record.t_begin - course.t_odometry) < 1e-6 and dt < CARRY_S
-    made = se2.between(course.ahead, delta) if follows else rest(delta, record, course.t_mono)
+    velocity = se2.log(delta) / dt if 1e-3 < dt < CARRY_S else course.velocity
+    course.velocity = velocity if (np.abs(velocity) <= AT_MOST).all() else course.velocity
+    beyond = se2.exp(course.velocity * min(max(course.t_mono - record.t_end, 0.0), CARRY_S))
+    made = se2.between(course.ahead, se2.compose(delta, beyond)) if follows else rest(delta, record, course.t_mono)
     ahead, _, turned = made.tolist()
     way, turn = abs(ahead), 0.0 if by_gyro else abs(turned)
     idle = min(max(dt, 0.0), CARRY_S)
@@ -66,15 +66,10 @@ def on_odometry(lights: Lights, record: Odometry, matched: bool = False) -> None
         noise.turn**2 * turn + (0.0 if by_gyro else noise.wander**2 * way) + noise.idle_rad**2 * idle,
     )
     blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else turned, 0.0 if by_gyro else ahead, 0.0, 1.0)
-    if 1e-3 < dt < CARRY_S:
-        velocity = se2.log(delta) / dt
-        vx, vy, rate = velocity.tolist()
-        possible = abs(vx) <= AT_MOST[0] and abs(vy) <= AT_MOST[1] and abs(rate) <= AT_MOST[2]
-        course.velocity = velocity if possible else course.velocity
     course.gyro_turned = course.gyro_span = 0.0
     course.t_odometry = record.t_end
     move_all(lights, made, np.array(blame), np.array(q), max(course.t_mono, record.t_end))
-    course.ahead = se2.identity()
+    course.ahead = beyond if follows else se2.identity()
 
 
 def rest(delta: Array, record: Odometry, t_mono: float) -> Array:
@@ -100,32 +95,6 @@ def on_imu(lights: Lights, record: Imu) -> None:
     glide(lights, record.t_end, float(record.dyaw) * share, noise.gyro)
 
 
-def on_heading(lights: Lights, t_mono: float, heading: float) -> None:
-    """Turn as the laser has turned since it last told its heading, where neither wheels nor a gyro tell it.
-
-    The turn is carried ahead at its last rate, and what that was wrong by is put right with the next heading.
-    """
-    course = lights.course
-    carry_to(lights, t_mono)
-    dt, turned = t_mono - course.t_heading, se2.wrap(heading - course.heading)
-    told = math.isfinite(heading)
-    course.t_heading, course.heading = (t_mono, heading) if told else (-math.inf, 0.0)
-    done = course.turned_on
-    course.turned_on = float(course.velocity[2]) * min(course.t_mono - t_mono, CARRY_S)
-    possible = told and 0.0 < dt < CARRY_S and abs(turned) < TURNED_RAD + TURNED_RAD_S * dt
-    if not possible or course.wheels or gyro(lights):
-        return
-    course.velocity[2] = turned / dt
-    made = np.array((0.0, 0.0, turned - (done - course.turned_on)))
-    move_all(lights, made, np.zeros(7), np.zeros(3), course.t_mono)
-
-
-def turns_with_laser(lights: Lights) -> bool:
-    """Whether the laser tells how the robot turns, and nothing else does."""
-    course = lights.course
-    return not (course.wheels or gyro(lights)) and course.t_mono - course.t_heading < HEADING_FRESH_S
-
-
 def carry_to(lights: Lights, t_mono: float) -> None:
     """Bring the poses to an instant at the velocity; an instant in the past changes nothing."""
     course = lights.course
@@ -139,10 +108,6 @@ def carry_to(lights: Lights, t_mono: float) -> None:
     if gyro(lights) or course.wheels:
         spread = lights.settings.motion.gyro if gyro(lights) else lights.settings.motion.angular
         glide(lights, t_mono, float(course.velocity[2]) * min(t_mono - course.t_mono, CARRY_S), spread)
-    elif turns_with_laser(lights):
-        turn = float(course.velocity[2]) * min(t_mono - course.t_mono, CARRY_S)
-        course.turned_on += turn
-        glide(lights, t_mono, turn, lights.settings.motion.matched)
     else:
         glide(lights, t_mono, None, lights.settings.motion.angular)
 

@@ -47,7 +47,7 @@ class MotionErrors:
         skid: m per root radian turned: what a robot turns about is known to centimetres only.
         idle_m, idle_rad: per root second.
         scale, turn_scale: share of the way and of the turn that wheels may be off for good. curve: rad per metre.
-        gyro: rad per root second. gyro_bias: rad/s. matched: rad per root second, where the laser tells the turn.
+        gyro: rad per root second. gyro_bias: rad/s.
         acceleration, angular: m/s and rad/s per root second, without odometry. sideways: speed across, m/s.
         speed: what a robot without odometry may go at, m/s.
     """
@@ -64,7 +64,6 @@ class MotionErrors:
     curve: float = 0.05
     gyro: float = 0.001
     gyro_bias: float = 0.02
-    matched: float = 0.002
     acceleration: float = 0.4
     angular: float = 0.3
     sideways: float = 0.03
@@ -182,7 +181,6 @@ class Course:
         wheels: whether odometry is alive. matched: it was matches that told it last, not wheels. velocity: (v_x, v_y,
             yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
         gyro_turned, gyro_span: added up since the last odometry.
-        t_heading, heading: latest heading by the laser, -inf where it tells none. turned_on: rad turned beyond it.
         T, trail: dead-reckoned pose since the start, and its last second as (instant, pose).
         way: metres driven. turned: radians turned.
     """
@@ -196,9 +194,6 @@ class Course:
     ahead: Array = field(default_factory=se2.identity)
     gyro_turned: float = 0.0
     gyro_span: float = 0.0
-    t_heading: float = -math.inf
-    heading: float = 0.0
-    turned_on: float = 0.0
     T: Array = field(default_factory=se2.identity)
     trail: list[tuple[float, Array]] = field(default_factory=list)
     way: float = 0.0

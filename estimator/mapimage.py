@@ -217,7 +217,7 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
     atlas.held = state.settings.localise
     if state.absolute is not None:
         state.absolute.since = state.next_key
-        atlas.askew = image.P.copy()
+        atlas.askew, atlas.T_askew = image.P.copy(), image.T_map_base.copy()
         atlas.foreign = not (image.identity.surveyed or any(piece.light is not None for piece in image.submaps))
     return state
 

@@ -11,7 +11,9 @@ separation, Blanch et al., NAVIGATION 2010; docs/integrity.md has the derivation
   what that one may be wrong by.
 
 Where there is one witness only nothing can be separated, and the first bound is widened instead. Laser and light share
-the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself.
+the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself. Without wheels they share
+the laser's way (`guide`): a laser that slides leads light along until lamps have corrected it, for which light is
+believed less then (`absolute.UNGUIDED`), and a heading by it is nobody's bound.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
-from estimator.absolute import doubted_covariance, pose_at
+from estimator.absolute import doubted_covariance, on_wheels, pose_at
 from estimator.records import Array
 from estimator.result import Fix, Protection
 from estimator.state import State
@@ -93,11 +95,12 @@ def _without_laser(state: State) -> tuple[float, float]:
     tie, light = state.absolute, state.light
     assert tie is not None
     assert light is not None
-    said, (covered, _) = light.result, doubted_covariance(tie, light.result, state.fused.odometry)
+    wheels = on_wheels(state)
+    said, (covered, _) = light.result, doubted_covariance(tie, light.result, wheels)
     here = se2.compose(state.T_map_odom, pose_at(state, max(said.t_mono, said.t_pose)))
     off = said.T_map_base - here
     far, turned = spread(covered, K_FAULT)
-    heading = 0.0 if not state.fused.odometry else abs(se2.wrap(float(off[2]))) + turned
+    heading = 0.0 if not wheels else abs(se2.wrap(float(off[2]))) + turned
     return math.hypot(off[0], off[1]) + far, heading
 
 

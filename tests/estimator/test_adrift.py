@@ -82,11 +82,14 @@ def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_whe
     state, _ = driven(laps=0.6)
     state.next_key, yaw = 1000, 0.7
     state.T_map_odom = np.array((1.0, 2.0, yaw))
-    state.absolute = tie = Absolute(placed=True, P=np.eye(3), P_match=np.diag((0.04, 0.01, 0.02)))
+    at = state.fused.T_odom_base - np.array((8.0, 0.0, 0.0))
+    state.absolute = tie = Absolute(placed=True, P=np.eye(3), matched=(at, np.diag((0.04, 0.01, 0.02))))
     assert begin(state)
     R = se2.rotation(yaw)
-    np.testing.assert_allclose(state.atlas.askew, R @ tie.P_match @ R.T, err_msg="a blind way since is not the map's")
-    tie.P_match = np.eye(3)
+    np.testing.assert_allclose(
+        state.atlas.askew, R @ tie.matched[1] @ R.T, err_msg="a blind way since is not the map's"
+    )
+    tie.matched = at, np.eye(3)
     assert begin(state), "carried on: of the place meanwhile nobody knew anything"
     np.testing.assert_allclose(state.atlas.askew[2, 2], 0.02)
     state.T_map_odom = np.array((0.0, 0.0, -0.4))
@@ -94,6 +97,9 @@ def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_whe
     R = se2.rotation(-0.4)
     assert (np.linalg.eigvalsh(R @ tie.P @ R.T - state.atlas.askew) > 0.0).all()
     assert tie.P[2, 2] < 0.03
+    assert np.trace(tie.P[:2, :2]) == pytest.approx(0.05 + 8.0**2 * 0.02, abs=0.01), (
+        "a map that is askew swings by that"
+    )
 
 
 def test_what_is_adrift_leaves_the_older_map_as_it_is() -> None:
