@@ -16,9 +16,10 @@ settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")  # how long an example takes there says nothing; `tests.fuzz` judges stalls
 
 ROOT = Path(__file__).parents[1]
-UNTRACED = ("faults", "fuzz", "hil", "logs", "tools")
+UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")
 """Folders of storms and drives: they go over the same lines a million times, for which tracing takes two to five times
-as long, and reach hardly one that the other tests do not (`tools.floors` tells)."""
+as long, and reach hardly one that the other tests do not (`tools.floors` tells). The estimator's are traced in the row
+without the compiler."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

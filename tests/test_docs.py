@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -78,14 +79,42 @@ MADE = {"experiments": "tools.experiments", "bench": "tools.bench", "demo": "too
         "fuzz": "tests.fuzz"}  # fmt: skip
 
 
-@pytest.mark.parametrize("module", sorted(programs()))
-def test_programs_of_the_documents_know_the_options_named(module: str) -> None:
-    """Each is started for its help, with what is installed for the tests."""
-    done = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)
+HELP = """
+import contextlib, io, json, runpy, sys
+said = {}
+for module in sys.argv[1:]:
+    out, code = io.StringIO(), 0
+    sys.argv = [module, "--help"]
+    with contextlib.redirect_stdout(out):
+        try:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            code = end.code or 0
+        except Exception as error:
+            code = repr(error)
+    said[module] = code, out.getvalue()
+print(json.dumps(said))
+"""
+
+
+@pytest.fixture(scope="module")
+def helps() -> dict[str, tuple[object, str]]:
+    """How each program ends that is asked for its help, and what it says; one process, which loads numba once."""
+    command = [sys.executable, "-c", HELP, *sorted(programs())]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    said: dict[str, tuple[object, str]] = json.loads(done.stdout)
+    return said
+
+
+@pytest.mark.parametrize("module", sorted(programs()))
+def test_programs_of_the_documents_know_the_options_named(module: str, helps: dict[str, tuple[object, str]]) -> None:
+    """Each is started for its help, with what is installed for the tests."""
+    code, said = helps[module]
+    assert code == 0, said
     for page, options in programs()[module]:
         for option in options:
-            assert re.search(rf"{option}\b", done.stdout), f"{page}: {module} {option}"
+            assert re.search(rf"{option}\b", said), f"{page}: {module} {option}"
 
 
 def test_no_picture_is_kept_beside_the_one_that_a_command_keeps() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.rotation import turn
+from tests.rotation import share
 
 ROOT = Path(__file__).parents[2]
 WAYS: dict[str, dict[str, str]] = {
@@ -67,8 +67,8 @@ def test_an_index_that_is_out_of_bounds_is_noticed() -> None:
 
 
 def marked(way: str) -> object:
-    """One way with each commit: these two take four minutes."""
-    return pytest.param(way, marks=[] if OTHERS.index(way) == turn(len(OTHERS)) else [pytest.mark.slow])
+    """One way with each commit: the two of them take minutes."""
+    return pytest.param(way, marks=share(OTHERS.index(way), len(OTHERS)))
 
 
 @pytest.mark.parametrize("way", [marked(way) for way in OTHERS])
@@ -78,7 +78,7 @@ def test_the_estimators_tests_pass(way: str) -> None:
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("way", OTHERS)
+@pytest.mark.parametrize("way", [marked(way) for way in OTHERS])
 def test_the_poses_are_those_of_the_usual_way(way: str) -> None:
     usual, other = made_by("as usual"), made_by(way)
     assert usual["directory"] != other["directory"]

@@ -43,6 +43,7 @@ def lit(light_at: tuple[float, float, float] = (0.0, 0.0, 0.0), wheels: bool = T
     state.fused.odometry = wheels
     state.local = cast(Any, SimpleNamespace())
     assert state.light is not None
+    state.light.filter.course.wheels = wheels
     state.light.result = lights(np.array(light_at), P)
     return state
 

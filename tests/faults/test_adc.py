@@ -20,6 +20,7 @@ from hal.fake.adc_faults import ADC, ERRORS, number_of
 from hal.lidar import Link
 from hal.photodiode.trouble import POLICIES
 from tests.hal.photodiode.bench import Bench, falsehoods, on_fake
+from tests.rotation import share
 
 AT_ONCE = 0.2
 SILENCE = 5 * 0.05 + 0.02
@@ -186,10 +187,15 @@ LIGHT = [
     Case("what = 'saturated'", DeviceFault, "no light at all, or so much", blocks=150, noticed=PERSISTS),
 ]
 
+
+def name(case: Case) -> str:
+    return case.name
+
+
 CASES = CHIP + WRONG + BUS + TRANSIENT + LASTING + TIME + BYTES + LIGHT
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=share(k, 2)) for k, case in enumerate(CASES)], ids=name)
 def test_fault(case: Case) -> None:
     async def body(bench: Bench) -> None:
         driver = bench.driver()

@@ -16,6 +16,7 @@ from hal.fake.lidar_faults import LIDAR
 from hal.fake.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.lidar import VALID, Link
 from tests.faults.bench import Run, Story, falsehoods, play
+from tests.rotation import share
 
 AT_ONCE = 0.08
 """Seconds: two revolutions and the time on the line."""
@@ -159,6 +160,10 @@ WORDS = [
 CASES = BYTES + STAMPS + LINE + COMMANDS + STATES + WORDS
 
 
+def name(case: Case) -> str:
+    return case.name
+
+
 def run_of(case: Case) -> Run:
     return Run(
         case.model,
@@ -171,7 +176,7 @@ def run_of(case: Case) -> Run:
     )
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=share(k, 2)) for k, case in enumerate(CASES)], ids=name)
 def test_driver_survives(case: Case) -> None:
     story = play(run_of(case))
     assert falsehoods(story) == []

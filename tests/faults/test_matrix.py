@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 
 from tests.faults.matrix import DEVICES, TIMES, WORDS, Cell, cells, objections, play
-from tests.rotation import turn
+from tests.rotation import share
 
 CELLS = cells()
-TURN = turn(3)
 
 
 def third(cell: Cell) -> int:
@@ -25,7 +24,7 @@ def third(cell: Cell) -> int:
 
 def marked(cell: Cell) -> object:
     """A cell with the row of tests that it runs in; a known defect has to show."""
-    marks = [pytest.mark.system] if third(cell) == TURN else [pytest.mark.system, pytest.mark.slow]
+    marks = [pytest.mark.system, *share(third(cell), 3)]
     if cell.defect:
         marks.append(pytest.mark.xfail(reason=cell.defect, strict=True, raises=AssertionError))
     return pytest.param(cell, marks=marks, id=cell.name.replace(" ", "-"))

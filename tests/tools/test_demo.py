@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from daemon.publish.snapshot import State
+from tests.rotation import share
 from tools.demo import free_port, line, links, write_config
 from tools.demo_acts import ROBOT, Act, OrderRefused, Stage, complaint, programme
 from tools.demo_score import Score, Track, in_map, summary, verdict
@@ -299,7 +300,9 @@ def test_half_a_minute(tmp_path: Path) -> None:
 
 @pytest.mark.system
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(one, marks=share(k, 2)) for k, one in enumerate((signal.SIGINT, signal.SIGTERM))]
+)
 def test_interrupted_it_shows_what_it_has_and_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
     demo = start(tmp_path, "--forever")
     assert demo.stdout is not None

@@ -13,6 +13,7 @@ from hal.fake.models import MODELS, UST_10LX, UTM_30LX, LidarModel
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import VALID, Link, RawScan
 from tests.hal.hokuyo.bench import Bench, on_fake
+from tests.rotation import share
 
 LASTS_S = 2.5
 
@@ -128,11 +129,13 @@ def judge(bench: Bench, scan: RawScan, late: float) -> None:
 @pytest.mark.parametrize(
     ("case", "model"),
     [
-        pytest.param(case, model, marks=pytest.mark.slow)
-        if case.order == "piece = 1" and model is not case.models[0]
-        else (case, model)
+        pytest.param(
+            case,
+            model,
+            marks=pytest.mark.slow if case.order == "piece = 1" and number else share(number, len(case.models)),
+        )
         for case in CASES
-        for model in case.models
+        for number, model in enumerate(case.models)
     ],
     ids=[
         f"{case.word} {case.order} {model.modl.partition('(')[0].partition('[')[0]}".replace("\n", " ")
