@@ -272,7 +272,7 @@ def estimating(module: str, name: str, what: str = "warm") -> Body:
         from daemon import warmup
 
         try:
-            warmup.load_aloud(say, what, lambda: (warmup.load(), import_module(module)))
+            warmup.load_aloud(say, what, warmup.load, module)
         except warmup.CannotLoad as error:
             return fail(str(error))
         return loaded(module, name)(args)

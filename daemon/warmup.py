@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -96,17 +97,20 @@ def load(lights: Lights | None = None) -> Warmth:
     try:
         with _one:
             return _load(begun, lights)
-    except PermissionError as error:  # raised by the compiler under the service manager's MemoryDenyWriteExecute=
-        remedy = "the process must be allowed to make memory executable"
+    except PermissionError as error:
+        remedy = "the process must be allowed to make memory executable"  # see MemoryDenyWriteExecute= (systemd.exec)
+        if error.filename is not None:
+            remedy = "give that file to the user who runs this, or name another folder with NUMBA_CACHE_DIR"
         raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
 
 
-def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]) -> None:
+def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object], module: str = "") -> None:
     """Do ``work``, which loads ``what`` of the estimator, and ``say`` (in another thread) that kernels are compiled.
 
-    Nothing is done where an earlier start has left all of them, and nothing said where it has left these.
+    Nothing is done where an earlier start has left all of them, and nothing said where it has left these. ``module``:
+    imported after that; of what it is missing it compiles under the lock.
 
     Raises:
         CannotLoad: as for :func:`load`.
@@ -117,11 +121,21 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
         begun, before = time.monotonic(), _compiled()
         with _announced(say, before):
             work()
+            if module:
+                _import(module)
         mark_of(what).touch()
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
     if count := len(_compiled() - before):
         say(f"{count} kernels compiled in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
+
+
+def _import(module: str) -> None:
+    """Import a module of kernels that no daemon loads."""
+    from estimator.kernel import CACHE_DIR
+
+    with KernelLock(CACHE_DIR) as lock, before_compiling(lock.take):
+        import_module(module)
 
 
 @contextlib.contextmanager

@@ -98,7 +98,7 @@ def _shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out
     from daemon import warmup
 
     try:
-        warmup.load_aloud(cli.say, "warm", lambda: (warmup.load(), import_module("taps.view.camera")))
+        warmup.load_aloud(cli.say, "warm", warmup.load, "taps.view.camera")
     except warmup.CannotLoad as error:
         cli.fail(str(error))
         return

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from daemon import warmup
-from daemon.kernellock import waits
+from daemon.kernellock import KernelLock, waits
 from daemon.lights import Lights
 from daemon.warmup import Warmth, kernel_count, warm_up
 from estimator.cdma_profile import PROFILE_A
@@ -288,6 +288,28 @@ def test_a_command_that_cannot_load_leaves_no_mark(tmp_path: Path, monkeypatch: 
     with pytest.raises(warmup.CannotLoad, match="No space left"):
         warmup.load_aloud(lambda text: None, "warm", full)
     assert not (tmp_path / "warm").exists()
+
+
+def test_what_a_command_compiles_beyond_the_daemons_kernels_it_compiles_under_the_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+    monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
+    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr(KernelLock, "take", lambda lock: taken.append("taken"))
+    (tmp_path / "of_its_own.py").write_text("import numba\nnumba.njit('f8(f8)')(lambda x: x + 1.0)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    warmup.load_aloud(lambda text: None, "plan", lambda: taken.append("loaded"), "of_its_own")
+    assert taken[:2] == ["loaded", "taken"]
+
+
+def test_a_lock_of_another_user_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(13, "Permission denied", "/var/cache/lumiloop/lock")
+
+    monkeypatch.setattr(warmup, "_load", refused)
+    with pytest.raises(warmup.CannotLoad, match=r"/var/cache/lumiloop/lock.*give that file to the user"):
+        warmup.load()
 
 
 def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
