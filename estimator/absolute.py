@@ -76,8 +76,8 @@ class Absolute:
     Attributes:
         placed: light has told where the map lies. proved: it was sure of that, or a person said so. broken: the laser
             has let go of the pose since, or begun its map anew.
-        P, X: see above, both 3x3, odom-aligned axes. matched: T_odom_base and P at the latest match; what P has
-            grown by since is of the way, and not of the map that the match was with.
+        P, X: see above, both 3x3, odom-aligned axes. kept: T_map_base, and P in map axes, at the latest match, or
+            when light or a person said where the map lies; what P has grown by since is of the way, not of the map.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
             unknown. odd_since: since when they have disagreed.
         elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
@@ -97,7 +97,7 @@ class Absolute:
     broken: bool = False
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    matched: tuple[Array, Array] = field(default_factory=lambda: (se2.identity(), np.zeros((3, 3))))
+    kept: tuple[Array, Array] = field(default_factory=lambda: (se2.identity(), np.zeros((3, 3))))
     gap: float | None = None
     odd_since: float | None = None
     elsewhere_since: float | None = None
@@ -145,24 +145,32 @@ def on_match(state: State, T_before: Array, P_before: Array, lacked: Array) -> N
     mended = np.empty((3, 3, 3))
     mend_tie(tie.P, tie.X, lacked, P_before, moving.P, mended)
     tie.P, tie.X, share = mended[0], mended[1], mended[2]
-    tie.matched = moving.T_odom_base, tie.P
     made = moving.T_odom_base - T_before
     made[2] = se2.wrap(made[2])
     T_map_base = se2.compose(state.T_map_odom, T_before) + se2.rotation(state.T_map_odom[2]) @ (share @ made)
     move_map(state, se2.compose(T_map_base, se2.inverse(moving.T_odom_base)))
+    keep_tie(state)
+
+
+def keep_tie(state: State) -> None:
+    """Remember how surely the map lies in the survey: see `Absolute.kept`."""
+    tie, R = state.absolute, se2.rotation(state.T_map_odom[2])
+    assert tie is not None
+    tie.kept = se2.compose(state.T_map_odom, state.fused.T_odom_base), R @ tie.P @ R.T
 
 
 def on_lights(state: State, lights: LightsResult) -> None:
     """Take an epoch of the `lights` filter."""
     tie = state.absolute
     assert tie is not None
+    assert state.light is not None
     tie.gap = None
     tie.light_s, tie.t_light = min(lights.t_mono - tie.t_light, SLOWEST_S), lights.t_mono
     if begun_anew(state, lights):
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    lights = across_the_row(state, doubted(tie, lights, guided(state)))
+    lights = across_the_row(state, doubted(tie, lights, state.light.told))
     held = holds_heading(state)
     if held:
         lights = without_heading(lights)
@@ -181,7 +189,6 @@ def on_lights(state: State, lights: LightsResult) -> None:
         gain(state, lights, T_odom_base, off)
     if lights.fix is Fix.GOOD and tie.odd_since is None:
         tie.proved, tie.broken = True, False
-        assert state.light is not None
         tie.way_start = state.light.filter.way_start
 
 
@@ -201,6 +208,7 @@ def on_order(state: State, command: Command) -> None:
         leave(state, np.zeros((3, 3)))
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0
         tie.broken, tie.way_start = False, state.light.filter.way_start
+        keep_tie(state)
 
 
 def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
@@ -218,7 +226,7 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
     tie.fresh = max(0.0, tie.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
-    if not on_wheels(state):
+    if state.light is not None and not state.light.on_wheels:
         tie.P, tie.X = straighten(tie.P, tie.X)
     before = R @ tie.P @ R.T
     L_before = invert3(before)
@@ -243,6 +251,7 @@ def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     tie.P = R.T @ lights.covariance @ R
     leave(state, np.zeros((3, 3)))
     tie.placed, tie.odd_since, tie.fresh = True, None, 0.0
+    keep_tie(state)
 
 
 def hang_on_anchor(state: State) -> None:
@@ -283,7 +292,7 @@ def virtual(state: State) -> Virtual | None:
     tie = state.absolute
     if tie is None or state.light is None or state.light.result.fix is not Fix.GOOD:
         return None
-    wheels = guided(state)
+    wheels = state.light.told
     lights = across_the_row(state, state.light.result)
     _, factor = doubted_covariance(tie, lights, wheels)
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
@@ -327,16 +336,6 @@ def doubted_covariance(tie: Absolute, lights: LightsResult, wheels: bool = True)
     return P, factor
 
 
-def guided(state: State) -> bool:
-    """Whether `lights` hears how the robot moves, by wheels or by the laser."""
-    return state.light is not None and state.light.filter.course.wheels
-
-
-def on_wheels(state: State) -> bool:
-    """Whether it is wheels that tell it."""
-    return guided(state) and state.light is not None and not state.light.filter.course.matched
-
-
 def holds_heading(state: State) -> bool:
     """Whether the laser holds a heading that light has proved, and light has nothing as good.
 
@@ -345,7 +344,7 @@ def holds_heading(state: State) -> bool:
     """
     tie = state.absolute
     assert tie is not None
-    return tie.proved and not tie.broken and not blind(state) and not guided(state)
+    return tie.proved and not tie.broken and not blind(state) and not (state.light is not None and state.light.told)
 
 
 def without_heading(lights: LightsResult) -> LightsResult:

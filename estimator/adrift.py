@@ -73,12 +73,8 @@ def begin(state: State) -> bool:
 
 def leave_map(state: State) -> None:
     """Keep how surely the map lies in the survey, as of the latest match with it; zero where light has not told it."""
-    tie, R, atlas = state.absolute, se2.rotation(state.T_map_odom[2]), state.atlas
-    if tie is None or not tie.placed:
-        atlas.askew = np.zeros((3, 3))
-        return
-    T_odom_base, P = tie.matched
-    atlas.askew, atlas.T_askew = R @ P @ R.T, se2.compose(state.T_map_odom, T_odom_base)
+    tie, atlas = state.absolute, state.atlas
+    atlas.T_askew, atlas.askew = (se2.identity(), np.zeros((3, 3))) if tie is None or not tie.placed else tie.kept
 
 
 def local_map_lost(state: State) -> None:

@@ -13,6 +13,7 @@ from typing import Final
 
 from estimator import se2
 from estimator.fusion import BLIND, loose_direction
+from estimator.lights_motion import CARRY_S
 from estimator.records import Odometry
 from estimator.result import MatchResult
 from estimator.state import State
@@ -20,24 +21,27 @@ from estimator.suspicion import too_far
 
 WHEELS_GONE_S: Final = 5.0
 """Wheels that have been silent for longer are not waited for: what lamps said of their scale is given up."""
-STOOD_S: Final = 1.0
-"""A robot that has stayed where it is for so long stands: what matches move it by is their noise."""
 
 
 def guide(state: State, match: MatchResult) -> None:
     """Tell `lights` how the robot has moved since the scan before, after ``match`` has been fused."""
     light, moving = state.light, state.fused
-    if light is None or match.reason in BLIND:
+    if light is None:
+        return
+    if moving.t_mono - moving.t_odometry < WHEELS_GONE_S:
+        light.guided = None
+        return
+    if match.reason in BLIND:  # the next one tells of the way since
         return
     before, light.guided = light.guided, None
-    if moving.t_mono - moving.t_odometry < WHEELS_GONE_S:
-        return
-    held = match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None
-    made = se2.identity() if before is None else se2.between(before[1], moving.T_odom_base)
-    if not held or (before is not None and too_far(made, moving.t_mono - before[0])):  # else it was carried
+    if not (match.ok and match.known_axes.all() and loose_direction(match.information) is None):
         light.left_alone()
         return
-    stands = before is not None and moving.t_mono - moving.t_stood > STOOD_S
-    light.guided = moving.t_mono, before[1] if before is not None and stands else moving.T_odom_base
-    if before is not None:
-        light.move(Odometry(before[0], moving.t_mono, se2.identity() if stands else made))
+    light.guided = now, T = moving.t_mono, moving.T_odom_base
+    if before is None:
+        return
+    dt, made = now - before[0], se2.between(before[1], T)
+    if dt >= CARRY_S or too_far(made, dt):  # then it was carried
+        light.left_alone()
+    else:
+        light.move(Odometry(before[0], now, made), moving.velocity)

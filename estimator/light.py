@@ -59,9 +59,19 @@ class Light:
         if isinstance(record, Odometry | Imu):
             lights.predict(self.filter, record)
 
-    def move(self, record: Odometry) -> None:
+    @property
+    def told(self) -> bool:
+        """Whether the `lights` filter hears how the robot moves, by wheels or by the laser."""
+        return self.filter.course.wheels
+
+    @property
+    def on_wheels(self) -> bool:
+        """Whether it is wheels that tell it."""
+        return self.filter.course.wheels and not self.filter.course.matched
+
+    def move(self, record: Odometry, velocity: Array) -> None:
         """Where no wheels tell how the robot moves: move the `lights` filter by what matches say of it."""
-        lights.move(self.filter, record)
+        lights.move(self.filter, record, velocity)
 
     def left_alone(self) -> None:
         """Matches do not tell that any more."""

@@ -86,12 +86,18 @@ def predict(lights: Lights, record: Odometry | Imu) -> None:
         lights_motion.on_imu(lights, record)
 
 
-def move(lights: Lights, record: Odometry) -> None:
-    """Move as the laser has, where no wheels tell it; not while the lamps in use are a row."""
+def move(lights: Lights, record: Odometry, velocity: Array) -> None:
+    """Move as the laser has, where no wheels tell it; not while the lamps in use are a row.
+
+    Args:
+        lights: all of the filter.
+        record: the way from the scan before to the latest one.
+        velocity: (v_x, v_y, yaw rate) at that.
+    """
     if in_a_row(lights, record.t_end):
         left_alone(lights)
     else:
-        lights_motion.on_odometry(lights, record, matched=True)
+        lights_motion.on_odometry(lights, record, velocity)
 
 
 def left_alone(lights: Lights) -> None:
@@ -104,9 +110,9 @@ def in_a_row(lights: Lights, t_mono: float) -> bool:
     """Whether the lamps in use have been one row for long enough to count as such.
 
     What a row tells of the distance from it, and of the heading, is the same mistake in every epoch: who also knows the
-    way and the turn to a hair soon believes it.
+    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing.
     """
-    return t_mono - lights.t_row >= row.LASTING_S
+    return t_mono - lights.t_row >= row.LASTING_S and t_mono - lights.t_used < HELD_S
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:

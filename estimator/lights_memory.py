@@ -9,7 +9,7 @@ import numpy as np
 from estimator import ekf
 from estimator.lamps import Lamp
 from estimator.lights_links import settled
-from estimator.lights_motion import scales
+from estimator.lights_motion import wheel_scales
 from estimator.lights_state import Lights, Track
 from estimator.records import Array
 
@@ -56,7 +56,7 @@ def sensors_known(lights: Lights) -> tuple[Array, Array] | None:
         return None
     mean, variance = known.x[SENSORS].copy(), np.diag(known.P)[SENSORS].copy()
     if lights.course.matched:  # what it knows of scales is about matches, and would be taken for that of wheels
-        mean[:3], variance[:3] = 0.0, scales(lights)
+        mean[:3], variance[:3] = wheel_scales(lights)
     return mean, variance
 
 

@@ -23,6 +23,8 @@ GYRO_FRESH_S: Final = 0.1
 UNSEEN: Final = 0.5
 """m/s and rad/s of a robot that nobody watches."""
 REVERSE_M_S: Final = 0.1
+TOLD_S: Final = 2.0
+"""So long after odometry, or matches, told the way a robot may be reversing as these have said."""
 STILL: Final = 0.08
 """m/s; without odometry a slower robot is taken to stand."""
 AT_MOST: Final = (5.0, 5.0, 10.0)
@@ -31,13 +33,18 @@ FASTEST: Final = 20.0
 """m or rad within one record. More is not a motion but a counter that has jumped."""
 
 
-def on_odometry(lights: Lights, record: Odometry, matched: bool = False) -> None:
+def on_odometry(lights: Lights, record: Odometry, velocity: Array | None = None) -> None:
     """Move by what the wheels say, less what was carried ahead; turn by the gyro where that covers the stretch.
 
-    What comes late, when light has already carried the pose beyond its stamp, is carried on to there again.
-    ``matched``: matches say it, in the place of wheels.
+    What comes late, when light has already carried the pose beyond its stamp, is carried on to there again. The noise
+    is that of the way told: what the carry was wrong by says nothing of what wheels are.
+
+    Args:
+        lights: all of them.
+        record: the way.
+        velocity: (v_x, v_y, yaw rate) by matches, where these tell the way in the place of wheels; else None.
     """
-    course, noise = lights.course, lights.settings.motion
+    course, noise, matched = lights.course, lights.settings.motion, velocity is not None
     delta = np.array(record.delta, dtype=np.float64)
     dt = record.t_end - record.t_begin
     largest = max([abs(part) if math.isfinite(part) else math.inf for part in delta.tolist()])
@@ -48,28 +55,42 @@ def on_odometry(lights: Lights, record: Odometry, matched: bool = False) -> None
     if course.matched is not matched:
         course.matched = matched
         begin_scales(lights)
-    by_gyro = dt > 0.0 and abs(course.gyro_span - dt) < 0.3 * dt
+    turned, later = gyro_until(lights, record.t_end)
+    by_gyro = dt > 0.0 and abs(turned[1] - dt) < 0.3 * dt
     if by_gyro:
-        delta = np.array((delta[0], delta[1], course.gyro_turned * dt / course.gyro_span))
-    follows = abs(record.t_begin - course.t_odometry) < 1e-6 and dt < CARRY_S
-    velocity = se2.log(delta) / dt if 1e-3 < dt < CARRY_S else course.velocity
-    course.velocity = velocity if (np.abs(velocity) <= AT_MOST).all() else course.velocity
-    beyond = se2.exp(course.velocity * min(max(course.t_mono - record.t_end, 0.0), CARRY_S))
-    made = se2.between(course.ahead, se2.compose(delta, beyond)) if follows else rest(delta, record, course.t_mono)
-    ahead, _, turned = made.tolist()
-    way, turn = abs(ahead), 0.0 if by_gyro else abs(turned)
+        delta = np.array((delta[0], delta[1], turned[0] * dt / turned[1]))
+    if velocity is None:
+        velocity = se2.log(delta) / dt if 1e-3 < dt < CARRY_S else course.velocity
+    course.velocity = velocity.copy() if (np.abs(velocity) <= AT_MOST).all() else course.velocity
+    if abs(record.t_begin - course.t_odometry) < 1e-6 and dt < CARRY_S:
+        ahead = se2.exp(course.velocity * min(max(course.t_mono - record.t_end, 0.0), CARRY_S))
+        if later[1] > 0.0:
+            ahead[2] = later[0] + course.velocity[2] * max(course.t_mono - course.t_gyro, 0.0)
+        made, told = se2.between(course.ahead, se2.compose(delta, ahead)), delta
+    else:
+        ahead = se2.inverse(back_to(lights, record.t_end)) if course.t_mono > record.t_end else se2.identity()
+        made = told = rest(delta, record, course.t_mono)
+    way, turn = math.hypot(told[0], told[1]), abs(float(told[2]))
     idle = min(max(dt, 0.0), CARRY_S)
-    skid = noise.skid**2 * abs(turned)
+    skid = noise.skid**2 * turn
     q = (
         noise.slip**2 * way + skid + noise.idle_m**2 * idle,
         noise.side**2 * way + skid + noise.idle_m**2 * idle,
-        noise.turn**2 * turn + (0.0 if by_gyro else noise.wander**2 * way) + noise.idle_rad**2 * idle,
+        (0.0 if by_gyro else noise.turn**2 * turn + noise.wander**2 * way) + noise.idle_rad**2 * idle,
     )
-    blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else turned, 0.0 if by_gyro else ahead, 0.0, 1.0)
-    course.gyro_turned = course.gyro_span = 0.0
+    blame = (0.0, 0.0, 0.0, 0.0 if by_gyro else made[2], 0.0 if by_gyro else made[0], 0.0, 1.0)
+    course.gyro_turned, course.gyro_span = later
     course.t_odometry = record.t_end
     move_all(lights, made, np.array(blame), np.array(q), max(course.t_mono, record.t_end))
-    course.ahead = beyond if follows else se2.identity()
+    course.ahead = ahead
+
+
+def gyro_until(lights: Lights, t_end: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What the gyro has added up (rad, s) since the last odometry: until an instant, and later."""
+    course = lights.course
+    later_s = min(max(course.t_gyro - t_end, 0.0), course.gyro_span)
+    later = float(course.velocity[2]) * later_s, later_s
+    return (course.gyro_turned - later[0], course.gyro_span - later_s), later
 
 
 def rest(delta: Array, record: Odometry, t_mono: float) -> Array:
@@ -159,10 +180,11 @@ def move_all(lights: Lights, delta: Array, blame: Array, q: Array, t_mono: float
             made = delta + track.x[ekf.SPEED : ekf.TURN + 1] * blame[:3]
         ekf.move(track.x, track.P, track.n, delta, blame, q)
     course.T = se2.compose(course.T, made)
-    x, y, turned = made.tolist()
-    way = math.hypot(x, y)
+    way = math.hypot(made[0], made[1])
+    if course.matched and course.wheels:  # the noise of matches is no way
+        speed = math.hypot(course.velocity[0], course.velocity[1])
+        way = speed * (t_mono - course.t_mono) if speed > STILL and math.isfinite(course.t_mono) else 0.0
     course.way += way if course.wheels else max(0.0, way - STILL * float(blame[0]))
-    course.turned += abs(turned)
     course.t_mono = max(course.t_mono, t_mono)
     course.trail.append((course.t_mono, course.T))
     while course.trail[0][0] < course.t_mono - TRAIL_S:
@@ -196,16 +218,26 @@ def settle(lights: Lights) -> None:
 
 
 def begin_scales(lights: Lights) -> None:
-    """Another source tells the way: of its scales, and how it curves, nothing is known."""
-    prior = scales(lights)
+    """Another source tells the way: of the scales of matches nothing is known, of wheels what an earlier run knew."""
+    mean, variance = wheel_scales(lights)
+    if lights.course.matched:
+        mean, variance = np.zeros(3), prior_scales(lights)
     for track in lights.tracks:
-        for j, variance in enumerate(prior.tolist(), start=ekf.SCALE):
+        for k, j in enumerate(range(ekf.SCALE, ekf.CURVE + 1)):
             ekf.cut(track.P, track.n, j)
-            track.x[j], track.P[j, j] = 0.0, variance
+            track.x[j], track.P[j, j] = mean[k], variance[k]
 
 
-def scales(lights: Lights) -> Array:
-    """Variances of the scales of way and turn, and of the curve, of wheels that nobody has compared with lamps."""
+def wheel_scales(lights: Lights) -> tuple[Array, Array]:
+    """Means and variances of the scales of way and turn, and of the curve, of wheels, as known before this run."""
+    if lights.before is None:
+        return np.zeros(3), prior_scales(lights)
+    of = slice(ekf.SCALE, ekf.CURVE + 1)
+    return lights.before.x[of].copy(), np.minimum(np.diag(lights.before.P)[of], prior_scales(lights))
+
+
+def prior_scales(lights: Lights) -> Array:
+    """Variances of those of which nothing is known."""
     noise = lights.settings.motion
     return np.array((noise.scale, noise.turn_scale, noise.curve)) ** 2
 
@@ -224,7 +256,8 @@ def face_forward(lights: Lights, track: Track) -> None:
     Strengths and gyro cannot tell the two apart; the photodiode stays where it is.
     """
     sigma = math.sqrt(max(float(track.P[ekf.SPEED, ekf.SPEED]), 0.0))
-    if lights.course.wheels or track.x[ekf.SPEED] > -max(REVERSE_M_S, 2.0 * sigma):
+    told = lights.course.wheels or lights.course.t_mono - lights.course.t_odometry < TOLD_S
+    if told or track.x[ekf.SPEED] > -max(REVERSE_M_S, 2.0 * sigma):
         return
     receiver = lights.survey.receiver
     c, s = math.cos(track.x[ekf.YAW]), math.sin(track.x[ekf.YAW])

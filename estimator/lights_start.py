@@ -169,7 +169,7 @@ def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track |
     track.x[ekf.FLOOR] = math.log(max(lights.survey.floor, 1e-4))
     for j, sigma in variance.items():
         track.P[j, j] = sigma**2
-        if old is not None:
+        if old is not None and not (lights.course.matched and old is lights.before and j <= ekf.CURVE):  # of wheels
             track.x[j], track.P[j, j] = old.x[j], min(2.0 * float(old.P[j, j]) + (0.2 * sigma) ** 2, sigma**2)
     return track
 

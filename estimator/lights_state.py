@@ -182,7 +182,7 @@ class Course:
             yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
         gyro_turned, gyro_span: added up since the last odometry.
         T, trail: dead-reckoned pose since the start, and its last second as (instant, pose).
-        way: metres driven. turned: radians turned.
+        way: metres driven.
     """
 
     t_mono: float = -math.inf
@@ -197,7 +197,6 @@ class Course:
     T: Array = field(default_factory=se2.identity)
     trail: list[tuple[float, Array]] = field(default_factory=list)
     way: float = 0.0
-    turned: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

@@ -12,8 +12,8 @@ separation, Blanch et al., NAVIGATION 2010; docs/integrity.md has the derivation
 
 Where there is one witness only nothing can be separated, and the first bound is widened instead. Laser and light share
 the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself. Without wheels they share
-the laser's way (`guide`): a laser that slides leads light along until lamps have corrected it, for which light is
-believed less then (`absolute.UNGUIDED`), and a heading by it is nobody's bound.
+the laser's way (`guide`): a laser that slides leads light along until lamps have corrected it, for which the level
+believes its position less (`absolute.UNGUIDED`); and of the heading the laser is the only witness.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
-from estimator.absolute import doubted_covariance, on_wheels, pose_at
+from estimator.absolute import doubted_covariance, pose_at
 from estimator.records import Array
 from estimator.result import Fix, Protection
 from estimator.state import State
@@ -60,12 +60,18 @@ def bound(state: State, P: Array) -> Protection | None:
     _watch(state, P)
     horizontal, yaw = spread(P, K_PLAIN if laser and lit else ALONE * K_PLAIN)
     if laser and lit:
+        yaw *= 1.0 if on_wheels(state) else ALONE
         for other in (_without_light(state), _without_laser(state)):
             horizontal, yaw = max(horizontal, other[0]), max(yaw, other[1])
     horizontal, yaw = horizontal + UNKNOWN_M, min(yaw + UNKNOWN_RAD, math.pi)
     if not horizontal < MOST_M:
         return None
     return Protection(horizontal, yaw, laser, lit, state.fused.odometry)
+
+
+def on_wheels(state: State) -> bool:
+    """Whether light hears from wheels how the robot moves."""
+    return state.light is not None and state.light.on_wheels
 
 
 def _watch(state: State, P: Array) -> None:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from estimator import absolute, ekf, guide, lights, lights_motion, motion, row, se2
+from estimator import ekf, guide, lights, lights_motion, row, se2
 from estimator.light import Light
+from estimator.lights import HELD_S
 from estimator.lights_memory import sensors_known
-from estimator.lights_motion import scales
+from estimator.lights_motion import prior_scales
 from estimator.matching import no_match
-from estimator.records import Array, Odometry, Record
+from estimator.records import Array, Imu, Odometry, Record
 from estimator.result import Fix, MatchResult, Reason
 from estimator.row import LASTING_S
 from tests.estimator.light_room import SURVEY, Room, circle
@@ -39,7 +40,8 @@ def led(move: bool, seconds: float = 25.0) -> tuple[lights.Lights, float, float]
         t = 0.1 * k
         result = lights.update(filter_, Room(seed=k).epoch(t - 0.03, circle(t - 0.03)))
         if move:
-            lights.move(filter_, Odometry(t - 0.1, t, se2.between(matched(t - 0.1), matched(t))))
+            made = se2.between(matched(t - 0.1), matched(t))
+            lights.move(filter_, Odometry(t - 0.1, t, made), se2.log(made) / 0.1)
         off = result.T_map_base - circle(result.t_pose)
         errors.append((math.hypot(off[0], off[1]), abs(se2.wrap(float(off[2])))))
     assert result.fix is Fix.GOOD
@@ -64,27 +66,81 @@ def test_what_matches_say_of_way_and_turn_is_as_good_as_wheels() -> None:
     assert moved.course.wheels
 
 
-@pytest.mark.parametrize("matched", [False, True])
-def test_a_way_that_is_told_late_is_carried_on_to_where_light_has_carried_it(matched: bool) -> None:
+def told(filter_: lights.Lights, begin: float, end: float, way: tuple[float, float, float], by_laser: bool) -> None:
+    """An increment by wheels, or by matches."""
+    velocity = np.array(way) / (end - begin) if by_laser else None
+    lights_motion.on_odometry(filter_, Odometry(begin, end, np.array(way)), velocity)
+
+
+@pytest.mark.parametrize("by_laser", [False, True])
+@pytest.mark.parametrize("late_s", [0.0, 0.04, 0.09])
+def test_a_way_that_is_told_late_is_carried_on_to_where_light_has_carried_it(late_s: float, by_laser: bool) -> None:
     """Epochs come between a scan's end and its match; else each such scan sets the robot back by what lies between."""
     filter_ = placed(np.array((5.0, 5.0, 0.0)))
+    x = filter_.tracks[0].x
+    told(filter_, -0.1, 0.0, (0.1, 0.0, 0.0), by_laser)
+    began = 5.0 + 0.1 * (not by_laser) - float(x[0])
     for k in range(1, 6):
-        lights.carry_to(filter_, 0.1 * k + 0.04)
-        lights_motion.on_odometry(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.1, 0.0, 0.0))), matched)
-    assert filter_.course.t_mono == pytest.approx(0.54)
-    assert filter_.tracks[0].x[0] == pytest.approx(5.0 + 1.0 * 0.54, abs=0.11), "the first begins before the carry"
-    before = float(filter_.tracks[0].x[0])
-    lights_motion.on_odometry(filter_, Odometry(0.5, 0.6, np.array((0.1, 0.0, 0.0))), matched)
-    assert filter_.tracks[0].x[0] - before == pytest.approx(0.06, abs=1e-6)
-    lights_motion.on_odometry(filter_, Odometry(0.6, 0.7, np.array((0.0, 0.0, 0.0))), matched)
-    assert filter_.tracks[0].x[0] - before == pytest.approx(0.06, abs=1e-6), "stopped"
+        lights.carry_to(filter_, 0.1 * k + late_s)
+        told(filter_, 0.1 * k - 0.1, 0.1 * k, (0.1, 0.0, 0.0), by_laser)
+    assert filter_.course.t_mono == pytest.approx(0.5 + late_s)
+    assert x[0] + began - 5.0 - 0.1 * (not by_laser) == pytest.approx(0.5 + late_s, abs=1e-6)
+    told(filter_, 0.5, 0.6, (0.1, 0.0, 0.0), by_laser)
+    told(filter_, 0.6, 0.7, (0.0, 0.0, 0.0), by_laser)
+    assert x[0] + began - 5.0 - 0.1 * (not by_laser) == pytest.approx(0.6, abs=1e-6), "stopped"
+
+
+@pytest.mark.parametrize("late_s", [0.03, 0.09])
+def test_what_begins_late_takes_back_what_was_guessed_beyond_it(late_s: float) -> None:
+    """Else each time that the laser holds all axes again the robot is carried on by the same stretch twice."""
+    filter_ = placed(np.array((5.0, 5.0, 0.0)))
+    for turn in range(5):
+        for k in range(1, 5):
+            t = turn + 0.1 * k
+            lights.carry_to(filter_, t + late_s)
+            if k > 1:
+                told(filter_, t - 0.1, t, (0.05, 0.0, 0.0), by_laser=True)
+        lights.left_alone(filter_)
+        lights.carry_to(filter_, turn + 0.7)
+        lights.carry_to(filter_, turn + 1.0)
+    assert filter_.tracks[0].x[0] - 5.0 == pytest.approx(0.5 * (5.0 - 0.2), abs=1e-6), "of the first it knew nothing"
+
+
+@pytest.mark.parametrize("by_laser", [False, True])
+@pytest.mark.parametrize("late_s", [0.0, 0.02, 0.05])
+def test_a_turn_by_gyro_is_taken_once_however_late_the_wheels_are(late_s: float, by_laser: bool) -> None:
+    filter_ = placed(np.array((5.0, 5.0, 0.0)))
+    done = 0
+    for k in range(1, 201):
+        t = 0.01 * k
+        lights.predict(filter_, Imu(t - 0.01, t, 0.01))
+        while 0.1 * (done + 1) + late_s <= t + 1e-9:
+            told(filter_, 0.1 * done, 0.1 * done + 0.1, (0.0, 0.0, 0.1), by_laser)
+            done += 1
+    assert filter_.tracks[0].x[2] == pytest.approx(2.0, abs=0.002)
+
+
+def test_the_noise_of_the_way_does_not_depend_on_when_light_comes() -> None:
+    spreads = []
+    for late_s in (-0.1, -0.05, -0.01, 0.0, 0.03):
+        filter_ = placed(np.array((5.0, 5.0, 0.0)))
+        filter_.tracks[0].P[:3, :3] = 0.0
+        told(filter_, -0.1, 0.0, (0.05, 0.0, 0.0), by_laser=True)
+        for k in range(1, 201):
+            if late_s > -0.1:
+                lights.carry_to(filter_, 0.1 * k + late_s)
+            told(filter_, 0.1 * k - 0.1, 0.1 * k, (0.05, 0.0, 0.0), by_laser=True)
+        spreads.append(math.sqrt(filter_.tracks[0].P[2, 2]))
+    wander = filter_.settings.motion.wander * math.sqrt(10.0)
+    curve = filter_.settings.motion.curve * 10.0
+    assert spreads == pytest.approx([math.hypot(wander, curve)] * 5, rel=0.03)
 
 
 def test_left_alone_it_guesses_at_its_speed_at_once() -> None:
     """Coasting with hardly any noise it would be sure of a place that it has passed, or not come to."""
     filter_ = placed(np.array((5.0, 5.0, 0.0)))
     for k in range(1, 4):
-        lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.05, 0.0, 0.0))))
+        told(filter_, 0.1 * k - 0.1, 0.1 * k, (0.05, 0.0, 0.0), by_laser=True)
     lights.left_alone(filter_)
     track = filter_.tracks[0]
     assert not filter_.course.wheels
@@ -92,17 +148,30 @@ def test_left_alone_it_guesses_at_its_speed_at_once() -> None:
     before = float(track.P[0, 0])
     lights.carry_to(filter_, 0.7)
     assert track.P[0, 0] - before > 0.08**2
-    lights.predict(filter_, Odometry(0.7, 0.8, np.array((0.05, 0.0, 0.0))))
+    told(filter_, 0.7, 0.8, (0.05, 0.0, 0.0), by_laser=False)
     lights.left_alone(filter_)
     assert filter_.course.wheels, "wheels of its own go on telling"
 
 
+def test_a_robot_that_the_laser_saw_reverse_is_not_turned_round_for_it() -> None:
+    filter_ = placed(np.array((5.0, 5.0, 0.0)))
+    for k in range(1, 4):
+        told(filter_, 0.1 * k - 0.1, 0.1 * k, (-0.06, 0.0, 0.0), by_laser=True)
+    lights.left_alone(filter_)
+    for t, turned in ((1.0, False), (3.0, True)):
+        lights.carry_to(filter_, t)
+        filter_.tracks[0].x[ekf.SPEED], filter_.tracks[0].P[ekf.SPEED, ekf.SPEED] = -0.6, 0.01
+        lights_motion.face_forward(filter_, filter_.tracks[0])
+        assert bool(abs(filter_.tracks[0].x[2]) > 3.0) is turned
+
+
 def test_under_a_row_of_lamps_nothing_is_taken() -> None:
     filter_ = placed(np.array((5.0, 5.0, 0.5)))
-    filter_.t_row = 0.0
+    filter_.t_row = filter_.t_used = 0.0
     for k in range(1, 31):
-        lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.1, 0.0, 0.0))))
-        assert filter_.course.wheels is (k < 10.0 * LASTING_S)
+        filter_.t_used = min(0.1 * k, 2.0)  # then they go out
+        lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.1, 0.0, 0.0))), np.array((1.0, 0.0, 0.0)))
+        assert filter_.course.wheels is (k < 10.0 * LASTING_S or k >= 20 + 10.0 * HELD_S)
 
 
 class Told:
@@ -110,7 +179,7 @@ class Told:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.moves, self.alone = list[Odometry](), 0
-        monkeypatch.setattr(Light, "move", lambda _, record: self.moves.append(record))
+        monkeypatch.setattr(Light, "move", lambda _, record, _v: self.moves.append(record))
         monkeypatch.setattr(Light, "left_alone", lambda _: self.leave())
 
     def leave(self) -> None:
@@ -137,8 +206,10 @@ def test_the_way_is_told_where_every_axis_holds(monkeypatch: pytest.MonkeyPatch)
         (no_match(np.zeros(3), 300, Reason.PASSED_OVER), 0.9, 0.45, 2, 3),  # there was no time for this scan
         (scanned(), 1.0, 0.50, 3, 3),
         (scanned(), 1.1, 2.50, 3, 4),  # nothing indoors drives so fast: it was carried
-        (scanned(), 1.2, 2.55, 3, 4),
-        (scanned(), 1.3, 2.60, 4, 4),
+        (scanned(), 1.2, 2.55, 4, 4),
+        (scanned(), 1.3, 2.60, 5, 4),
+        (scanned(), 1.9, 2.90, 5, 5),  # so slow a lidar does not tell how it moved meanwhile
+        (scanned(), 2.0, 2.95, 6, 5),
     ]
     for match, t, x, moves, alone in steps:
         state.fused.t_mono, state.fused.T_odom_base = t, np.array((x, 0.0, 0.3))
@@ -149,19 +220,21 @@ def test_the_way_is_told_where_every_axis_holds(monkeypatch: pytest.MonkeyPatch)
     assert (told.moves[2].t_begin, told.moves[2].t_end) == (0.8, 1.0)
 
 
-def test_the_noise_of_matches_moves_nobody_who_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forty times a second it would be a way on which strengths seem to say something new of the heading."""
-    told, state = Told(monkeypatch), lit_state(room_run(seed=1, people=0))
-    rng, noise = np.random.default_rng(1), state.settings.noise
+@pytest.mark.parametrize(("speed", "spin"), [(0.0, 0.0), (0.0, 0.5), (0.5, 0.0)])
+def test_the_noise_of_matches_is_no_way(speed: float, spin: float) -> None:
+    """Forty times a second it would be one on which strengths seem to say something new of the heading."""
+    state = lit_state(room_run(seed=1, people=0))
+    assert state.light is not None
+    rng, moving = np.random.default_rng(1), state.fused
     for k in range(400):
-        state.fused.T_odom_base = np.array((1.0, 2.0, 0.0)) + rng.normal(0.0, 0.003, 3)
-        if k == 399:  # it starts
-            state.fused.T_odom_base[0] += 0.05
-        motion.carry_to(state.fused, 0.025 * k, noise)
-        motion.stir(state.fused, 0.025 * k)
+        t = 0.025 * k
+        moving.T_odom_base = np.array((speed * t, 0.0, se2.wrap(spin * t))) + rng.normal(0.0, 0.0015, 3)
+        moving.velocity = np.array((speed, 0.0, spin)) + rng.normal(0.0, 0.02, 3)  # as the fused filter has it
+        moving.t_mono = t
         guide.guide(state, scanned())
-    assert sum(math.hypot(*one.delta[:2]) for one in told.moves[80:-1]) == 0.0
-    assert told.moves[-1].delta[0] == pytest.approx(0.05, abs=0.02), "nothing of the way is lost"
+    course = state.light.filter.course
+    assert course.way == pytest.approx(speed * 10.0, rel=0.05, abs=0.1)
+    assert np.abs(course.velocity - (speed, 0.0, spin)).max() < 0.1, "a correction by a match is no speed"
 
 
 def test_while_wheels_tell_the_way_the_laser_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,7 +260,8 @@ def test_without_wheels_the_pose_is_known_as_soon_as_with_them() -> None:
         run, records = blind_drive(seed)
         state = lit_state(run)
         logs.append(play(state, records, run.truth))
-        assert absolute.guided(state)
+        assert state.light is not None
+        assert state.light.told
         assert not state.fused.odometry
         known = next(r.t_mono for r in logs[-1].results if r.placed and r.covariance[2, 2] < 0.04**2)
         assert known < 16.0, "rad, where TRACKING begins"
@@ -210,7 +284,7 @@ def test_wheels_that_come_later_are_not_believed_as_matches_were() -> None:
     """Of their scale nothing is known; nor is it kept for the next run what lamps said of that of matches."""
     filter_, _, _ = led(True, 20.0)
     track = filter_.tracks[0]
-    prior = scales(filter_)
+    prior = prior_scales(filter_)
     assert track.P[ekf.SCALE, ekf.SCALE] < 0.5 * prior[0]
     kept = sensors_known(filter_)
     assert kept is not None
