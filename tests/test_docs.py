@@ -85,7 +85,7 @@ said = {}
 for module in sys.argv[1:]:
     out, code = io.StringIO(), 0
     sys.argv = [module, "--help"]
-    with contextlib.redirect_stdout(out):
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         try:
             runpy.run_module(module, run_name="__main__", alter_sys=True)
         except SystemExit as end:

@@ -90,7 +90,7 @@ def test_stamps_are_right_to_a_fraction_of_the_millisecond(seed: int, ppm: float
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("ppm", [pytest.param(ppm, marks=share(turn, 3)) for turn, ppm in enumerate((-1000, 1000))])
+@pytest.mark.parametrize("ppm", [pytest.param(ppm, marks=share(turn, 2)) for turn, ppm in enumerate((-1000, 1000))])
 def test_three_wraps(ppm: float) -> None:
     """14 hours: every tenth revolution of a 10 Hz sensor."""
     s = sensor(ppm=ppm, period_s=1.002, seconds=3.1 * TICK_MODULUS / 1e3, start_ms=TICK_MODULUS - 100_000)
