@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
+
 from daemon.checkpoint import take
 from daemon.restore import restore
+from estimator import se2
 from estimator.mapimage import restored
+from estimator.pipeline import step
+from estimator.records import UNLIMITED, LightEpoch, Record, Scan
 from estimator.state import State
 from tests.daemon.mapmaker import Shape, image
+from tests.estimator.lit import lit_state, scans, together
+from tools.sim.lightrun import room_run
 
 
 def state(submaps: int, loose: int = 0) -> State:
@@ -27,3 +36,29 @@ def test_submaps_are_those_that_were_there_when_it_was_taken() -> None:
     assert list(after.atlas.submaps) == keys
     assert rest["one"] is after.atlas.submaps[keys[2]]
     assert all((one.place() == place).all() for one, place in zip(after.atlas.submaps.values(), places, strict=True))
+
+
+@pytest.mark.jit
+def test_a_drive_in_which_the_laser_tells_light_the_way_goes_on_from_any_moment() -> None:
+    """The same poses to the last bit, also between a scan and the next, and in the middle of a leap."""
+    run = replace(room_run(seed=4, people=0), seconds=12.0)
+    first, then = lit_state(run), None
+    guided = 0
+    pending: list[Record] = []
+    for count, record in enumerate(together(run.light(), scans(run))):
+        pending.append(record)
+        if not isinstance(record, Scan | LightEpoch):
+            continue
+        if count % 37 == 36:
+            then, _ = restore(take(first, {}).pieces())
+            assert first.light is not None
+            guided += first.light.told
+        if isinstance(record, Scan) and 6.0 < record.t_end < 6.3:  # somebody stands before it, all at once
+            record = pending[-1] = replace(record, range_m=record.range_m.clip(max=1.5))
+        one = step(first, pending, UNLIMITED)
+        two = step(then, pending, UNLIMITED) if then is not None else one
+        pending = []
+        poses = [se2.compose(result.T_map_odom, result.T_odom_base) for result in (one, two)]
+        assert (poses[0] == poses[1]).all()
+        assert (one.covariance == two.covariance).all()
+    assert guided > 3
