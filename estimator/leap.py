@@ -130,7 +130,7 @@ class Leap:
             self.loud = self.loud + 1 if share >= LOUD else 0
         self.latest, self.seen = now, False
         if self.alike >= CALM:
-            soon = self.calm is not None and self.t_first - self.calm.t_end < LATEST_S
+            soon = self.calm is not None and 0.0 < self.t_first - self.calm.t_end < LATEST_S
             self.seen = soon and self.loud >= CALM
             self.calm, self.loud = now, 0
 

@@ -2,7 +2,7 @@
 
 Light names lamps, and with stored gains their strengths give the position to a decimetre from the first epochs on;
 where codes repeat there are several. It says little of the heading until the robot has moved: that, and the
-confirmation, come from the laser. Nothing here is ever told to the `lights` filter, which stays free of the laser.
+confirmation, come from the laser. Nothing here is ever told to the `lights` filter, which hears of no place by laser.
 
 It counts only in a map whose frame is that of the light survey (`told`).
 """
