@@ -146,6 +146,7 @@ def test_every_point_is_on_the_axis_once_and_in_order(n: int) -> None:
         assert (np.diff(axis.rows[low:high, 2]) >= 0.0).all()
 
 
+@pytest.mark.jit
 def test_axes_that_are_gone_leave_nothing() -> None:
     cloud = np.random.default_rng(0).normal(0.0, 5.0, (4000, 2))
     build_axis(cloud[:100], np.zeros(2))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -48,6 +51,19 @@ def drive(state: State, *, odometry: bool, n: int = 300) -> tuple[list[Array], l
     return truth, results
 
 
+@cache
+def driven_once(n: int) -> tuple[State, Array]:
+    """Without the compiler a step takes a quarter of a second: several tests begin where this has ended."""
+    state = new_state(Settings())
+    return state, drive(state, odometry=True, n=n)[0][-1]
+
+
+def driven(n: int) -> tuple[State, Array]:
+    """A state of its own after ``n`` scans, and where the robot is."""
+    state, T = driven_once(n)
+    return deepcopy(state), T
+
+
 @pytest.mark.jit
 @pytest.mark.parametrize("odometry", [True, False])
 def test_follows_the_robot(odometry: bool) -> None:
@@ -88,10 +104,7 @@ def bad(kind: str) -> Scan:
 @pytest.mark.parametrize("kind", ["empty", "invalid", "three", "identical", "nan", "negative", "infinite"])
 @pytest.mark.parametrize("fresh", [True, False])
 def test_bad_scans_say_why_and_move_nothing(kind: str, fresh: bool) -> None:
-    state = new_state(Settings())
-    truth = [np.zeros(3)]
-    if not fresh:
-        truth, _ = drive(state, odometry=True, n=30)
+    state, truth = (new_state(Settings()), np.zeros(3)) if fresh else driven(30)
     before = state.fused.T_odom_base.copy()
     records: list[Record] = [bad(kind)]
     if not fresh:
@@ -102,17 +115,16 @@ def test_bad_scans_say_why_and_move_nothing(kind: str, fresh: bool) -> None:
         few = (Reason.TOO_FEW_POINTS, Reason.TOO_FEW_PAIRS)
         assert result.match.reason in (*few, Reason.NO_MAP, Reason.REJECTED, Reason.MALFORMED)
         np.testing.assert_allclose(result.T_odom_base, before, atol=1e-9)
-    assert np.abs(se2.between(truth[-1], result.T_odom_base)[:2]).max() < 0.03
+    assert np.abs(se2.between(truth, result.T_odom_base)[:2]).max() < 0.03
     assert np.isfinite(result.covariance).all()
     if not fresh:
-        again = step(state, [scan_at(truth[-1], 16.1, 1000)], UNLIMITED)
+        again = step(state, [scan_at(truth, 16.1, 1000)], UNLIMITED)
         assert again.match is not None
         assert again.match.ok
 
 
 def test_set_pose_moves_the_map_and_counts_a_jump() -> None:
-    state = new_state(Settings())
-    drive(state, odometry=True, n=60)
+    state, _ = driven(60)
     before = state.fused.T_odom_base.copy()
     wanted = np.array((10.0, -3.0, 1.0))
     result = step(state, [Command(3.1, Order.SET_POSE, wanted)], UNLIMITED)
@@ -125,12 +137,11 @@ def test_set_pose_moves_the_map_and_counts_a_jump() -> None:
 
 
 def test_reset_forgets_the_map() -> None:
-    state = new_state(Settings())
-    truth, _ = drive(state, odometry=True, n=60)
+    state, truth = driven(60)
     result = step(state, [Command(3.1, Order.RESET)], UNLIMITED)
     np.testing.assert_allclose(se2.compose(result.T_map_odom, result.T_odom_base), np.zeros(3), atol=1e-12)
     assert list(keyframe_poses(state)) == [0]
-    again = step(state, [scan_at(truth[-1], 3.2, 1000)], UNLIMITED)
+    again = step(state, [scan_at(truth, 3.2, 1000)], UNLIMITED)
     assert again.match is not None
     assert again.match.reason is Reason.NO_MAP
     assert again.keyframe > 0
