@@ -179,7 +179,7 @@ def desk(warm_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Desk:
                 until((made.folder / "run/lumiloop/lumiloop.stream").exists)
         shutil.rmtree(made.folder / "drive")
         with made.running(recording):
-            until(lambda: tracks(made), 30.0)
+            until(lambda: tracks(made), 120.0)
             made.at = time.strftime(AT)
             beside(made)
     return made
