@@ -151,8 +151,8 @@ class Atlas:
         kept: ID of this session's first keyframe, where the map is one that was restored; else 0. held: that map is
             only used; see `Settings.localise`. foreign: that map does not lie in the light survey's frame, and the
             robot's place in it has not been found yet. askew: covariance (m, m, rad; map axes) of the place that light
-            had told, and so of that map, in the survey's frame at the last match before the place was lost; T_askew:
-            the pose at that match.
+            had told, and so of that map, in the survey's frame before the place was lost; T_askew: the pose then. See
+            `Absolute.kept`.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
