@@ -26,7 +26,7 @@ from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
-from estimator.row import doubt, straighten
+from estimator.row import doubt, straighten, sure_part
 from estimator.state import State
 from estimator.trail import KEPT_S
 
@@ -49,9 +49,10 @@ SURPRISE_S = 1.0
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 """What stamps and lever arms make of a moving robot."""
 
-FAR_M, FAR_RAD = 1.5, 0.5
-"""While the laser has held the pose without a break, light that disagrees by less than this is told, not followed: the
-laser does not lose so little, and light that reflects in an unusual place can be off by as much."""
+FAR_M, FAR_RAD, CHECKED = 1.5, 0.5, 3
+"""While the laser has held the pose without a break, light that is off by less is told, not followed: the laser does
+not lose so little, and light that reflects in an unusual place is off by as much; nor, where the pose is known, is
+light of fewer lamps: one of two that hangs elsewhere takes the place along."""
 SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
@@ -409,8 +410,7 @@ def pose_at(state: State, t_mono: float) -> Array:
 def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
     """Whether light has disagreed with the pose for long enough, and by enough, to be believed.
 
-    Light that is still looking for its place, or that is off by less than the laser could have lost, says nothing
-    against a pose that was proved and that the laser has held since.
+    Light that looks, or is off by less than the laser could have lost, says nothing against a proved pose held since.
     """
     tie = state.absolute
     assert tie is not None
@@ -419,9 +419,10 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
         return False
     tie.odd_since = lights.t_mono if tie.odd_since is None else tie.odd_since
     held = tie.proved and not tie.broken and not blind(state)
-    turned = abs(off[2]) > FAR_RAD and not holds_heading(state) and _elsewhere(state)
-    far = math.hypot(off[0], off[1]) > FAR_M or turned
-    believed = not held or (far and lights.fix is Fix.GOOD)
+    away, turn = sure_part(off, lights.covariance)
+    far = away > FAR_M or (turn > FAR_RAD and not holds_heading(state) and _elsewhere(state))
+    checked = len(lights.accepted) >= CHECKED or bool(np.any(np.diag(tie.P) >= KNOWN))
+    believed = not held or (far and lights.fix is Fix.GOOD and checked)
     return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
 
 

@@ -28,6 +28,9 @@ BENT_M = 0.7
 """A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
 is off by says nothing of that."""
 
+SURE = 3.0
+"""An offset of fewer standard deviations of what has told it may be none."""
+
 KNOWN = 4096
 """So many sets of lamps are remembered."""
 
@@ -94,6 +97,23 @@ def straighten(P: Array, X: Array) -> tuple[Array, Array]:
     for A in (P, X):
         A[2, :2] = A[:2, 2] = 0.0
     return P, X
+
+
+def sure_part(off: Array, P: Array) -> tuple[float, float]:
+    """Distance (m) and turn (rad) by which a pose is off, as far as what told the pose can be sure of it.
+
+    Of a distance only what lies along those axes of its uncertainty on which it is beyond doubt: a place that is 1.4 m
+    across the row and half a metre along it is half a metre away.
+
+    Args:
+        off: x, y, yaw; m and rad.
+        P: covariance (3, 3) of what has told the pose, in the same axes.
+    """
+    variances, axes = np.linalg.eigh(P[:2, :2])
+    apart = axes.T @ off[:2]
+    sure = apart[apart * apart > SURE * SURE * variances]
+    turn = abs(float(off[2]))
+    return float(np.linalg.norm(sure)), turn if turn > SURE * math.sqrt(P[2, 2]) else 0.0
 
 
 def spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:

@@ -363,9 +363,20 @@ def test_a_heading_from_light_is_followed_against_the_laser_only_if_light_has_lo
     assert abs(se2.wrap(now[2] - T[2])) == pytest.approx(1.0 if followed else 0.0, abs=0.05)
 
 
-@pytest.mark.parametrize(("away", "broken", "followed"), [(0.9, False, False), (2.5, False, True), (0.9, True, True)])
+@pytest.mark.parametrize(
+    ("off", "broken", "lamps", "followed"),
+    [
+        ((0.9, 0.0), False, (1, 4, 13, 16), False),
+        ((2.5, 0.0), False, (1, 4, 13, 16), True),
+        ((0.9, 0.0), True, (1, 4, 13, 16), True),
+        ((2.5, 0.0), False, (1, 16), False),  # two lamps do not check each other
+        ((2.5, 0.0), True, (1, 16), True),
+        ((1.0, 1.4), False, (1, 2, 3, 4), False),  # across their row they do not know, along it is not far
+        ((2.5, 1.4), False, (1, 2, 3, 4), True),
+    ],
+)
 def test_only_what_the_laser_could_have_lost_is_taken_from_light(
-    driven: tuple[State, Log], away: float, broken: bool, followed: bool
+    driven: tuple[State, Log], off: tuple[float, float], broken: bool, lamps: tuple[int, ...], followed: bool
 ) -> None:
     state = copy.deepcopy(driven[0])
     tie = state.absolute
@@ -373,10 +384,10 @@ def test_only_what_the_laser_could_have_lost_is_taken_from_light(
     assert tie.proved
     tie.broken = broken
     T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    told = T + np.array((away, 0.0, 0.0))
+    told = T + np.array((*off, 0.0))
     for _ in range(30):
         state.fused.t_mono += 0.05
         tie.t_match = state.fused.t_mono
-        absolute.on_lights(state, lights_at(told, frozenset((1, 4, 13, 16)), state))
+        absolute.on_lights(state, lights_at(told, frozenset(lamps), state))
     now = se2.compose(state.T_map_odom, state.fused.T_odom_base)
     assert np.hypot(*(now - told)[:2]) < 0.05 if followed else np.hypot(*(now - T)[:2]) < 0.05
