@@ -15,13 +15,16 @@ import errno
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Final
 
 from hal.i2c import Bus, Message, OnRead, Transferred
 
 CLOSE_S: Final = 0.25
 """Patience with a transaction in the kernel when the bus is closed; afterwards the thread ends by itself."""
+
+IDLE_S: Final = 1.0
+"""How often a thread without work looks whether its loop is still there: one that ended without a word closes no bus."""
 
 Post = Callable[..., None]
 
@@ -147,9 +150,18 @@ class ThreadedBus:
         self._about = bus.about
         self._post(_succeed, self.opened, None)
         with closing(bus):
-            while (job := self._jobs.get()) is not None:
+            while (job := self._next()) is not None:
                 self._run(job, bus)
         self._post(self._ended.set)
+
+    def _next(self) -> _Job | None:
+        """What to do next, waited for; None when the bus is to be closed or the loop has been."""
+        while not self._loop.is_closed():
+            try:
+                return self._jobs.get(timeout=IDLE_S)
+            except Empty:
+                continue
+        return None
 
     def _run(self, job: _Job, bus: Bus) -> None:
         if isinstance(job, _Once):

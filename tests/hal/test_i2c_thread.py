@@ -222,6 +222,16 @@ def test_a_loop_that_has_ended_ends_the_thread() -> None:
     assert slow.closed.wait(4.0)
 
 
+def test_a_loop_that_has_ended_ends_a_thread_without_work() -> None:
+    slow = Slow()
+
+    async def main() -> None:
+        await opened(slow)
+
+    asyncio.run(main())
+    assert slow.closed.wait(4.0)
+
+
 def test_opening_a_bus_that_is_not_there() -> None:
     from hal.opening import open_bus
 
