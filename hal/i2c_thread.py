@@ -24,7 +24,7 @@ CLOSE_S: Final = 0.25
 """Patience with a transaction in the kernel when the bus is closed; afterwards the thread ends by itself."""
 
 IDLE_S: Final = 1.0
-"""How often a thread without work looks whether its loop is still there: one that ended without a word closes no bus."""
+"""How often a thread without work looks whether its loop is still there: one that just ended closes no bus."""
 
 Post = Callable[..., None]
 
