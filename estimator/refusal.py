@@ -1,6 +1,7 @@
 """Scans that no lidar can have measured are refused before anything is computed from them, and it is said why.
 
-A bearing or a mount that is no number would become an index in the kernels; arrays that do not belong together, or a
+A bearing or a mount that is no number would become an index in the kernels; an angle of millions of turns has no digits
+left for the beams, which then fall together to a scan that fits anywhere; arrays that do not belong together, or a
 sweep that ends before it begins, come from a program and not from the world.
 """
 
@@ -21,7 +22,7 @@ LARGEST_NOISE_M = 1.0
 LATEST_S = 1e11
 """No clock of a robot, and no stamp of a log, is three thousand years from its zero."""
 FULL_TURN = 2.0 * math.pi + 0.1
-"""Bearings of one sweep span no more than this."""
+"""Bearings of one sweep span no more than this; nor is one of them, or a mount's yaw, farther from zero."""
 
 
 def refused(state: State, scan: Scan) -> Reason | None:
@@ -43,7 +44,7 @@ def well_formed(scan: Scan) -> bool:
     if len(shape) != 1 or mount.shape != (3,) or mount.dtype != np.float64 or not mount.flags.c_contiguous:
         return False
     x, y, yaw = mount.tolist()
-    placed = math.hypot(x, y) < FARTHEST_MOUNT_M and math.isfinite(yaw)
+    placed = math.hypot(x, y) < FARTHEST_MOUNT_M and abs(yaw) <= FULL_TURN
     timed = in_time(scan.t_end) and 0.0 <= scan.t_end - scan.t_begin < LONGEST_SWEEP_S
     return placed and timed and 0.0 <= scan.sigma_m < LARGEST_NOISE_M
 
@@ -54,7 +55,8 @@ def even(state: State, bearing: Array) -> bool:
         return True
     steps = np.diff(bearing) if np.isfinite(bearing).all() else np.zeros(1)
     one_way = bool((steps > 0.0).all() or (steps < 0.0).all())
-    if not one_way or abs(float(bearing[-1]) - float(bearing[0])) > FULL_TURN:
+    first, last = float(bearing[0]), float(bearing[-1])
+    if not one_way or max(abs(first), abs(last), abs(last - first)) > FULL_TURN:
         return False
     state.bearing_rad = bearing
     return True

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimator import se2
@@ -41,6 +41,9 @@ MALFORMED: dict[str, Callable[[Scan], Scan]] = {
     "a mount that is no number": lambda scan: replace(scan, T_base_lidar=np.array((0.0, np.nan, 0.0))),
     "a mount without end": lambda scan: replace(scan, T_base_lidar=np.array((0.0, 0.0, np.inf))),
     "a mount a mile away": lambda scan: replace(scan, T_base_lidar=np.array((1609.0, 0.0, 0.0))),
+    "a mount turned beyond all digits": lambda scan: replace(scan, T_base_lidar=np.array((0.0, 0.0, 1e300))),
+    "a mount of twenty turns": lambda scan: replace(scan, T_base_lidar=np.array((0.0, 0.0, 40.0 * np.pi))),
+    "bearings a million turns on": lambda scan: replace(scan, bearing_rad=BEARING + 2e6 * np.pi),
     "a mount of two numbers": lambda scan: replace(scan, T_base_lidar=np.zeros(2)),
     "noise that is no number": lambda scan: replace(scan, sigma_m=np.nan),
     "noise below nothing": lambda scan: replace(scan, sigma_m=-0.01),
@@ -253,9 +256,20 @@ def fuzzed(
     return Scan(end, end, seed, np.array(mount), bearing, ranges, beam, sigma)
 
 
+WAY = float(BEARING[0]), float(BEARING[-1])
+FELL_TOGETHER = [
+    (N, WAY, "room", 1, 0.01, 80.0, (0.0, 0.0, 0.0)),
+    (N, WAY, "room", 0, 0.01, 0.0, (0.0, 0.0, 0.0)),
+    (N, WAY, "same", 0, 0.01, 0.0, (0.0, 0.0, 1e300)),
+]
+"""Eighty seconds nobody speaks of, then a scan whose beams all have one bearing, since the mount's yaw has no digits
+left for them: it once fitted a wall nine metres off."""
+
+
 @pytest.mark.parametrize("matcher", Matcher)
 @settings(max_examples=15, deadline=None)
 @given(cases=st.lists(FUZZ, min_size=1, max_size=6))
+@example(cases=FELL_TOGETHER)
 def test_whatever_comes_the_step_goes_on(
     matcher: Matcher, cases: list[tuple[int, tuple[float, float], str, int, float, float, tuple[float, ...]]]
 ) -> None:
