@@ -30,7 +30,7 @@ def test_the_age_of_the_process_is_that_of_the_kernel() -> None:
 
 
 def test_resident_memory_counts_what_is_touched() -> None:
-    """Pages of its own: the allocator may hand out some that an earlier test has touched and the process still holds."""
+    """With pages of its own: the allocator may hand out some that an earlier test has touched."""
     before = resident_mb()
     with mmap.mmap(-1, 50_000_000, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as ballast:
         for at in range(0, len(ballast), mmap.PAGESIZE):
