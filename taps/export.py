@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -37,6 +37,10 @@ IN_A_LOG_S: Final = 10.0
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 
 
+class WouldLose(Exception):
+    """What is asked for would write over what is read, or over itself."""
+
+
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.mcap is None and args.tum is None and args.kitti is None:
@@ -48,6 +52,8 @@ def main(args: argparse.Namespace) -> int:
         if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
             raise
         return cli.fail(f"MCAP files need {error.name}, which is not installed: {how_to_install('mcap')}")
+    except WouldLose as error:
+        return cli.fail(str(error), cli.USAGE)
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return cli.fail(str(error))
     except OSError as error:
@@ -68,8 +74,7 @@ def _save(args: argparse.Namespace) -> int:
     if args.tum or args.kitti:
         told = f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole"
         return cli.fail(f"{told}; trajectories are made of the recording itself", cli.USAGE)
-    if args.mcap.resolve() == args.log.resolve():
-        return cli.fail(f"--mcap {args.mcap}: is the file that is read; name another one", cli.USAGE)
+    _refuse_to_write_over((args.log,), args)
     try:
         found = recover(args.log, args.mcap)
     except NotMcap as error:
@@ -81,6 +86,7 @@ def _save(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
     told = Retold(args.log, args.settings, Given(args.config is not None, keys))
+    _refuse_to_write_over(told.source.files, args)
     if made := made_elsewhere(told.source.header):
         cli.say(f"{args.log}: {made}")
     stopped = ""
@@ -109,6 +115,22 @@ def _export(args: argparse.Namespace) -> int:
         count, first = told.rerun.comparison.differ, told.rerun.comparison.first
         cli.say(f"the replay is not the recorded run in {count} cycles: other software, or records lost; first {first}")
     return cli.fail(f"{stopped}; what was read until then is written") if stopped else cli.OK
+
+
+def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> None:
+    """Before anything is replayed: a target that is read from, or one that is named twice.
+
+    Raises:
+        WouldLose: naming the option.
+    """
+    taken = {path.resolve(): "the file that is read" for path in read}
+    for option in ("mcap", "tum", "kitti"):
+        target: Path | None = getattr(args, option)
+        if target is None:
+            continue
+        if target.resolve() in taken:
+            raise WouldLose(f"--{option} {target}: is {taken[target.resolve()]}; name another one")
+        taken[target.resolve()] = f"what --{option} writes, too"
 
 
 @contextmanager

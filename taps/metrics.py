@@ -37,7 +37,12 @@ Sample = tuple[Labels, float]
 
 @dataclass(slots=True)
 class Told:
-    """The latest of everything; ``up``: whether the daemon is there."""
+    """The latest of everything.
+
+    Attributes:
+        up: whether the daemon is there. held: the last frame with a pose of this run of it, also when it has gone.
+        t_heard: when the latest pose came.
+    """
 
     up: bool = False
     hello: Hello | None = None
@@ -49,18 +54,18 @@ class Told:
     t_heard: float = -math.inf
 
     def latest(self, now: float) -> Pose | None:
-        """The pose told last, without its place where none has come for :data:`OLD_S`: the daemon stands then."""
-        if self.pose is None or now - self.t_heard <= OLD_S:
+        """The pose told last; once the daemon has gone, or stood for :data:`OLD_S`, without a place in the map."""
+        if self.pose is not None and now - self.t_heard <= OLD_S:
             return self.pose
-        return msgspec.structs.replace(self.pose, pose=None)
+        return None if self.held is None else msgspec.structs.replace(self.held, pose=None)
 
     def take(self, frame: Frame | Lost, now: float) -> None:
         """Take one in, at ``now`` of our own clock (CLOCK_MONOTONIC, which is also the daemon's)."""
         match frame:
             case Lost():
                 self.up, self.pose, self.lights, self.faults, self.statistics = False, None, None, None, None
-            case Hello():
-                self.up, self.hello = True, frame
+            case Hello():  # of another run: where the one before lost its pose says nothing of where the robot is now
+                self.up, self.hello, self.held = True, frame, None
             case Pose():
                 self.pose, self.t_heard = frame, now
                 self.held = frame if frame.pose is not None else self.held

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -294,6 +295,26 @@ def test_an_mcap_file_is_neither_written_over_itself_nor_made_into_a_trajectory(
     assert cli.main(["export", str(file), "--tum", str(tmp_path / "t")]) == cli.USAGE
     assert "made of the recording itself" in capsys.readouterr().err
     assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("option", ["--tum", "--kitti", "--mcap"])
+def test_an_export_never_writes_over_what_it_reads_nor_over_itself(
+    option: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Seen before anything is replayed, however the file is named."""
+    shutil.copytree(recording, tmp_path / "copied")
+    segment = min((tmp_path / "copied").rglob("*.lumirec"))
+    before = segment.read_bytes()
+    (tmp_path / "link").symlink_to(segment)
+    for log in (segment, segment.parent):
+        assert cli.main(["export", str(log), option, str(tmp_path / "link")]) == cli.USAGE
+        said = capsys.readouterr().err
+        assert f"{option} {tmp_path / 'link'}: is the file that is read; name another one" in said
+    other = "--kitti" if option == "--tum" else "--tum"
+    assert cli.main(["export", str(segment), option, str(tmp_path / "t"), other, f"{tmp_path}/./t"]) == cli.USAGE
+    assert "writes, too; name another one" in capsys.readouterr().err
+    assert segment.read_bytes() == before
+    assert not (tmp_path / "t").exists()
 
 
 @pytest.mark.system

@@ -146,6 +146,27 @@ def test_a_daemon_that_stands_still_does_not_localize() -> None:
     assert b'"x": 1.0' in said
 
 
+def test_of_a_daemon_that_has_gone_the_last_place_is_told_and_of_the_next_one_its_own() -> None:
+    """A vehicle that asks for its position learns where it was last known to be, and that this is not known to hold."""
+    told = Told()
+    answering = serve_metrics.Answering(told)
+    request = b"GET /vda5050/2 HTTP/1.1\r\n\r\n"
+    told.take(Hello(schema=1, name="agv", pid=1), 0.0)
+    assert b"503" in answering._answer(request)
+    told.take(POSE, time.monotonic())
+    told.take(Lost("gone"), time.monotonic())
+    said = answering._answer(request)
+    assert b" 200 OK" in said
+    assert json.loads(said.partition(b"\r\n\r\n")[2])["agvPosition"] == {
+        "x": 1.0, "y": 2.0, "theta": pytest.approx(7.0 - 2.0 * math.pi, abs=1e-5), "mapId": "000000ff",
+        "positionInitialized": False, "localizationScore": 0.0,
+    }  # fmt: skip
+    told.take(Hello(schema=1, name="agv", pid=2), 9.0)
+    assert b"there is no pose yet" in answering._answer(request)
+    told.take(msgspec.structs.replace(POSE, state=int(State.LOST), pose=None), time.monotonic())
+    assert b"there is no pose yet" in answering._answer(request)
+
+
 def test_a_robot_that_is_lost_is_not_localized() -> None:
     assert position(msgspec.structs.replace(POSE, pose=None)) is None
     lost = msgspec.structs.replace(POSE, state=int(State.LOST), pose=None)
