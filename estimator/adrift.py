@@ -15,12 +15,13 @@ from typing import Final
 import numpy as np
 
 from estimator import absolute, livemap, se2
+from estimator.askew import askew_at
 from estimator.atlas import LOOK, Atlas
 from estimator.closing import join
 from estimator.globalsearch import Around
 from estimator.hypotheses import WATCH_M, Hypothesis, Seek, Watch
 from estimator.keyframe import Keyframe
-from estimator.linear3 import invert3, swing
+from estimator.linear3 import invert3
 from estimator.loop import Found
 from estimator.mapframe import move_map, rehang, shift_map, unlist
 from estimator.records import Array
@@ -335,7 +336,7 @@ def land(state: State, one: Hypothesis, alone: bool) -> None:
             close = Found(it.key, it.T_submap_keyframe, P, it.share, it.against, it.residual_m, np.zeros(3))
             join(atlas, at, replace(close, reason=LoopReason.PLACED))
     bridge(atlas, first)
-    resettle(state, frame, fit.P)
+    resettle(state, frame, fit.P, first)
     rehang(state, since)
 
 
@@ -351,8 +352,11 @@ def bridge(atlas: Atlas, first: int | None) -> None:
         atlas.constraints.add(key, after.key, T, P, True)
 
 
-def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
-    """How sure the pose is now: by the match that has decided, and the way since."""
+def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> None:
+    """How sure the pose is now: by the match that has decided, the way since, and the map it was found in.
+
+    ``first``: key of the first submap that is no part of that map.
+    """
     atlas = state.atlas
     newest = atlas.newest
     assert newest is not None
@@ -371,10 +375,8 @@ def resettle(state: State, frame: Keyframe, P_map: Array) -> None:
         tie.gap, tie.odd_since = None, None
     elif tie.placed or told(state):  # the map's frame is the survey's
         absolute.hang_on_anchor(state)
-        off = se2.compose(state.T_map_odom, state.fused.T_odom_base) - atlas.T_askew
-        askew = atlas.askew.copy()
-        swing(float(off[0]), float(off[1]), askew)
-        tie.P = tie.P + R @ askew @ R.T  # the map is no surer in the survey's frame than when it was left
+        askew = askew_at(atlas, se2.compose(state.T_map_odom, state.fused.T_odom_base), first)
+        tie.P = tie.P + R @ askew @ R.T  # no surer in the survey's frame than the map is
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from estimator import absolute, bymap, livemap, se2
+from estimator.askew import APART
 from estimator.atlas import LOOK, SOLVE, Atlas, Ints, Waiting
 from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
@@ -41,9 +42,6 @@ TREMBLE: Final = np.diag((0.005**2, 0.005**2, 0.003**2))
 
 AS_ONE: Final = 1e-6
 """Rounding (m, rad) of submaps that were moved together."""
-
-APART: Final = 4.0
-"""By how much the variance of what light said is raised: its errors hang together over several submaps."""
 
 
 def take_answer(state: State, answer: Answer) -> None:

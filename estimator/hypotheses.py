@@ -41,6 +41,12 @@ BEHIND: Final = 0.15
 NEARLY, NEARLY_M, NEARLY_RAD = 0.75, 0.1, 0.03
 """Share of the beams, and deviations, of a place that another witness may confirm though no look has held it."""
 
+STEADY, HALF = 3, 0.5
+"""So many looks have to have found it in the same place, with this share, where less of the beams fit."""
+
+LOST: Final = 2
+"""Looks in a row that lost a place while they held another one: it is no rival of that one any more."""
+
 MOVED_M, MOVED_RAD = 1.0, 0.5
 """A robot that is farther from where it was remembered has been moved: more than it rolls on once it is not steered."""
 
@@ -137,6 +143,7 @@ class Seek:
     def favourite(self) -> Hypothesis | None:
         """The only place that a look has held, or nearly, if there is one and all others are well behind it."""
         held = [one for one in self.alive if one.held]
+        held = [one for one in held if not outdone(one, held)]
         if len(held) > 1 or not self.alive:
             return None
         best = held[0] if held else max(self.alive, key=lambda one: one.share)
@@ -174,13 +181,25 @@ def near(remembered: Array, T_map_odom: Array) -> bool:
     return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
 
 
+def outdone(one: Hypothesis, held: list[Hypothesis]) -> bool:
+    """Whether looks have lost a place that they once held while they went on holding another one, and surely."""
+    return one.idle >= LOST and any(not other.idle and other.holds >= HELD for other in held if other is not one)
+
+
 def nearly(one: Hypothesis) -> Hypothesis | None:
-    """A place that no look has held, as if the latest had, where only somebody who stands about spoke against it."""
+    """A place that no look has held, as if the latest had, where only what has changed since spoke against it.
+
+    Somebody who stands about leaves most of the beams; where furniture was moved, look after look has to fit there.
+    """
     if one.latest is None:
         return None
     frame, fit = one.latest
     x, y, yaw = np.sqrt(np.diag(fit.P)).tolist()
-    if fit.share < NEARLY or math.hypot(x, y) > NEARLY_M or yaw > NEARLY_RAD:
+    if math.hypot(x, y) > NEARLY_M or yaw > NEARLY_RAD:
+        return None
+    x, y, yaw = se2.between(se2.compose(one.T_map_odom, frame.T_odom_keyframe), fit.T_map_keyframe).tolist()
+    steady = one.looks >= STEADY and math.hypot(x, y) < NEARLY_M and abs(yaw) < NEARLY_RAD
+    if fit.share < (HALF if steady else NEARLY):
         return None
     return replace(one, T_map_odom=carried(frame, fit), held=((frame, fit),), idle=0)
 

@@ -91,7 +91,7 @@ def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_whe
     assert begin(state), "carried on: of the place meanwhile nobody knew anything"
     np.testing.assert_allclose(state.atlas.askew[2, 2], 0.02)
     state.T_map_odom = np.array((0.0, 0.0, -0.4))
-    resettle(state, next(reversed(state.keyframes.values())), 1e-6 * np.eye(3))
+    resettle(state, next(reversed(state.keyframes.values())), 1e-6 * np.eye(3), None)
     way = math.hypot(*(se2.compose(state.T_map_odom, state.fused.T_odom_base) - left)[:2])
     assert way > 3.0
     assert tie.P[2, 2] < 0.03
