@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,3 +59,45 @@ def test_a_place_that_most_looks_leave_open_is_not_sure(verdicts: list[Verdict],
     assert seek.favourite() is one
     assert seek.sure(one, False) is sure
     assert seek.sure(one, True), "a second witness makes it so"
+
+
+def half_fitting(frame: Keyframe, share: float, x: float = 0.0) -> Fit:
+    """A look that leaves a place open, ``x`` metres off it, though its axes are well known."""
+    T = frame.T_odom_keyframe + np.array((x, 0.0, 0.0))
+    return replace(fit(frame, OPEN), share=share, T_map_keyframe=T)
+
+
+@pytest.mark.parametrize(
+    ("share", "looks", "drift_m", "found"),
+    [(0.55, 3, 0.0, True), (0.55, 2, 0.0, False), (0.45, 3, 0.0, False), (0.55, 3, 0.2, False), (0.8, 1, 0.2, True)],
+)
+def test_where_half_of_the_beams_fit_look_after_look_has_to_find_the_same_place(
+    share: float, looks: int, drift_m: float, found: bool
+) -> None:
+    """Furniture was moved: no look holds the place, and nothing else fits."""
+    seek = Seek(alive=(Hypothesis(se2.identity()),))
+    for k in range(looks):
+        frame = frame_at(1.0 + 0.5 * k)
+        fits = tuple(half_fitting(frame, share, drift_m * (k == looks - 1)) for _ in seek.alive)
+        seek.take(frame, seek.alive, Looked(TERRAIN, fits, (), True, 0))
+    one = seek.favourite()
+    assert (one is not None) is found
+    if one is not None:
+        assert seek.sure(one, True)
+        assert not seek.sure(one, False), "the laser alone is not enough"
+
+
+@pytest.mark.parametrize(("lost", "decided"), [(1, False), (2, True)])
+def test_a_place_that_looks_have_lost_while_they_held_another_is_no_rival(lost: int, decided: bool) -> None:
+    far = np.array((9.0, 0.0, np.pi))
+    seek = Seek(alive=(Hypothesis(se2.identity()), Hypothesis(far)))
+    for k in range(4 + lost):
+        frame = frame_at(1.0 + 0.5 * k)
+        there = fit(frame, HOLDS if k < 2 else OPEN)
+        T = se2.compose(far, frame.T_odom_keyframe)
+        there = replace(there, T_map_keyframe=T, share=0.8 if k < 2 else 0.0)
+        if 2 <= k < 4:  # both are held until here
+            there = replace(there, verdict=HOLDS, share=0.5)
+        seek.take(frame, seek.alive, Looked(TERRAIN, (fit(frame, HOLDS), there), (), True, 0))
+    assert len(seek.alive) == 2
+    assert (seek.favourite() is not None) is decided
