@@ -99,9 +99,9 @@ deb:  ## the same as a Debian package, in out/
 	systemd/package.sh
 
 lock:  ## renew the lock files (needs uv)
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade pyproject.toml -o requirements/core.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra zenoh pyproject.toml -o requirements/dev.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra zenoh --extra bench pyproject.toml -o requirements/bench.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade pyproject.toml -o requirements/core.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra zenoh pyproject.toml -o requirements/dev.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra zenoh --extra bench pyproject.toml -o requirements/bench.lock
 
 clean:  ## remove what the targets above made
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from fnmatch import fnmatch
+from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -38,10 +40,25 @@ def test_locks_have_everything_that_is_named() -> None:
     extras = PROJECT["project"]["optional-dependencies"]
     dev = ["test", "plot", "mcap", "foxglove", "view", "zenoh"]
     for lock, named in {"core": [], "dev": dev, "bench": [*dev, "bench"]}.items():
-        kept = {row.partition("==")[0] for row in (ROOT / f"requirements/{lock}.lock").read_text().splitlines()}
+        kept = {name_of(row) for row in (ROOT / f"requirements/{lock}.lock").read_text().splitlines()}
         wanted = [*PROJECT["project"]["dependencies"], *(one for extra in named for one in extras[extra])]
         missing = {one for one in wanted if name_of(one) not in kept}
         assert not missing, f"{lock}.lock lacks {missing}"
+
+
+def test_locks_name_the_extras_that_packages_ask_for() -> None:
+    """Else pip takes the newest version for the extra, and refuses it for want of a hash, once there is a newer one."""
+    rows = [row for row in (ROOT / "requirements/dev.lock").read_text().splitlines() if "==" in row]
+    locked = {name_of(row): row.partition("==")[0] for row in rows}
+    asked = {
+        requirement.partition("]")[0] + "]"
+        for one in metadata.distributions()
+        if name_of(one.metadata["Name"]) in locked
+        for requirement in one.requires or ()
+        if re.match(r"[\w.-]+\[", requirement) and "extra ==" not in requirement
+    }
+    assert "coverage[toml]" in asked
+    assert not {one for one in asked if locked.get(name_of(one)) != one}
 
 
 def name_of(requirement: str) -> str:
