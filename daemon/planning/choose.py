@@ -59,6 +59,17 @@ class Plan:
     reached: float
     possible: npt.NDArray[np.bool_]
 
+    def short_of(self, goals: Goals) -> str:
+        """Why the goals are not reached where they could be, or there are fewer lamps than asked; else empty."""
+        count = len(self.lamps)
+        if goals.exact is not None:
+            return "" if count >= goals.exact else f"only {count} spots where one more lamp would tell anything"
+        share = self.reached / max(1e-9, float(self.possible.mean()))
+        if share >= goals.share or not self.possible.any():
+            return ""
+        why = f"limit of {goals.most} lamps" if count >= goals.most else "no further spot helps"
+        return f"goal NOT reached: {why}; {100.0 * share:.1f} % of the places where it could be"
+
     @property
     def light_sigma(self) -> Array:
         """(n,) m, of the worse axis, from light alone."""

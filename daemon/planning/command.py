@@ -45,6 +45,8 @@ def main(args: argparse.Namespace) -> int:
         )  # fmt: skip
         sys.stdout.write(report(hall, plan, goals, fitting))
         _write(args, hall, plan, receiver, survey is None)
+        if survey is None and (short := plan.short_of(goals)):
+            return cli.fail(f"{short}: plan parts of the hall apart, or lower the goals (--share, --links, --accuracy)")
     except (NoHall, SurveyError, OutputRefused, ValueError) as error:
         return cli.fail(str(error))
     return cli.OK

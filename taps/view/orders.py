@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import secrets
 import struct
 from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
@@ -85,20 +86,24 @@ class Wire(asyncio.DatagramProtocol):
         return told
 
     async def next_number(self) -> int:
-        """A number that starts a command."""
+        """A number that starts a command: not the one in force, and not what another client would take next, too."""
         before = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 1))
-        return int.from_bytes(before[2:4], "big") % 0xFFFF + 1
+        return (int.from_bytes(before[2:4], "big") + secrets.randbelow(0xFFFE)) % 0xFFFF + 1
 
-    async def outcome(self, number: int) -> tuple[bool, bool, Outcome]:
-        """Whether the request in force is still ours, whether it has ended, and how."""
+    async def outcome(self, ours: bytes) -> tuple[bool, bool, Outcome]:
+        """Whether the order in force is still ours, whether it has ended, and how.
+
+        ``ours``: the registers as they were written; another client may have taken the same number.
+        """
         told = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 10))
-        request = int.from_bytes(told[2:4], "big")
+        number = int.from_bytes(ours[:2], "big")
         acknowledged, result = struct.unpack(">HH", told[2 + 16 : 2 + 20])
         try:
             outcome = Outcome(result)
         except ValueError:
             outcome = Outcome.UNKNOWN
-        return request == number, acknowledged == number and outcome is not Outcome.RUNNING, outcome
+        mine = told[2 : 2 + len(ours)] == ours
+        return mine, acknowledged == number and outcome is not Outcome.RUNNING, outcome
 
     def close(self) -> None:
         """Close the socket."""
@@ -145,7 +150,7 @@ class Orders:
             self._tell({**self._latest, "outcome": "replaced", "by": viewer})
         self._latest = {"order": name, "pose": pose if name == "set_pose" else None, "viewer": viewer, "number": number}
         self._tell({**self._latest, "outcome": "running"})
-        self._following = asyncio.create_task(self._follow(wire, number, dict(self._latest)))
+        self._following = asyncio.create_task(self._follow(wire, words, dict(self._latest)))
 
     async def close(self) -> None:
         """Stop following."""
@@ -161,13 +166,13 @@ class Orders:
             self._wire = await _wired(*self._where)
         return self._wire
 
-    async def _follow(self, wire: Wire, number: int, told: dict[str, object]) -> None:
+    async def _follow(self, wire: Wire, ours: bytes, told: dict[str, object]) -> None:
         """Until it has ended."""
         outcome = "no end seen"
         end = asyncio.get_running_loop().time() + LONGEST_S
         while asyncio.get_running_loop().time() < end:
             try:
-                mine, ended, result = await wire.outcome(number)
+                mine, ended, result = await wire.outcome(ours)
             except OrderRefused as error:
                 outcome = str(error)
                 break
@@ -199,10 +204,11 @@ async def switch_map(host: str, port: int, map_id: int) -> str:
     try:
         number = await wire.next_number()
         await wire.ask(struct.pack(">BHHBI", 16, MAP_ADDRESS, 2, 4, map_id))
-        await wire.ask(struct.pack(">BHHBHH", 16, COMMAND_ADDRESS, 2, 4, number, CommandCode.SWITCH_MAP))
+        ours = struct.pack(">HH", number, CommandCode.SWITCH_MAP)
+        await wire.ask(struct.pack(">BHHB", 16, COMMAND_ADDRESS, 2, 4) + ours)
         end = asyncio.get_running_loop().time() + LONGEST_S
         while asyncio.get_running_loop().time() < end:
-            mine, ended, result = await wire.outcome(number)
+            mine, ended, result = await wire.outcome(ours)
             if not mine:
                 return "replaced"
             if ended:

@@ -68,7 +68,9 @@ class Player:
             self.speed = min(max(float(speed), SLOWEST), FASTEST)
         if isinstance(paused, bool):
             self.paused = paused
-        if _is_number(at):
+        if not self._film.reels["pose"].times:
+            pass  # nothing to be shown yet: it begins with the first pose
+        elif _is_number(at):
             self.seek(float(at))
         elif paused is False and self._film.done and self.at >= self._film.t_last:
             self.seek(self._film.t_first)  # from the beginning again

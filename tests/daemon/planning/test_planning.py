@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,23 @@ def test_the_goals_are_reached_with_no_lamp_too_many(planned: tuple[Hall, Plan])
         fewer = plan_of(large, FITTING, walls, Goals(), np.delete(plan.lamps, left_out, axis=0))
         still = (fewer.links >= 4) & (fewer.light_sigma <= 0.10)
         assert still[plan.possible].mean() < 0.95
+
+
+def test_a_plan_that_falls_short_says_why(
+    planned: tuple[Hall, Plan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    large, plan = planned
+    assert plan.short_of(Goals()) == ""
+    few = Goals(most=3)
+    short = choose(large, FITTING, wall_information(large), few).short_of(few)
+    assert re.fullmatch(r"goal NOT reached: limit of 3 lamps; \d+\.\d % of the places where it could be", short)
+    path = write_pgm(tmp_path, room(3.0, 3.0))
+    words = ["plan", str(path), "--out", str(tmp_path / "plan"), "--lamps", "400", "--spacing", "1.0"]
+    assert cli.main(words) == cli.FAILED
+    said = capsys.readouterr()
+    assert re.search(r"only \d+ spots", said.err)
+    assert "lamps: " in said.out, "what was found is told and written"
+    assert (tmp_path / "plan" / "lights.toml").exists()
 
 
 def test_a_plan_is_better_than_as_many_lamps_in_rows(planned: tuple[Hall, Plan]) -> None:

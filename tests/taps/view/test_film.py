@@ -86,6 +86,29 @@ def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: Film) -> No
     asyncio.run(body())
 
 
+def test_a_bar_that_is_dragged_before_there_is_a_pose_blanks_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "film"
+    file.touch()
+    film = Film(tmp_path, file)
+
+    async def body() -> None:
+        viewer = Viewer(1)
+        player = Player(film, viewer)
+        player.told({"at": 0.0, "speed": 2.0})
+        playing = asyncio.create_task(player.run())
+        write(file, *((t, "pose", frame("pose", {"t_mono": t})) for t in (10, 11)))
+        for _ in range(100):
+            await asyncio.sleep(0.02)
+            if player.at >= 10.0:
+                break
+        playing.cancel()
+        assert (player.speed, player.at >= 10.0) == (2.0, True)
+        assert ("pose", {"t_mono": 10}) in told(viewer)
+        film.close()
+
+    asyncio.run(body())
+
+
 def test_tiles_on_their_way_when_the_time_leaps_are_told_again(film: Film) -> None:
     async def body() -> None:
         film.look()

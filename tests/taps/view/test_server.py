@@ -6,6 +6,7 @@ import asyncio
 import logging
 import re
 import socket
+import struct
 from collections.abc import Awaitable, Callable
 from importlib import resources
 from pathlib import Path
@@ -20,7 +21,7 @@ from daemon.publish import stream as daemon_stream
 from daemon.publish.holding import CommandCode, Outcome, Request
 from daemon.publish.snapshot import State
 from taps.frames import Loop, MapTiles, Scan
-from taps.view import server, viewers
+from taps.view import orders, server, viewers
 from taps.view.guard import Guard
 from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing
@@ -382,6 +383,30 @@ def test_an_order_that_another_client_replaces(tmp_path: Path) -> None:
                 assert "by" not in await page.until("order", lambda one: one["outcome"] == "replaced")
             finally:
                 await machine.close()
+
+    ordering(tmp_path, body)
+
+
+def test_the_end_of_another_client_s_order_of_the_same_number_is_not_ours(tmp_path: Path) -> None:
+    """Two masters took the next number at the same moment: the later order is the one that is done."""
+
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        async with house.page(TOKEN) as page:
+            await page.welcome()
+            await order(page, "relocalise")
+            await page.until("order")
+            wire = await orders._wired("127.0.0.1", modbus.port)
+            try:
+                other = struct.pack(">HH", asked[0].number, CommandCode.SAVE_MAP)
+                await wire.ask(struct.pack(">BHHB", 16, orders.COMMAND_ADDRESS, 2, 4) + other)
+                modbus.acknowledge(asked[0].number, Outcome.DONE)
+                assert (await page.until("order", lambda one: one["outcome"] != "running"))["outcome"] == "replaced"
+                taken = {await wire.next_number() for _ in range(40)}
+                assert asked[0].number not in taken
+                assert len(taken) > 30
+                assert all(0 < number <= 0xFFFF for number in taken)
+            finally:
+                wire.close()
 
     ordering(tmp_path, body)
 
