@@ -121,8 +121,6 @@ class View:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if not self._guard.origin_ok(request.headers.get("Origin"), request.headers.get("Host", "")):
             raise web.HTTPForbidden(text="Only the page of this server may open this.\n")
-        if len(self._sockets) >= VIEWERS:
-            raise web.HTTPServiceUnavailable(text=f"{FULL}\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_WORDS, compress=False)
         await socket.prepare(request)
         _little_kept(request)

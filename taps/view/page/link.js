@@ -3,7 +3,7 @@
 import { decode } from "./msgpack.js";
 
 export const PROTOCOL = 1;
-const PING_MS = 5000, LAST_RETRY_MS = 5000, RELOAD_MS = 2000, TOKEN = "lumiloop-token", RELOADED = "lumiloop-reloaded";
+const PING_MS = 5000, UNANSWERED = 2, LAST_RETRY_MS = 5000, RELOAD_MS = 2000, TOKEN = "lumiloop-token", RELOADED = "lumiloop-reloaded";
 
 export class Link {
   // told: {welcome, refused, frame, lost}: what is called with what comes.
@@ -18,6 +18,7 @@ export class Link {
     addEventListener("hashchange", () => {
       this.token = token();
       if (this.socket) this.socket.close();
+      else this.open();   // it was refused for want of the right one
     });
   }
 
@@ -30,17 +31,22 @@ export class Link {
     this.refused = "";
     socket.onopen = () => this.say({ page: this.page, token: this.token });
     socket.onmessage = (event) => this.take(event.data);
-    socket.onclose = () => {
-      clearInterval(this.beat);
-      this.socket = null;
-      this.told.lost();
-      if (this.refused !== "token") this.timer = setTimeout(() => this.open(), this.retry);
-      this.retry = Math.min(2 * this.retry, LAST_RETRY_MS);
-    };
+    socket.onclose = () => this.closed();
   }
 
+  closed() {
+    clearInterval(this.beat);
+    this.socket = null;
+    this.told.lost();
+    if (this.refused !== "token") this.timer = setTimeout(() => this.open(), this.retry);
+    this.retry = Math.min(2 * this.retry, LAST_RETRY_MS);
+  }
+
+  // Whether it went out: there may be no connection just now.
   say(words) {
-    if (this.socket && this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(words));
+    if (!this.socket || this.socket.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(words));
+    return true;
   }
 
   // The server's time, s since the epoch.
@@ -81,6 +87,7 @@ export class Link {
     sessionStorage.removeItem(RELOADED);
     this.retry = 250;
     this.trip = Infinity;
+    this.unanswered = 0;
     this.ping();
     clearInterval(this.beat);
     this.beat = setInterval(() => this.ping(), PING_MS);
@@ -98,9 +105,21 @@ export class Link {
     else this.socket.close();
   }
 
-  ping() { this.say({ ping: performance.now() }); }
+  // A network that has gone closes no socket for minutes: without answers it is given up and opened again.
+  ping() {
+    if (this.unanswered >= UNANSWERED) {
+      const socket = this.socket;
+      socket.onopen = socket.onmessage = socket.onclose = null;
+      socket.close();
+      this.closed();
+      return;
+    }
+    this.unanswered += 1;
+    this.say({ ping: performance.now() });
+  }
 
   pong(words) {
+    this.unanswered = 0;
     const trip = performance.now() - words.ping;
     if (trip > this.trip * 1.5 + 2) return;
     this.trip = Math.min(trip, this.trip);

@@ -38,7 +38,7 @@ export class Orders {
   }
 
   send(name, pose) {
-    this.link.say({ order: name, pose });
+    if (!this.link.say({ order: name, pose })) this.toast(`${SAID[name] || name}: not sent, there is no connection`, "bad");
     this.aim(false);
   }
 

@@ -190,6 +190,36 @@ def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -
     look(browser, address.partition("#")[0] + "#token=not-the-right-one", body)
 
 
+def test_a_token_that_is_pasted_after_a_refusal_is_tried(browser: str, address: str) -> None:
+    async def body(page: Tab) -> None:
+        await page.js("lumiloop.link.refused = 'token'; lumiloop.link.socket.close()")
+        await page.until("lumiloop.link.socket === null")
+        await page.js(f"location.hash = {address.partition('#')[2]!r}")
+        await page.until("lumiloop.link.socket && document.getElementById('mode').textContent === 'may order'", 20.0)
+
+    look(browser, address.partition("#")[0], body)
+
+
+def test_a_connection_that_answers_no_more_is_opened_again_and_orders_are_not_lost_unsaid(
+    browser: str, address: str
+) -> None:
+    """A phone that leaves the network gets no word of it for minutes."""
+
+    async def body(page: Tab) -> None:
+        await page.js("globalThis.first = lumiloop.link.socket; first.onmessage = null")
+        for _ in range(3):
+            await page.js("lumiloop.link.ping()")
+        await page.until("lumiloop.link.socket !== first")
+        await page.js("document.querySelector('[data-order=save_map]').click()")
+        said = await page.js("document.getElementById('toasts').textContent")
+        assert "not sent, there is no connection" in said
+        await page.js("globalThis.before = lumiloop.world.pose.seq")
+        await page.until("lumiloop.link.socket && lumiloop.world.pose && lumiloop.world.pose.seq !== before")
+        await page.until("document.getElementById('banner').hidden")
+
+    look(browser, address, body)
+
+
 def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -> None:
     env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
 
