@@ -7,6 +7,7 @@ those of `requirements/dev.lock`. Everything goes below a temporary folder; pack
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -34,10 +35,11 @@ def size_mb(folder: Path) -> float:
 
 
 def locked(folder: Path) -> Path:
-    """The versions of the lock file, as constraints: pip takes no hashes for a part of what is locked."""
+    """The versions of the lock file, as constraints: pip takes no hashes for a part of what is locked, nor extras."""
     lines = (ROOT / "requirements" / "dev.lock").read_text().splitlines()
+    pins = [re.sub(r"\[.*?\]", "", line.removesuffix("\\").strip()) for line in lines if line[:1].isalnum()]
     path = folder / "constraints.txt"
-    path.write_text("\n".join(line.removesuffix("\\").strip() for line in lines if line[:1].isalnum()) + "\n")
+    path.write_text("\n".join(pins) + "\n")
     return path
 
 
