@@ -20,7 +20,7 @@ from daemon.probe import is_bus
 from daemon.publish.snapshot import LinkUse, State
 from daemon.surveyfile import SurveyError, read_survey
 from hal.inet import refusal
-from taps.doctor.host import Heard, Host
+from taps.doctor.host import Heard, Host, Mute
 
 FREE_BYTES: Final = 200 << 20
 """A map of a large building, twice, and some recording."""
@@ -53,18 +53,18 @@ class Case:
 
     Attributes:
         settings: the configuration. file: where it is from, None: built-in. host: the computer.
-        heard: what the running daemon tells; a text: why nothing.
+        heard: what the running daemon tells; `Mute`: it is there and is not heard; a text: why there is none.
     """
 
     settings: Config
     file: Path | None
     host: Host
-    heard: Heard | str
+    heard: Heard | Mute | str
 
     @property
     def runs(self) -> bool:
         """Whether a daemon of this name is running: its devices and ports are in use then."""
-        return isinstance(self.heard, Heard)
+        return isinstance(self.heard, Heard | Mute)
 
 
 Check = Callable[[Case], Iterator[Finding]]
@@ -303,6 +303,9 @@ def daemon(case: Case) -> Iterator[Finding]:
         yield remark(
             "daemon", f"does not run, or not as `name` {case.settings.name} ({heard})", "see what its log says"
         )
+        return
+    if isinstance(heard, Mute):
+        yield fix("daemon", heard.text, heard.remedy)
         return
     present = () if heard.faults is None else heard.faults.present
     for fault in present:

@@ -23,6 +23,8 @@ from taps.frames import Faults, Hello, Lights, NotTheStream, Pose, StateChange
 from taps.stream import Stream
 
 LISTEN_S: Final = 3.0
+LISTENERS: Final = "lumiloop-stream"
+"""The group that may listen to the service."""
 TIME_ERROR: Final = 5
 """adjtimex(2): the clock is not synchronised."""
 _TIMEX_BYTES: Final = 512  # more than struct timex on any architecture
@@ -41,6 +43,14 @@ class Heard:
     faults: Faults | None = None
     lights: Lights | None = None
     lamps: dict[tuple[int, int | None], int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Mute:
+    """A daemon that is there and is not heard: why, and what to do."""
+
+    text: str
+    remedy: str
 
 
 class Host:
@@ -131,9 +141,28 @@ class Host:
         """Whether we may take a real-time priority."""
         return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
 
-    def listen(self, path: Path) -> Heard | str:
-        """What a running daemon tells for some seconds; a text: why nothing."""
-        return asyncio.run(_listen(path))
+    def listen(self, path: Path) -> Heard | Mute | str:
+        """What a running daemon tells for some seconds; a text: why there is none."""
+        heard = asyncio.run(_listen(path))
+        return heard if isinstance(heard, Heard) else self._mute(path, heard) or heard
+
+    def _mute(self, path: Path, why: str) -> Mute | None:
+        """The daemon at a path that has told nothing; None: there is none."""
+        try:
+            _reach(path)
+        except PermissionError:
+            text = f"{path}: {self.user()} may not listen there, so it is not known how it is"
+            return Mute(text, f"sudo usermod -aG {LISTENERS} {self.user()}, then log in again; or ask as root")
+        except OSError:
+            return None
+        text = f"{path}: a daemon is there and says nothing of use: {why}"
+        return Mute(text, "it stands, or is of another version; see its log")
+
+
+def _reach(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as sock:
+        sock.settimeout(LISTEN_S)
+        sock.connect(str(path))
 
 
 async def _listen(path: Path) -> Heard | str:

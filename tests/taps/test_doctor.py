@@ -20,7 +20,7 @@ from hal.errors import DeviceFault
 from hal.lidar import LidarGeometry
 from hal.photodiode.probe import BusFinding, Chip
 from hal.probe import Finding
-from taps.doctor.host import Heard, Host
+from taps.doctor.host import Heard, Host, Mute
 from taps.doctor.report import examine
 from taps.frames import Fault, Faults, Pose
 from tests.taps.serving import served
@@ -36,7 +36,7 @@ POSE = Pose(seq=1, t_mono=1.0, t_sent=1.0, t_utc=1.7e9, state=3, state_name="TRA
 class Computer(Host):
     """One on which all is well, until something is changed."""
 
-    heard: Heard | str = "nobody listens there"
+    heard: Heard | Mute | str = "nobody listens there"
     ttys: list[str] = field(default_factory=lambda: ["/dev/ttyACM0"])
     missing: set[str] = field(default_factory=set)
     closed: set[str] = field(default_factory=set)
@@ -91,7 +91,7 @@ class Computer(Host):
     def realtime(self) -> bool:
         return self.rights
 
-    def listen(self, path: Path) -> Heard | str:
+    def listen(self, path: Path) -> Heard | Mute | str:
         return self.heard
 
 
@@ -180,6 +180,7 @@ CASES = {
     ),
     "no cache": (broken(no_cache="no writable directory"), "kernels", "no writable directory", "a folder of its own"),
     "a fault of the daemon": (broken(heard=FAULTY), "daemon", "fault 104: no valid scan", "check the cable"),
+    "not heard": (broken(heard=Mute("may not listen", "usermod")), "daemon", "may not listen", "usermod"),
     "no pose": (broken(heard=Heard("agv", 7)), "daemon", "tells no pose", "see its log"),
     "no lamps": (broken(heard=Heard("agv", 7, POSE)), "lamps", "none is received", "covered"),
     "lamps that are all dead": (
@@ -323,3 +324,36 @@ def test_the_computer_itself_answers() -> None:
     assert host.realtime() in (True, False)
     assert isinstance(host.lidars(), list)
     assert isinstance(host.buses(), list)
+
+
+def test_a_daemon_that_cannot_be_heard_is_there_all_the_same(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its devices are in use: to open them would disturb a robot that drives."""
+    monkeypatch.setattr("taps.doctor.host.LISTEN_S", 0.2)
+    with socket.socket(socket.AF_UNIX) as hung:
+        hung.bind(str(tmp_path / "s"))
+        hung.listen()
+        heard = Host().listen(tmp_path / "s")
+    assert isinstance(heard, Mute)
+    assert "a daemon is there and says nothing" in heard.text
+    assert isinstance(Host().listen(tmp_path / "s"), str), "a socket that is left over is no daemon"
+
+    def closed(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr("taps.doctor.host._reach", closed)
+    heard = Host().listen(tmp_path / "none")
+    assert isinstance(heard, Mute)
+    assert "usermod -aG lumiloop-stream" in heard.remedy
+
+    class Opened(Computer):
+        def lidar_at(self, device: str) -> Finding:
+            raise AssertionError("the daemon's lidar was opened")
+
+        def chips_on(self, bus: str) -> BusFinding:
+            raise AssertionError("the daemon's bus was opened")
+
+    assert asked(file, Opened(heard=heard)) == cli.FAILED
+    said = capsys.readouterr().out
+    assert "1 to fix; first: daemon: sudo usermod" in said
