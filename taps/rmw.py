@@ -59,6 +59,11 @@ class Node:
         return f"{place}/%/{_mangled(self.namespace)}/{self.name}"
 
 
+def session_of(token: str) -> str:
+    """Zenoh's ID of the session that declared a liveliness token."""
+    return token.split("/")[2]
+
+
 def namespace_of(text: str) -> str:
     """A namespace as a person writes it, with a slash before and none behind.
 

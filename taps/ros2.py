@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import time
 from typing import Final
 
@@ -51,23 +52,58 @@ async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> Non
     """Join the router and pass on all that is told, until cancelled.
 
     Raises:
-        BadEndpoint: no such router can be. NameTaken: there is such a node. NotTheStream: there is no such daemon.
+        BadEndpoint: no such router can be. NameTaken: there is such a node, or one has come that stays.
+        NotTheStream: there is no such daemon.
     """
     async with joined(args.router, args.zenoh) as session:
         node = rmw.Node(args.domain, str(session.info.zid()), NAME, namespace)
         if await listed(session, node.others()):
-            raise NameTaken(
-                f"domain {node.domain} has a node {namespace}/{NAME} already: two robots on the same topics would "
-                "spoil both; give each a --namespace of its own, or stop the other one"
-            )
+            raise NameTaken(taken(node))
         talker = Talker(session, node, args.humble)
         watching = asyncio.create_task(watched(session, args.router, lambda there: None))
+        work = [asyncio.create_task(rivalled(session, node))]
         try:
             cli.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
-            await follow(stream, args.settings, talker)
+            work.append(asyncio.create_task(follow(stream, args.settings, talker)))
+            ended, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
         finally:
-            watching.cancel()
+            for task in (watching, *work):
+                task.cancel()
+            await asyncio.gather(*work, return_exceptions=True)
             talker.close()
+
+
+def taken(node: rmw.Node) -> str:
+    """What to do where two nodes have one name."""
+    return (
+        f"domain {node.domain} has a node {node.namespace}/{NAME} already: two robots on the same topics would "
+        "spoil both; give each a --namespace of its own, or stop the other one"
+    )
+
+
+async def rivalled(session: zenoh.Session, node: rmw.Node) -> None:
+    """Wait for a node of the same name that has the better right to it: the one with the lesser session.
+
+    Two that join at once, as when both have waited for the router, find nobody before them; so do two that were parted.
+
+    Raises:
+        NameTaken: there is one.
+    """
+    loop, met = asyncio.get_running_loop(), asyncio.Event()
+
+    def heard(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT and rmw.session_of(str(sample.key_expr)) < node.session:
+            with contextlib.suppress(RuntimeError):  # the loop has closed
+                loop.call_soon_threadsafe(met.set)
+
+    listening = session.liveliness().declare_subscriber(node.others(), heard, history=True)
+    try:
+        await met.wait()
+    finally:
+        withdraw(listening)
+    raise NameTaken(taken(node))
 
 
 class Talker:

@@ -137,3 +137,30 @@ def test_a_second_node_of_the_name_is_refused_and_the_first_does_not_suffer(tmp_
 
         asyncio.run(beside(body(), serve(made, tmp_path / "s")))
         assert len({gid for _, (_, _, gid) in pose.got}) == 1
+
+
+def test_of_two_that_join_at_once_or_meet_again_one_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both have waited for the router, and neither finds the other in the list: no topic may have two speakers."""
+
+    async def nobody(session: Any, key: str) -> list[str]:
+        return []
+
+    monkeypatch.setattr(ros2, "listed", nobody)
+    with served(tmp_path / "s"), router() as made, zenoh.open(config("client", made.address)) as session:
+        pose = Subscriber(session, "/pose")
+
+        async def both() -> None:
+            two = [asyncio.create_task(serve(made, tmp_path / "s")) for _ in range(2)]
+            ended, (stays,) = await asyncio.wait(two, timeout=20.0, return_when=asyncio.FIRST_COMPLETED)
+            (stopped,) = ended
+            with pytest.raises(ros2.NameTaken, match="has a node /lumiloop already"):
+                stopped.result()
+            await asyncio.sleep(0.3)
+            pose.got.clear()
+            await until(lambda: len(pose.got) > 10)
+            assert not stays.done()
+            assert len({gid for _, (_, _, gid) in pose.got}) == 1
+            stays.cancel()
+            await asyncio.gather(stays, return_exceptions=True)
+
+        asyncio.run(both())
