@@ -12,6 +12,7 @@ export class Link {
     this.page = document.querySelector("meta[name=lumiloop-page]").content;
     this.offset = 0;        // server's clock less ours, s
     this.trip = Infinity;   // of the ping that said so
+    this.heard = -Infinity; // when the server said anything last, ms of this page
     this.retry = 250;
     this.token = token();
     addEventListener("visibilitychange", () => { if (!document.hidden && !this.socket) this.open(); });
@@ -30,8 +31,10 @@ export class Link {
     this.socket = socket;
     this.refused = "";
     socket.onopen = () => this.say({ page: this.page, token: this.token });
-    socket.onmessage = (event) => this.take(event.data);
+    socket.onmessage = (event) => { this.heard = performance.now(); this.take(event.data); };
     socket.onclose = () => this.closed();
+    this.unanswered = 0;
+    this.beat = setInterval(() => this.ping(), PING_MS);   // also while it is being opened, which may take minutes
   }
 
   closed() {
@@ -89,8 +92,6 @@ export class Link {
     this.trip = Infinity;
     this.unanswered = 0;
     this.ping();
-    clearInterval(this.beat);
-    this.beat = setInterval(() => this.ping(), PING_MS);
     this.told.welcome(words);
   }
 

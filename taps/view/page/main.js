@@ -37,6 +37,7 @@ const link = new Link({
   lost() {
     gone = "the page has lost its server; trying again";
     if (!link.refused) banner("No connection to this page's server; trying again");
+    orders.lost();
     schedule();
   },
   frame,
@@ -116,17 +117,18 @@ function measure() {
   unshown = null;
 }
 
-// A daemon that is there and says nothing.
+// A daemon that is there and says nothing; where the server is silent, too, nobody knows.
 function stale() {
   const now = poseAt > 0 && !recording && !gone && performance.now() - poseAt > OLD_MS;
-  if (now) banner(`No new pose for ${Math.round((performance.now() - poseAt) / 1000)} s: the daemon stands`);
+  const who = link.heard - poseAt > OLD_MS ? ": the daemon stands" : "";
+  if (now) banner(`No new pose for ${Math.round((performance.now() - poseAt) / 1000)} s${who}`);
   else if (old && !gone) banner("");
   old = now;
 }
 
 function words() {
   stale();
-  panel.state(gone);
+  panel.state(gone, link.socket ? "NO DAEMON" : "NO SERVER");
   panel.pose();
   panel.lights();
   panel.cycle();

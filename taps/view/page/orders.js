@@ -11,6 +11,7 @@ export class Orders {
     this.camera = camera;
     this.toast = toast;
     this.told = [];
+    this.sent = [];          // orders of which nothing has been told yet
     for (const button of document.querySelectorAll("[data-order]")) button.addEventListener("click", () => this.press(button.dataset.order));
     $("ask-yes").addEventListener("click", () => this.send("set_pose", this.pose));
     $("ask-no").addEventListener("click", () => this.aim(false));
@@ -38,8 +39,14 @@ export class Orders {
   }
 
   send(name, pose) {
-    if (!this.link.say({ order: name, pose })) this.toast(`${SAID[name] || name}: not sent, there is no connection`, "bad");
+    if (this.link.say({ order: name, pose })) this.sent.push(name);
+    else this.take({ order: name, viewer: this.you, outcome: "not sent, there is no connection" });
     this.aim(false);
+  }
+
+  lost() {
+    const unknown = this.sent.splice(0);
+    for (const order of unknown) this.take({ order, viewer: this.you, outcome: "connection lost, perhaps before it arrived" });
   }
 
   // From here on hands drag a pose, or the map again.
@@ -62,6 +69,7 @@ export class Orders {
   }
 
   take(order) {
+    if (order.viewer === this.you) this.sent = this.sent.filter((name) => name !== order.order);
     const key = order.number === undefined ? null : `${order.number},${order.viewer}`;
     const known = key && this.told.find((one) => one.key === key);
     if (known) Object.assign(known, order);

@@ -41,11 +41,11 @@ export class Panel {
     this.faultsOpen = false;
   }
 
-  state(gone) {
+  state(gone, who) {
     const pose = this.world.pose, chip = $("state");
     const name = gone ? "gone" : pose ? pose.state_name : "none";
     if (chip.dataset.state !== name) chip.dataset.state = name;
-    put("state-name", gone ? "NO DAEMON" : pose ? pose.state_name.replace("_", " ") : "connecting");
+    put("state-name", gone ? who : pose ? pose.state_name.replace("_", " ") : "connecting");
     const table = pose && this.world.scene.states[pose.state];
     const meaning = gone || (pose ? pose.reason ? pose.meaning : table ? table[1] : "" : "waiting for the first pose");
     put("why", pose && !gone && pose.reason ? pose.meaning : "");

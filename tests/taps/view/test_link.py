@@ -1,0 +1,127 @@
+"""The page and its server where the connection between them is at fault: chromium, over a wire that can be cut."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taps.view.guard import Guard
+from tests.taps.view.house import TOKEN, House, serving, snapshot
+from tools.browser import CHROMIUM, Tab, chromium, tab
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt-get install chromium"),
+]
+BANNER = "document.getElementById('banner').hidden ? '' : document.getElementById('banner').textContent"
+POSE = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.seq"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with chromium(tmp_path_factory.mktemp("browser")) as one:
+        yield one
+
+
+class Wire:
+    """Between browser and server. cut: nothing passes, and nobody is told, as where a radio link fades."""
+
+    def __init__(self, address: str) -> None:
+        host, port = address.removeprefix("http://").split(":")
+        self._to = host, int(port)
+        self.cut = False
+        self._parts: list[asyncio.Task[None]] = []
+        self._ends: list[asyncio.StreamWriter] = []
+
+    async def meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._ends.append(writer)
+        if self.cut:
+            writer.close()
+            return
+        there, back = await asyncio.open_connection(*self._to)
+        self._ends.append(back)
+        self._parts += [asyncio.create_task(self._pass(*ends)) for ends in ((reader, back), (there, writer))]
+
+    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        dead = False
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(1 << 16):
+                dead = dead or self.cut
+                if not dead:
+                    writer.write(data)
+            if not dead:
+                writer.close()
+
+    async def end(self) -> None:
+        for part in self._parts:
+            part.cancel()
+        await asyncio.gather(*self._parts, return_exceptions=True)
+        for writer in self._ends:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+
+@contextlib.asynccontextmanager
+async def wired(house: House) -> AsyncIterator[tuple[Wire, str]]:
+    wire = Wire(house.address)
+    listening = await asyncio.start_server(wire.meet, "127.0.0.1", 0)
+    try:
+        yield wire, f"http://127.0.0.1:{listening.sockets[0].getsockname()[1]}"
+    finally:
+        listening.close()
+        await wire.end()
+
+
+def run(folder: Path, body: Callable[[House], Awaitable[None]], **options: Any) -> None:
+    async def all_of_it() -> None:
+        async with serving(folder, **options) as house:
+            await body(house)
+
+    asyncio.run(all_of_it())
+
+
+async def shows(page: Tab, text: str, seconds: float = 20.0) -> None:
+    await page.until(f"({BANNER}).includes({text!r})", seconds)
+
+
+def test_a_dead_wire_is_no_daemon_that_stands_and_the_page_comes_back(browser: str, tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with wired(house) as (wire, address), tab(browser, f"{address}/#token={TOKEN}") as page:
+            await page.until("globalThis.lumiloop")
+            house.stream.publish(snapshot(1))
+            await page.until(f"{POSE} === 1")
+            wire.cut = True
+            await page.click("[data-order=relocalise]")  # into a wire that takes it
+            await page.js(f"globalThis.told = []; setInterval(() => told.push({BANNER}), 50); 0")
+            await shows(page, "No connection to this page")
+            assert not [text for text in await page.js("told") if "the daemon stands" in text]
+            await page.until("document.getElementById('state-name').textContent === 'NO SERVER'")
+            await page.until("document.getElementById('told').textContent.includes('connection lost')")
+            await page.click("[data-order=save_map]")
+            await page.until(
+                "[...document.querySelectorAll('#told li')].some((one) =>"
+                "one.textContent.includes('Save map (you): not sent, there is no connection'))"
+            )
+            wire.cut = False
+            house.stream.publish(snapshot(2))
+            await page.until(f"{POSE} === 2")
+            await page.until(f"({BANNER}) === ''")
+
+    run(tmp_path, body, guard=Guard("127.0.0.1", TOKEN, True))
+
+
+def test_a_daemon_that_stands_is_still_named(browser: str, tmp_path: Path) -> None:
+    async def body(house: House) -> None:
+        async with tab(browser, house.address) as page:
+            await page.until("globalThis.lumiloop")
+            house.stream.publish(snapshot(1))
+            await page.until(f"{POSE} === 1")
+            await shows(page, "the daemon stands")
+
+    run(tmp_path, body)
