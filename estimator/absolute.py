@@ -21,7 +21,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Virtual
-from estimator.linear3 import det3, invert3, largest_of, positive_part
+from estimator.linear3 import det3, invert3, largest_of, positive_part, symmetric
 from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
@@ -79,8 +79,8 @@ class Absolute:
             has let go of the pose since, or begun its map anew.
         P, X: see above, both 3x3, odom-aligned axes. kept: T_map_base, and P in map axes, at the latest match, or
             when light or a person said where the map lies; what P has grown by since is of the way, not of the map.
-        gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None where either is
-            unknown. odd_since: since when they have disagreed.
+        gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None: either is unknown.
+        odd_since: since when they have disagreed. doubted_at: when that was last no reason to follow light.
         elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
             itself has had the robot elsewhere.
         way, way_young: driven so far, and when light last began to find the place. way_start: of the `lights` filter,
@@ -101,6 +101,7 @@ class Absolute:
     kept: tuple[Array, Array] = field(default_factory=lambda: (se2.identity(), np.zeros((3, 3))))
     gap: float | None = None
     odd_since: float | None = None
+    doubted_at: float = -math.inf
     elsewhere_since: float | None = None
     aside_since: float | None = None
     way: float = 0.0
@@ -231,7 +232,7 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
         tie.P, tie.X = straighten(tie.P, tie.X)
     before = R @ tie.P @ R.T
     L_before = invert3(before)
-    after = _symmetric(invert3(L_before + positive_part(G)))
+    after = symmetric(invert3(L_before + positive_part(G)))
     keep = R.T @ after @ L_before @ R
     tie.P = R.T @ after @ R
     leave(state, keep)
@@ -301,8 +302,8 @@ def virtual(state: State) -> Virtual | None:
     if not wheels:  # the pose's heading is the better guess, by which the submap's origin is found from here
         lights = without_heading(lights)
         T_map_base[2] = se2.compose(state.T_map_odom, T_odom_base)[2]
-    moved = se2.between(T_odom_base, state.fused.T_odom_base)
-    return Virtual(se2.compose(T_map_base, moved), factor / TRUST * lights.covariance, lights.accepted)
+    T_map_base = se2.compose(T_map_base, se2.between(T_odom_base, state.fused.T_odom_base))
+    return Virtual(T_map_base, factor / TRUST * lights.covariance, lights.accepted)
 
 
 def begun_anew(state: State, lights: LightsResult) -> bool:
@@ -355,7 +356,7 @@ def without_heading(lights: LightsResult) -> LightsResult:
     P[2, 2] = ANY_HEADING
     keep = invert3(P) @ lights.covariance
     made = np.array((lights.gained_by[0], lights.gained_by[1], 0.0))
-    return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T), gained_by=made)
+    return replace(lights, covariance=P, gained=symmetric(keep @ lights.gained @ keep.T), gained_by=made)
 
 
 def across_the_row(state: State, lights: LightsResult) -> LightsResult:
@@ -367,7 +368,7 @@ def across_the_row(state: State, lights: LightsResult) -> LightsResult:
     P = lights.covariance + more
     keep = invert3(P) @ lights.covariance
     made = keep.T @ lights.gained_by  # what is told must go with what it weighs: else each wander across adds up
-    return replace(lights, covariance=P, gained=_symmetric(keep @ lights.gained @ keep.T), gained_by=made)
+    return replace(lights, covariance=P, gained=symmetric(keep @ lights.gained @ keep.T), gained_by=made)
 
 
 def blind(state: State) -> bool:
@@ -410,7 +411,8 @@ def pose_at(state: State, t_mono: float) -> Array:
 def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
     """Whether light has disagreed with the pose for long enough, and by enough, to be believed.
 
-    Light that looks, or is off by less than the laser could have lost, says nothing against a proved pose held since.
+    Light that looks, or is off by less than the laser could have lost, says nothing against a proved pose held since;
+    nor does one lamp beside a row of others, seen for a moment: what the row has led astray it does not put right.
     """
     tie = state.absolute
     assert tie is not None
@@ -422,8 +424,9 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
     away, turn = sure_part(off, lights.covariance)
     far = away > FAR_M or (turn > FAR_RAD and not holds_heading(state) and _elsewhere(state))
     checked = len(lights.accepted) >= CHECKED or bool(np.any(np.diag(tie.P) >= KNOWN))
-    believed = not held or (far and lights.fix is Fix.GOOD and checked)
-    return believed and lights.t_mono - tie.odd_since >= SURPRISE_S
+    if held and not (far and lights.fix is Fix.GOOD and checked):
+        tie.doubted_at = lights.t_mono
+    return lights.t_mono - max(tie.odd_since, tie.doubted_at) >= SURPRISE_S
 
 
 def _elsewhere(state: State) -> bool:
@@ -444,7 +447,3 @@ def _elsewhere(state: State) -> bool:
 def _surer(tie: Absolute, lights: LightsResult) -> bool:
     """Whether the lights' pose is so much better known that nothing is lost by taking it as it is."""
     return tie.odd_since is None and det3(lights.covariance) < SURER * det3(tie.P)
-
-
-def _symmetric(A: Array) -> Array:
-    return np.asarray(0.5 * (A + A.T))

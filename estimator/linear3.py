@@ -164,3 +164,8 @@ def add_turned(yaw: float, variance: Array, P: Array) -> None:
     P[0, 1] += c * s * (variance[0] - variance[1])
     P[1, 0] += c * s * (variance[0] - variance[1])
     P[2, 2] += variance[2]
+
+
+def symmetric(A: Array) -> Array:
+    """The symmetric part of a matrix, which rounding leaves of one that should be."""
+    return np.asarray(0.5 * (A + A.T))

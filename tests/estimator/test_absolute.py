@@ -391,3 +391,25 @@ def test_only_what_the_laser_could_have_lost_is_taken_from_light(
         absolute.on_lights(state, lights_at(told, frozenset(lamps), state))
     now = se2.compose(state.T_map_odom, state.fused.T_odom_base)
     assert np.hypot(*(now - told)[:2]) < 0.05 if followed else np.hypot(*(now - T)[:2]) < 0.05
+
+
+def test_one_lamp_beside_a_row_of_others_moves_nothing_until_it_has_been_there_for_a_while(
+    driven: tuple[State, Log],
+) -> None:
+    """What a row has led astray becomes sure with the first lamp beside it, and is as wrong as before."""
+    state = copy.deepcopy(driven[0])
+    tie = state.absolute
+    assert tie is not None
+    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    told = T + np.array((1.2, 1.6, 0.0))
+
+    def moved(lamps: tuple[int, ...], times: int) -> float:
+        for _ in range(times):
+            state.fused.t_mono += 0.05
+            tie.t_match = state.fused.t_mono
+            absolute.on_lights(state, lights_at(told, frozenset(lamps), state))
+        return float(np.hypot(*(se2.compose(state.T_map_odom, state.fused.T_odom_base) - T)[:2]))
+
+    assert moved((1, 2, 3, 4), 30) < 0.05
+    assert moved((1, 2, 3, 4, 13), 15) < 0.05
+    assert moved((1, 2, 3, 4, 13), 15) == pytest.approx(2.0, abs=0.05)
