@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
-from daemon.publish.holding import COMMAND_ADDRESS, CommandCode, Outcome
+from daemon.publish.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
 TRIES: Final = 4
@@ -90,19 +90,20 @@ class Wire(asyncio.DatagramProtocol):
         before = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 1))
         return (int.from_bytes(before[2:4], "big") + secrets.randbelow(0xFFFE)) % 0xFFFF + 1
 
-    async def outcome(self, ours: bytes) -> tuple[bool, bool, Outcome]:
+    async def outcome(self, ours: bytes, map_id: bytes = b"") -> tuple[bool, bool, Outcome]:
         """Whether the order in force is still ours, whether it has ended, and how.
 
-        ``ours``: the registers as they were written; another client may have taken the same number.
+        ``ours``, ``map_id``: the registers as they were written; another client may have taken the same number, or have
+        named another map in between.
         """
-        told = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, 10))
+        told = await self.ask(struct.pack(">BHH", 3, COMMAND_ADDRESS, COMMAND.words))
         number = int.from_bytes(ours[:2], "big")
         acknowledged, result = struct.unpack(">HH", told[2 + 16 : 2 + 20])
         try:
             outcome = Outcome(result)
         except ValueError:
             outcome = Outcome.UNKNOWN
-        mine = told[2 : 2 + len(ours)] == ours
+        mine = told[2:].startswith(ours) and told.endswith(map_id)
         return mine, acknowledged == number and outcome is not Outcome.RUNNING, outcome
 
     def close(self) -> None:
@@ -203,12 +204,13 @@ async def switch_map(host: str, port: int, map_id: int) -> str:
     wire = await _wired(host, port)
     try:
         number = await wire.next_number()
-        await wire.ask(struct.pack(">BHHBI", 16, MAP_ADDRESS, 2, 4, map_id))
+        named = struct.pack(">I", map_id)
+        await wire.ask(struct.pack(">BHHB", 16, MAP_ADDRESS, 2, 4) + named)
         ours = struct.pack(">HH", number, CommandCode.SWITCH_MAP)
         await wire.ask(struct.pack(">BHHB", 16, COMMAND_ADDRESS, 2, 4) + ours)
         end = asyncio.get_running_loop().time() + LONGEST_S
         while asyncio.get_running_loop().time() < end:
-            mine, ended, result = await wire.outcome(ours)
+            mine, ended, result = await wire.outcome(ours, named)
             if not mine:
                 return "replaced"
             if ended:

@@ -31,11 +31,11 @@ const link = new Link({
     if (words.wrong_token) toast("That token is not the right one: read-only", "bad");
   },
   refused(words) {
-    if (words.what !== "token") { banner(words.text); return; }
-    $("token").showModal();
+    if (words.what === "token") $("token").showModal();
+    else banner(words.what === "version" ? words.text : `${words.text} Trying again.`);
   },
   lost() {
-    gone = "the page has lost its server; trying again";
+    gone = barred() ? "not shown without a token" : "the page has lost its server; trying again";
     if (!link.refused) banner("No connection to this page's server; trying again");
     orders.lost();
     schedule();
@@ -63,6 +63,9 @@ function daemon(data) {
   gone = data.up ? "" : data.why;
   banner(data.up ? "" : `No daemon: ${data.why}`);
 }
+
+// Refused for want of a token: nothing is tried again until there is one.
+function barred() { return link.refused === "token"; }
 
 function banner(text) {
   $("banner").hidden = !text;
@@ -128,7 +131,7 @@ function stale() {
 
 function words() {
   stale();
-  panel.state(gone, link.socket ? "NO DAEMON" : "NO SERVER");
+  panel.state(gone, barred() ? "NO TOKEN" : link.socket ? "NO DAEMON" : "NO SERVER");
   panel.pose();
   panel.lights();
   panel.cycle();
@@ -175,7 +178,13 @@ addEventListener("keydown", (event) => {
   const doing = { "+": () => camera.zoom(1.4), "-": () => camera.zoom(1 / 1.4), 0: () => $("fit").click(), f: () => $("follow").click() }[event.key];
   if (doing) doing();
 });
-$("token").addEventListener("close", () => { if ($("token-text").value) link.use($("token-text").value.trim()); $("token-text").value = ""; });
+$("token").addEventListener("close", () => {
+  const text = $("token-text").value.trim();
+  $("token-text").value = "";
+  if (text) { banner(""); link.use(text); }
+  else if (barred()) banner("Not shown without a token. Press here to give it, or open the address that lumiloop view printed.");
+});
+$("banner").addEventListener("click", () => { if (barred()) $("token").showModal(); });
 new ResizeObserver(() => {
   const box = $("stage").getBoundingClientRect();
   camera.resize(box.width, box.height);

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from taps.view import server
 from taps.view.guard import Guard
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 from tools.browser import CHROMIUM, Tab, chromium, tab
@@ -123,5 +124,46 @@ def test_a_daemon_that_stands_is_still_named(browser: str, tmp_path: Path) -> No
             house.stream.publish(snapshot(1))
             await page.until(f"{POSE} === 1")
             await shows(page, "the daemon stands")
+
+    run(tmp_path, body)
+
+
+def test_who_closes_the_question_for_a_token_is_told_why_nothing_is_shown_and_is_asked_again(
+    browser: str, tmp_path: Path
+) -> None:
+    async def body(house: House) -> None:
+        async with tab(browser, house.address) as page:
+            await page.until("globalThis.lumiloop")
+            await page.until("document.getElementById('token').open")
+            await page.until("document.getElementById('state-name').textContent === 'NO TOKEN'")
+            assert "trying again" not in await page.js("document.body.innerText")
+            await page.js("document.getElementById('token').close()")  # as Escape does
+            await shows(page, "Not shown without a token")
+            await page.click("#banner")
+            await page.until("document.getElementById('token').open")
+            await page.js(f"document.getElementById('token-text').value = '{TOKEN}'; 0")
+            await page.click("#token .go")
+            house.stream.publish(snapshot(1))
+            await page.until(f"{POSE} === 1")
+            await page.until(f"({BANNER}) === ''")
+
+    run(tmp_path, body, guard=Guard("0.0.0.0", TOKEN))
+
+
+def test_a_browser_too_many_comes_in_when_another_goes(
+    browser: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "VIEWERS", 1)
+
+    async def body(house: House) -> None:
+        async with house.page() as first:
+            await first.welcome()
+            async with tab(browser, house.address) as page:
+                await page.until("globalThis.lumiloop")
+                await shows(page, "browsers are watching; close one. Trying again.")
+                await first.socket.close()
+                house.stream.publish(snapshot(1))
+                await page.until(f"{POSE} === 1", 20.0)
+                await page.until(f"({BANNER}) === ''")
 
     run(tmp_path, body)

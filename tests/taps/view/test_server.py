@@ -414,6 +414,26 @@ def test_the_end_of_another_client_s_order_of_the_same_number_is_not_ours(tmp_pa
     ordering(tmp_path, body)
 
 
+@pytest.mark.parametrize(("between", "said"), [(None, "done"), (0x78, "replaced")])
+def test_another_map_that_somebody_names_in_between_is_no_map_of_ours(
+    tmp_path: Path, between: int | None, said: str
+) -> None:
+    async def body(house: House, asked: list[Request], modbus: Any) -> None:
+        wire = await orders._wired("127.0.0.1", modbus.port)
+        switching = asyncio.create_task(orders.switch_map("127.0.0.1", modbus.port, 0x77))
+        try:
+            await until(lambda: bool(asked))
+            assert (asked[0].code, asked[0].map_id) == (CommandCode.SWITCH_MAP, 0x77)
+            if between is not None:
+                await wire.ask(struct.pack(">BHHBI", 16, orders.MAP_ADDRESS, 2, 4, between))
+            modbus.acknowledge(asked[0].number, Outcome.DONE)
+            assert await switching == said
+        finally:
+            wire.close()
+
+    ordering(tmp_path, body)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
