@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 pytest.importorskip("aiohttp", reason="pip install 'lumiloop[view]'")
 from tools import pageshots
@@ -38,5 +39,18 @@ def test_the_robot_is_tracking_in_every_picture(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(pageshots, "tab", tab)
     monkeypatch.setattr(pageshots, "SETTLE_S", 0.0)
     asyncio.run(pageshots.photograph("", "", tmp_path, 0.0))
-    for name in ("view.png", "view-phone.png"):
+    for name in pageshots.PICTURES:
         assert "TRACKING" in taken[name]
+
+
+def test_a_picture_is_made_smaller_and_looks_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "page.png"
+    page = Image.new("RGB", (300, 200), (14, 18, 27))
+    for x in range(200):
+        page.paste((x, 200 - x, 90), (x, 0, x + 1, 100))
+    page.save(path)
+    pageshots.smaller(path)
+    with Image.open(path) as few:
+        assert few.mode == "P"
+        told, seen = page.tobytes(), few.convert("RGB").tobytes()
+    assert max(abs(a - b) for a, b in zip(told, seen, strict=True)) <= 3
