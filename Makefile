@@ -55,7 +55,7 @@ test: check  ## everything quick (no root, <= 12 minutes)
 ORDERLY := system and not slow
 NONE = $(if $(ARGS),|| [ $$? = 5 ])
 test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "$(ORDERLY) and not realtime" $(ARGS) $(NONE)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$(ORDERLY) and not realtime" $(ARGS) $(NONE)
 	$(BIN)/python -m pytest -q -m "$(ORDERLY) and realtime" $(ARGS) $(NONE)
 
 test-all: check  ## all of it, the long ones included

@@ -21,6 +21,9 @@ UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")
 as long, and reach hardly one that the other tests do not (`tools.floors` tells). The estimator's are traced in the row
 without the compiler."""
 
+FIRST = ("tools/test_soak.py", "faults/test_matrix.py", "systemd/test_container.py")
+"""Files that take minutes, longest first: where files are shared out to the cores none of them is begun last."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--lidar", default="fake", help="fake, or a real device: /dev/ttyACM0, tcp://192.168.0.10:10940")
@@ -43,6 +46,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if any(item.path.is_relative_to(ROOT / "tests" / folder) for folder in UNTRACED):
             item.add_marker(pytest.mark.no_cover)
+    items.sort(key=_turn)
+
+
+def _turn(item: pytest.Item) -> int:
+    """Place of its file in :data:`FIRST`; all others behind them, in the order in which they were."""
+    name = item.path.relative_to(ROOT / "tests").as_posix()
+    return FIRST.index(name) if name in FIRST else len(FIRST)
 
 
 @pytest.fixture(scope="session")
