@@ -65,7 +65,7 @@ class BeamModel:
         return np.concatenate((weights / weights.sum(), shapes))
 
 
-@kernel("f8(f8, f8, f8[::1])")
+@kernel("f8(f8, f8, f8[::1])", inner=True)
 def density(z: float, expected: float, model: Array) -> float:
     """Probability density (1/m) of an echo from range ``z`` where a surface is expected at ``expected``.
 
@@ -87,7 +87,7 @@ def density(z: float, expected: float, model: Array) -> float:
     return p
 
 
-@kernel("f8(f8, f8[::1])")
+@kernel("f8(f8, f8[::1])", inner=True)
 def silence(expected: float, model: Array) -> float:
     """Probability that a beam brings no echo."""
     return float(model[MAX] if expected < model[FAR] else model[MAX] + model[HIT])

@@ -15,7 +15,7 @@ Pattern = tuple[Ints, Ints, Ints, Ints]
 """Column start and rows, row start and columns: see `elimination.columns`."""
 
 
-@kernel("b1(f8[:, ::1], f8[:, ::1])")
+@kernel("b1(f8[:, ::1], f8[:, ::1])", inner=True)
 def invert_block(A: Array, out: Array) -> bool:
     """Inverse of a symmetric 3 x 3; False if it is not positive definite."""
     a, b, c, d, e, f = A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
@@ -30,7 +30,9 @@ def invert_block(A: Array, out: Array) -> bool:
     return True
 
 
-@kernel("i8(Tuple((i8[::1], i8[::1], i8[::1], i8[::1])), Tuple((f8[:, :, ::1], f8[:, :, ::1])), f8[:, :, ::1])")
+@kernel(
+    "i8(Tuple((i8[::1], i8[::1], i8[::1], i8[::1])), Tuple((f8[:, :, ::1], f8[:, :, ::1])), f8[:, :, ::1])", inner=True
+)
 def factor(pattern: Pattern, matrix: tuple[Array, Array], inverse: Array) -> int:
     """Left-looking L D L^T in place; the first column that is not positive definite, or -1.
 
@@ -79,7 +81,7 @@ def factor(pattern: Pattern, matrix: tuple[Array, Array], inverse: Array) -> int
     return -1
 
 
-@kernel("void(Tuple((i8[::1], i8[::1], i8[::1], i8[::1])), f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])")
+@kernel("void(Tuple((i8[::1], i8[::1], i8[::1], i8[::1])), f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])", inner=True)
 def solve(pattern: Pattern, below: Array, inverse: Array, b: Array) -> None:
     """Turn the right side ``b`` (n, 3), in the order of elimination, into the solution."""
     start, down = pattern[0], pattern[1]

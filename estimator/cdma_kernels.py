@@ -66,7 +66,7 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
     return bounds
 
 
-@kernel("void(f8[:,::1], i8[:,::1], i8, f8[:,::1])")
+@kernel("void(f8[:,::1], i8[:,::1], i8, f8[:,::1])", inner=True)
 def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
     """Inner products of all M rows with the first ``free`` rows, in tiles of 2 x 4; ``out`` is (M, free).
 
@@ -149,7 +149,7 @@ def mixed(weights: F8, rows: F8) -> F8:
     return out
 
 
-@kernel("void(f8[:,::1])")
+@kernel("void(f8[:,::1])", inner=True)
 def invert(a: F8) -> None:
     """Inverse of a symmetric positive definite matrix in its own place, by sweeping each pivot.
 

@@ -32,7 +32,7 @@ REACH = 0.12
 """Chips: the derivative columns are trusted so far."""
 
 
-@kernel("f8(f8[:,::1], i8[:,::1], i8, f8[:,::1], f8[::1])")
+@kernel("f8(f8[:,::1], i8[:,::1], i8, f8[:,::1], f8[::1])", inner=True)
 def reduce_rows(stack: F8, extent: I8, free: int, matrix: F8, right: F8) -> float:
     """Normal matrix and right side of the first ``free`` rows with the mains rows eliminated; power of y likewise.
 
@@ -100,7 +100,7 @@ def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, l
         stack[free - last + r] = wave[0, 0]
 
 
-@kernel("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1])")
+@kernel("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1])", inner=True)
 def _share_lag(matrix: F8, right: F8, amplitude: F8, normal: F8, target: F8) -> None:
     """Normal equations in the unknowns: slopes times amplitude are phases, and the lag moves all of these.
 
@@ -132,7 +132,7 @@ def _share_lag(matrix: F8, right: F8, amplitude: F8, normal: F8, target: F8) -> 
         normal[b, lag] = normal[lag, b]
 
 
-@kernel("f8(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], i8)")
+@kernel("f8(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], i8)", inner=True)
 def _move(lamps: F8, common: F8, theta: F8, variance: F8, bend: F8, size: int) -> float:
     """Take the step, no farther than the columns reach; returns its size in chips where it matters.
 

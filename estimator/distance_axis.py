@@ -111,7 +111,7 @@ def sector_of(x: float, y: float, sectors: int) -> int:
     return max(0, min(sectors - 1, int(turn_of(x, y) * 0.25 * sectors)))
 
 
-@kernel("f8(f8[:, ::1], i8, f8, f8, f8)")
+@kernel("f8(f8[:, ::1], i8, f8, f8, f8)", inner=True)
 def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float:
     """Squared distance of a query from the ray ``s``: beyond a right angle its nearest point is the centre."""
     if rays[s, 0] * qx + rays[s, 1] * qy <= 0.0:
@@ -128,7 +128,7 @@ def is_behind(row: Array, x: float, y: float, r: float) -> bool:
     return bool(row[0] > x or (row[0] == x and row[1] > y))
 
 
-@kernel("void(f8[:, ::1], i8[::1], i8, i8)")
+@kernel("void(f8[:, ::1], i8[::1], i8, i8)", inner=True)
 def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
     """Shell's sort of rows [lo, hi) by distance; rows at one distance by x and y, so that equal points lie together."""
     gap = 1

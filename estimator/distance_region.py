@@ -132,7 +132,7 @@ def merge(
             k += 1
 
 
-@kernel("Tuple((i8, f8, f8, i8, i8))(f8[:, ::1], i8, i8, i8, f8, f8, Tuple((i8, f8, f8, i8)))")
+@kernel("Tuple((i8, f8, f8, i8, i8))(f8[:, ::1], i8, i8, i8, f8, f8, Tuple((i8, f8, f8, i8)))", inner=True)
 def walk(
     rows: Array, low: int, high: int, at: int, qx: float, qy: float, best: tuple[int, float, float, int]
 ) -> tuple[int, float, float, int, int]:
@@ -196,7 +196,7 @@ def pair_fused(axis: Axis, fused: Fused, bound: float = np.inf) -> tuple[Ints, A
     return row, np.sqrt(d2), visits
 
 
-@kernel("i8(f8[:, ::1], i8, i8, f8)")
+@kernel("i8(f8[:, ::1], i8, i8, f8)", inner=True)
 def place_on_axis(rows: Array, low: int, high: int, r: float) -> int:
     """First row of the axis [low, high) that is not nearer to the origin than ``r``, by bisection."""
     while low < high:
@@ -233,7 +233,7 @@ def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: 
     return int(best), d2, min(e2, min(right * right, left * left))
 
 
-@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8, i8, f8, f8, Tuple((i8, f8, f8)))")
+@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8, i8, f8, f8, Tuple((i8, f8, f8)))", inner=True)
 def compare_through(
     rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float]:
@@ -262,7 +262,7 @@ def compare_through(
     return row, d2, e2
 
 
-@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8, i8, f8, f8, Tuple((i8, f8, f8)))")
+@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8, i8, f8, f8, Tuple((i8, f8, f8)))", inner=True)
 def search_axis(
     rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float, int]:
@@ -310,7 +310,7 @@ def search_group(
     return row, d2, e2, visits
 
 
-@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, i8, f8)")
+@kernel("Tuple((i8, f8, f8, i8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, i8, f8)", inner=True)
 def search(
     rows: Array, start: Ints, rays: Array, qx: float, qy: float, row: int, d2: float
 ) -> tuple[int, float, float, int]:
@@ -366,7 +366,7 @@ def search(
     return row, d2, e2, visits
 
 
-@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)")
+@kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)", inner=True)
 def nearest(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: float) -> tuple[int, float, float]:
     """Row nearest to the query (relative to the centre), its squared distance, and a bound for all others' (squared).
 

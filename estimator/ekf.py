@@ -40,7 +40,7 @@ SLOTS: Final = 24
 SIZE: Final = FIRST + OWN * SLOTS
 
 
-@kernel("void(f8[::1], f8[:, ::1], i8, f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[::1], f8[:, ::1], i8, f8[:, ::1], f8[:, ::1])", inner=True)
 def propagate(x: Array, P: Array, n: int, F: Array, Q: Array) -> None:
     """``P <- F P F' + Q`` where F differs from the identity in its first three rows only.
 

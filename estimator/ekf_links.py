@@ -40,7 +40,7 @@ SURPRISE_CAP: Final = 16.0
 must not decide which way the robot looks."""
 
 
-@kernel("i8(f8, i8)")
+@kernel("i8(f8, i8)", inner=True)
 def element(slot: float, w: int) -> int:
     """Where in the state the ``w``-th of the WIDTH elements of a link in a slot stands."""
     if w < 3:
@@ -104,7 +104,7 @@ def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: 
         out[i, SPREAD] = spread
 
 
-@kernel("void(f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def spread_out(P: Array, n: int, K: Array, b: Array, c: Array, out: Array) -> None:
     """``P <- P + sum of K c' - b K'`` over the links that are used, a row at a time: it stays in the cache."""
     for j in range(n):

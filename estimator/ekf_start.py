@@ -17,7 +17,7 @@ CAP: Final = 9.0
 """A link three sigma off counts no more, however far off it is: it may be covered, moved, or somewhere else."""
 
 
-@kernel("f8(f8[::1], f8[::1], i8, f8, f8[::1])")
+@kernel("f8(f8[::1], f8[::1], i8, f8, f8[::1])", inner=True)
 def common_gain(r: Array, s2: Array, n: int, prior2: float, best: Array) -> float:
     """The gain common to all links that explains their residuals best, robustly.
 

@@ -52,7 +52,7 @@ def adjacency(n: int, edges: Ints) -> tuple[Ints, Ints]:
     return first, near[:out].copy()
 
 
-@kernel("void(i8, i8, i8[:, ::1], i8[::1])")
+@kernel("void(i8, i8, i8[:, ::1], i8[::1])", inner=True)
 def bucket_in(i: int, degree: int, links: Ints, head: Ints) -> None:
     """Put pose ``i`` at the head of the list of those of this degree; ``links``: (next, previous) of each."""
     links[i, 0] = head[degree]
@@ -62,7 +62,7 @@ def bucket_in(i: int, degree: int, links: Ints, head: Ints) -> None:
     head[degree] = i
 
 
-@kernel("void(i8, i8, i8[:, ::1], i8[::1])")
+@kernel("void(i8, i8, i8[:, ::1], i8[::1])", inner=True)
 def bucket_out(i: int, degree: int, links: Ints, head: Ints) -> None:
     """Take pose ``i`` out of the list of its degree."""
     after, before = links[i, 0], links[i, 1]
@@ -84,7 +84,7 @@ QUOTIENT = "Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))"
 PASSED = "Tuple((i8[::1], i8[::1], i8[::1]))"
 
 
-@kernel(f"i8(i8, {QUOTIENT}, {PASSED})")
+@kernel(f"i8(i8, {QUOTIENT}, {PASSED})", inner=True)
 def reach_of(p: int, graph: Quotient, passed: Passed) -> int:
     """How many places eliminating ``p`` can fill at most."""
     first, near, elements, length = graph
@@ -95,7 +95,7 @@ def reach_of(p: int, graph: Quotient, passed: Passed) -> int:
     return int(reach)
 
 
-@kernel(f"i8(i8, i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1])")
+@kernel(f"i8(i8, i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1])", inner=True)
 def gather(k: int, p: int, graph: Quotient, passed: Passed, mark: Ints, fill: Ints) -> int:
     """Write the new element of pivot ``p``, neighbours and absorbed elements together; where it ends."""
     first, near, elements, length = graph
@@ -122,7 +122,7 @@ def gather(k: int, p: int, graph: Quotient, passed: Passed, mark: Ints, fill: In
     return int(end)
 
 
-@kernel(f"void(i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1], i8)")
+@kernel(f"void(i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1], i8)", inner=True)
 def weigh(k: int, graph: Quotient, passed: Passed, fill: Ints, weight: Ints, tag: int) -> None:
     """How much of every element near the new one lies outside it: ``weight - tag``."""
     first, near, elements, _ = graph
@@ -137,7 +137,7 @@ def weigh(k: int, graph: Quotient, passed: Passed, fill: Ints, weight: Ints, tag
                 weight[e] -= 1
 
 
-@kernel(f"i8(i8, i8, i8, {QUOTIENT}, {PASSED}, Tuple((i8[::1], i8[::1], i8)))")
+@kernel(f"i8(i8, i8, i8, {QUOTIENT}, {PASSED}, Tuple((i8[::1], i8[::1], i8)))", inner=True)
 def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[Ints, Ints, int]) -> int:
     """Replace in the slot of ``i`` what the new element covers; a bound of its degree besides the new element."""
     first, near, elements, length = graph

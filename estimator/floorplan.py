@@ -106,7 +106,7 @@ def fitted(
     return np.column_stack((middle, normal, slope))[good], n[good].astype(np.int64), at[good]
 
 
-@kernel("void(i8[:, :, ::1], i8, i8, i8, u1[::1])", aside=True)
+@kernel("void(i8[:, :, ::1], i8, i8, i8, u1[::1])", inner=True)
 def mark(line_of: npt.NDArray[np.int64], side: int, row: int, column: int, seen: npt.NDArray[np.uint8]) -> None:
     """Mark the lines of a cell and of those beside it as seen: beams a few metres off pass between cells."""
     _, rows, columns = line_of.shape

@@ -133,7 +133,7 @@ def widen(pyramid: Bytes) -> None:
                 pyramid[level, r, c] = best
 
 
-@kernel("f8(u1[:, :, ::1], i4[:, ::1], i8, i8, i8)")
+@kernel("f8(u1[:, :, ::1], i4[:, ::1], i8, i8, i8)", inner=True)
 def score_at(pyramid: Bytes, cells: Nodes, level: int, column: int, row: int) -> float:
     """Mean of the field under the points (cells (n, 2) from the sensor) with the sensor in the window there.
 
@@ -150,7 +150,7 @@ def score_at(pyramid: Bytes, cells: Nodes, level: int, column: int, row: int) ->
     return total / (255.0 * len(cells))
 
 
-@kernel("void(f8[::1], i4[:, ::1], i8, f8, Tuple((i4, i4, i4, i4)))")
+@kernel("void(f8[::1], i4[:, ::1], i8, f8, Tuple((i4, i4, i4, i4)))", inner=True)
 def push(keys: Array, nodes: Nodes, count: int, key: float, node: Node) -> None:
     """Add to a heap with the largest key on top."""
     i = count
@@ -166,7 +166,7 @@ def push(keys: Array, nodes: Nodes, count: int, key: float, node: Node) -> None:
     nodes[i, 0], nodes[i, 1], nodes[i, 2], nodes[i, 3] = node
 
 
-@kernel("void(f8[::1], i4[:, ::1], i8)")
+@kernel("void(f8[::1], i4[:, ::1], i8)", inner=True)
 def pop(keys: Array, nodes: Nodes, count: int) -> None:
     """Remove the top of a heap of ``count``; the caller has read it."""
     last = count - 1
@@ -189,7 +189,7 @@ def pop(keys: Array, nodes: Nodes, count: int) -> None:
         nodes[i, c] = nodes[last, c]
 
 
-@kernel("b1(f8[:, ::1], i8, UniTuple(i4, 4), i8, f8[::1])")
+@kernel("b1(f8[:, ::1], i8, UniTuple(i4, 4), i8, f8[::1])", inner=True)
 def near_hit(found: Array, hits: int, node: Node, headings: int, how: Array) -> bool:
     """Whether all of a node's window lies where a better hit has been found."""
     level, column, row, h = node

@@ -184,7 +184,7 @@ def sum_up(body: Array, held: Array, T: Array, scale: float, queries: int, sums:
     sums[15], sums[16], sums[17], sums[18] = inliers, count, weights, squares
 
 
-@kernel("void(f8[::1], f8, f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[::1], f8, f8[:, ::1], f8[:, ::1])", inner=True)
 def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
     """The part of the information that is not the normals' noise, times ``k``, and the projector onto what it holds.
 
@@ -232,7 +232,7 @@ def mean_lever(points: Array, eye: Array) -> float:
     return float(np.sqrt(square / max(len(points), 1)))
 
 
-@kernel("f8(f8[::1], f8[:, ::1], f8[::1])")
+@kernel("f8(f8[::1], f8[:, ::1], f8[::1])", inner=True)
 def between(u: Array, A: Array, v: Array) -> float:
     """``u' A v`` of two steps (3,), as the information A (3, 3) weighs them."""
     total = 0.0

@@ -2,7 +2,8 @@
 
 Every hot function is written as a plain Python function and decorated with :func:`kernel`:
 
-* an explicit signature: it compiles when imported, never inside a cycle, and a wrong dtype is a ``TypeError``;
+* an explicit signature: it compiles when imported, never inside a cycle, and a wrong dtype is a ``TypeError``; those
+  that only kernels call (``inner``) are in their callers' machine code, and a start does without their own;
 * with the interpreter held, but where ``aside`` says otherwise: letting it go and taking it back costs as much as the
   arithmetic of a small kernel, and while a background job runs Python, whoever has let go waits for it every time;
 * NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
@@ -17,6 +18,7 @@ This is the only module of the room that touches the file system; it does so onc
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -26,7 +28,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
-import llvmlite
+import llvmlite.binding
 import numpy as np
 
 # Importing numba asks whether scipy's BLAS is there, which loads a large part of scipy: a third of a warm start and
@@ -138,10 +140,13 @@ CACHE_DIR: Final = _choose_cache()
 _numba_config.CACHE_DIR = str(CACHE_DIR)
 
 
-def kernel(signature: str, inline: bool = False, aside: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def kernel(
+    signature: str, inline: bool = False, aside: bool = False, inner: bool = False
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
 
     ``inline`` writes its body into the kernels that call it: handing over three arrays costs as much as ten points.
+    ``inner`` says that kernels alone call it, as they alone call those with ``inline``.
     ``aside`` lets other threads run Python meanwhile: for what takes longer than some 50 us in background jobs.
 
     The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage. With
@@ -150,7 +155,6 @@ def kernel(signature: str, inline: bool = False, aside: bool = False) -> Callabl
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         compiled: Any = numba.njit(
-            signature,
             nogil=aside,
             cache=True,
             fastmath=FASTMATH,
@@ -160,6 +164,44 @@ def kernel(signature: str, inline: bool = False, aside: bool = False) -> Callabl
         )(function)
         if _numba_config.DISABLE_JIT:
             compiled.py_func = function
+        elif inner or inline:
+            _compile_on_use(compiled, signature)
+        else:
+            _compile(compiled, signature)
         return compiled  # type: ignore[no-any-return]  # numba has no types
 
     return decorate
+
+
+def _compile(compiled: Any, signature: str) -> None:
+    """For this signature, and for no other ever: what `numba.njit` does that is given one."""
+    compiled.compile(signature)
+    compiled.disable_compile()
+
+
+def _compile_on_use(compiled: Any, signature: str) -> None:
+    """As late as a kernel that calls it is compiled, or a test calls it."""
+    of_callers, of_calls = compiled.get_call_template, compiled._compile_for_args
+
+    def now() -> None:
+        compiled.get_call_template, compiled._compile_for_args = of_callers, of_calls
+        _compile(compiled, signature)
+
+    def get_call_template(args: Any, kws: Any) -> Any:
+        now()
+        return of_callers(args, kws)
+
+    def compile_for_args(*args: Any, **kws: Any) -> Any:
+        now()
+        return compiled  # whoever asks calls what it gets
+
+    compiled.get_call_template, compiled._compile_for_args = get_call_template, compile_for_args
+
+
+def _announce_no_calls() -> None:
+    """To numba's listeners, of which there are none: a start makes 20 000 calls of LLVM, and spends a sixth on that."""
+    with contextlib.suppress(AttributeError):  # private upstream
+        llvmlite.binding.ffi.lib._lock._cblist.clear()
+
+
+_announce_no_calls()

@@ -11,7 +11,7 @@ TINY = 1e-9
 """What is added to a diagonal: less than any uncertainty that matters (0.03 mm), and keeps an inverse finite."""
 
 
-@kernel("f8(f8[:, ::1], f8[::1], f8[::1])")
+@kernel("f8(f8[:, ::1], f8[::1], f8[::1])", inner=True)
 def solve3(A: Array, b: Array, x: Array) -> float:
     """Solve a symmetric positive definite system by Cramer's rule; returns the determinant (x = 0 if not positive)."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
@@ -30,7 +30,7 @@ def solve3(A: Array, b: Array, x: Array) -> float:
     return det
 
 
-@kernel("b1(f8[:, ::1])")
+@kernel("b1(f8[:, ::1])", inner=True)
 def positive(A: Array) -> bool:
     """Whether a symmetric matrix is positive definite (Sylvester's leading minors)."""
     minor = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
@@ -42,7 +42,7 @@ def positive(A: Array) -> bool:
     return bool(A[0, 0] > 0.0 and minor > 0.0 and det > 0.0)
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[:, ::1], f8[:, ::1])", inner=True)
 def eigen3(A: Array, V: Array) -> None:
     """Diagonalise a symmetric matrix in place by Jacobi rotations; the columns of ``V`` are its eigenvectors."""
     V[:] = 0.0

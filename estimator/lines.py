@@ -26,7 +26,7 @@ FLAT = 0.03
 """Largest share of a line's variance across it, unless range noise explains it."""
 
 
-@kernel("Tuple((i8, i8))(f8[:, ::1], i8, f8)")
+@kernel("Tuple((i8, i8))(f8[:, ::1], i8, f8)", inner=True)
 def neighbours(xy: Array, i: int, reach: float) -> tuple[int, int]:
     """Range [low, high) of the points around point ``i``, in scan order, that may lie on its surface."""
     n = len(xy)
@@ -45,7 +45,7 @@ def neighbours(xy: Array, i: int, reach: float) -> tuple[int, int]:
     return low, high
 
 
-@kernel("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def add_up(xy: Array, eye: Array, sums: Array, columns: Array) -> None:
     """Running sums of x, y, xx, xy, yy relative to the ``eye``: row i of ``sums`` (n + 1, 5) is over i points.
 
@@ -63,7 +63,7 @@ def add_up(xy: Array, eye: Array, sums: Array, columns: Array) -> None:
     sums[n, 0], sums[n, 1], sums[n, 2], sums[n, 3], sums[n, 4] = sx, sy, sxx, sxy, syy
 
 
-@kernel("Tuple((f8, f8, f8, f8))(f8[:, ::1], i8, i8)")
+@kernel("Tuple((f8, f8, f8, f8))(f8[:, ::1], i8, i8)", inner=True)
 def line_through(sums: Array, low: int, high: int) -> tuple[float, float, float, float]:
     """Total-least-squares line of the points [low, high): normal (x, y), variance across it and along it."""
     part = 1.0 / (high - low)
@@ -82,7 +82,7 @@ def line_through(sums: Array, low: int, high: int) -> tuple[float, float, float,
     return -ty * inverse, tx * inverse, max(0.0, mean - root), mean + root
 
 
-@kernel("f8(f8[:, ::1], i8, i8, Tuple((f8, f8, f8, f8)))")
+@kernel("f8(f8[:, ::1], i8, i8, Tuple((f8, f8, f8, f8)))", inner=True)
 def offset_on_line(columns: Array, low: int, high: int, at: tuple[float, float, float, float]) -> float:
     """Offset along the normal, at the point ``at`` (x, y, normal), of a parabola through the points [low, high).
 
@@ -111,7 +111,7 @@ def offset_on_line(columns: Array, low: int, high: int, at: tuple[float, float, 
     return (v0 * a - v1 * b + v2 * c) / det
 
 
-@kernel("void(f8[:, ::1], i8)")
+@kernel("void(f8[:, ::1], i8)", inner=True)
 def measure_runs(lines: Array, count: int) -> None:
     """Write into column 5 how far apart the ends of each unbroken run of lines are."""
     begin = 0

@@ -66,7 +66,7 @@ def strength_step(lamps: Array, rx: Array, data: Array, prior: Array, theta: Arr
     return float(cost)
 
 
-@kernel("f8(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])")
+@kernel("f8(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])", inner=True)
 def range_step(lamps: Array, data: Array, theta: Array, normal: Array) -> float:
     """Cost of Eq. 4 at ``theta`` (x, y), and the Gauss-Newton system there.
 
@@ -88,7 +88,7 @@ def range_step(lamps: Array, data: Array, theta: Array, normal: Array) -> float:
     return cost
 
 
-@kernel("b1(f8[:, ::1], f8, f8[::1])")
+@kernel("b1(f8[:, ::1], f8, f8[::1])", inner=True)
 def damped(normal: Array, damping: float, step: Array) -> bool:
     """Levenberg's step, shortened to `LONGEST_M` in the plane; whether it is a number at all."""
     n = normal.shape[0]

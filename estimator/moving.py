@@ -116,7 +116,7 @@ def hang(T_anchor: Array, T: Array, P_anchor: Array, P: Array, yaw: float, out: 
     turn(here, yaw, out)
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def times(A: Array, B: Array, out: Array) -> None:
     """Product of two 3x3 matrices."""
     for i in range(3):
@@ -128,7 +128,7 @@ MOST = 0.999
 """Share of the tie's error that may be the pose's too; more is rounding's, and might leave a negative variance."""
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def no_more(P: Array, X: Array, K: Array) -> None:
     """Scale the share ``K = X W^-1`` so that ``K W K' = X K'``, what it explains of ``P``, leaves something of it."""
     explained = np.empty((3, 3))

@@ -80,7 +80,7 @@ def pack_receiver(receiver: Receiver) -> Array:
     return np.array((r.x, r.y, r.z, r.area_m2, r.responsivity, r.order, cos_fov, r.slope_x, r.slope_y))
 
 
-@kernel("f8(f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1])")
+@kernel("f8(f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1])", inner=True)
 def expect(lamp: Array, rx: Array, pose: Array, floor: float, out: Array, J: Array) -> float:
     """Amplitude of one lamp (at gain 0) and its derivatives.
 

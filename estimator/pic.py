@@ -32,7 +32,7 @@ Spread = tuple[float, float, float]
 """Covariance of a point: xx, xy, yy."""
 
 
-@kernel("UniTuple(f8, 3)(f8, f8, f8, f8)")
+@kernel("UniTuple(f8, 3)(f8, f8, f8, f8)", inner=True)
 def spread_of(x: float, y: float, sigma: float, across: float) -> Spread:
     """Covariance of a point seen at (x, y) from the lidar: ``sigma`` along the ray, ``across`` (rad) over it."""
     r2 = x * x + y * y
@@ -42,7 +42,7 @@ def spread_of(x: float, y: float, sigma: float, across: float) -> Spread:
     return a * x * x + b * y * y, (a - b) * x * y, a * y * y + b * x * x
 
 
-@kernel("UniTuple(f8, 3)(f8, f8, f8[:, ::1])")
+@kernel("UniTuple(f8, 3)(f8, f8, f8[:, ::1])", inner=True)
 def swung(ux: float, uy: float, P: Array) -> Spread:
     """``J_q P J_q'``: what the pose's covariance does to a point at lever (ux, uy)."""
     ax, ay = P[0, 2] - uy * P[2, 2], P[1, 2] + ux * P[2, 2]
@@ -53,14 +53,14 @@ def swung(ux: float, uy: float, P: Array) -> Spread:
     )
 
 
-@kernel("f8(UniTuple(f8, 3))")
+@kernel("f8(UniTuple(f8, 3))", inner=True)
 def widest(S: Spread) -> float:
     """Larger eigenvalue."""
     half = 0.5 * (S[0] - S[2])
     return float(0.5 * (S[0] + S[2]) + np.sqrt(half * half + S[1] * S[1]))
 
 
-@kernel("void(f8[:, ::1], UniTuple(i8, 2), Tuple((f8, f8, f8, f8, f8, f8, f8)), UniTuple(f8, 2), f8[::1])")
+@kernel("void(f8[:, ::1], UniTuple(i8, 2), Tuple((f8, f8, f8, f8, f8, f8, f8)), UniTuple(f8, 2), f8[::1])", inner=True)
 def gather(
     rows: Array,
     part: tuple[int, int],
@@ -104,7 +104,10 @@ def gather(
         a += 1
 
 
-@kernel("void(Tuple((f8[:, ::1], i8[::1], f8[:, ::1])), Tuple((f8, f8, f8, f8, f8, f8, f8)), UniTuple(f8, 2), f8[::1])")
+@kernel(
+    "void(Tuple((f8[:, ::1], i8[::1], f8[:, ::1])), Tuple((f8, f8, f8, f8, f8, f8, f8)), UniTuple(f8, 2), f8[::1])",
+    inner=True,
+)
 def partners(
     reference: Reference,
     at: tuple[float, float, float, float, float, float, float],
@@ -134,7 +137,7 @@ def partners(
         todo -= 1
 
 
-@kernel("void(f8[::1], UniTuple(f8, 3), UniTuple(f8, 4), f8[:, ::1], f8[::1])")
+@kernel("void(f8[::1], UniTuple(f8, 3), UniTuple(f8, 4), f8[:, ::1], f8[::1])", inner=True)
 def add_partner(s: Array, spread: Spread, ray: tuple[float, float, float, float], A: Array, b: Array) -> None:
     """One virtual partner in the normal equations; b (3..) also gets inliers, pairs, weights and squares.
 
@@ -167,7 +170,8 @@ def add_partner(s: Array, spread: Spread, ray: tuple[float, float, float, float]
 
 @kernel(
     "void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1])), f8[::1], f8[:, ::1], f8[::1],"
-    " Tuple((f8[:, ::1], f8[::1])))"
+    " Tuple((f8[:, ::1], f8[::1])))",
+    inner=True,
 )
 def sum_up(points: Array, reference: Reference, T: Array, P: Array, how: Array, out: tuple[Array, Array]) -> None:
     """Normal equations over all virtual partners at the pose ``T`` with covariance ``P``; ``out``: A, and b (7)."""

@@ -66,7 +66,7 @@ def surfaces(xy: Array, sigma: float, out: Array) -> None:
         out[i, 3] = np.sqrt(12.0 * along) / max(m - 1.0, 1.0)
 
 
-@kernel("void(f8[::1], f8, UniTuple(f8, 2), UniTuple(f8, 2))")
+@kernel("void(f8[::1], f8, UniTuple(f8, 2), UniTuple(f8, 2))", inner=True)
 def add_pair(m: Array, w: float, q: tuple[float, float], p: tuple[float, float]) -> None:
     """One pair more in the moments of :func:`closed_form`."""
     m[0] += w
@@ -98,7 +98,7 @@ def closed_form(m: Array, T: Array) -> bool:
     return True
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])")
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])", inner=True)
 def align(q: Array, p: Array, T: Array) -> None:
     """Eq. 13 for given pairs of points (n, 2): T that maps q onto p."""
     m = np.zeros(9)
@@ -107,7 +107,7 @@ def align(q: Array, p: Array, T: Array) -> None:
     closed_form(m, T)
 
 
-@kernel("void(f8[:, ::1], f8, UniTuple(f8, 2), UniTuple(f8, 2))")
+@kernel("void(f8[:, ::1], f8, UniTuple(f8, 2), UniTuple(f8, 2))", inner=True)
 def add_outer(A: Array, w: float, n: tuple[float, float], u: tuple[float, float]) -> None:
     """Add ``w J J'``, where ``J = (n, n x u)`` is how a point at lever ``u`` moves along ``n`` with the pose."""
     turn = n[1] * u[0] - n[0] * u[1]

@@ -168,13 +168,13 @@ def parts_of(n: int, edges: Ints) -> Ints:
     return root
 
 
-@kernel("f8(f8)")
+@kernel("f8(f8)", inner=True)
 def wrapped(angle: float) -> float:
     """To (-pi, pi]."""
     return float(angle - 2.0 * np.pi * np.ceil((angle - np.pi) / (2.0 * np.pi)))
 
 
-@kernel("f8(f8[:], f8[::1], f8[::1])")
+@kernel("f8(f8[:], f8[::1], f8[::1])", inner=True)
 def quadratic(H: Array, e: Array, out: Array) -> float:
     """``e^T H e`` of an upper triangle; ``out`` = H e."""
     out[0] = H[0] * e[0] + H[1] * e[1] + H[2] * e[2]
@@ -183,20 +183,20 @@ def quadratic(H: Array, e: Array, out: Array) -> float:
     return float(e[0] * out[0] + e[1] * out[1] + e[2] * out[2])
 
 
-@kernel("f8(f8, f8)")
+@kernel("f8(f8, f8)", inner=True)
 def believed(chi2: float, phi: float) -> float:
     """Weight of a doubtful constraint: the derivative of :func:`potential`."""
     s = phi / (phi + chi2)
     return s * s
 
 
-@kernel("f8(f8, f8)")
+@kernel("f8(f8, f8)", inner=True)
 def potential(chi2: float, phi: float) -> float:
     """Geman-McClure's cost, which saturates at ``phi``."""
     return phi * chi2 / (phi + chi2)
 
 
-@kernel("void(f8[:, ::1], i8, i8, f8[:], f8[::1])")
+@kernel("void(f8[:, ::1], i8, i8, f8[:], f8[::1])", inner=True)
 def edge_error(poses: Array, i: int, j: int, z: Array, e: Array) -> None:
     """``T_z^-1 (T_i^-1 T_j)``; with i = -1, T_i is the origin."""
     x = y = yaw = 0.0
@@ -216,7 +216,7 @@ ABSOLUTE = "Tuple((i8[::1], f8[:, ::1], f8[:, ::1]))"
 PATTERN = "Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))"
 
 
-@kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE}, f8[::1], f8)", aside=True)
+@kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE}, f8[::1], f8)", inner=True)
 def cost(poses: Array, given: Given, absolute: Absolute, trust: Array, phi: float) -> float:
     """chi2 as weighted, and the ``trust`` in each edge.
 
@@ -252,7 +252,7 @@ def worst(poses: Array, given: Given, absolute: Absolute) -> float:
     return largest
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def add_product(A: Array, H: Array, B: Array, out: Array) -> None:
     """``out += A^T H B`` of 3 x 3."""
     for r in range(3):
@@ -263,7 +263,7 @@ def add_product(A: Array, H: Array, B: Array, out: Array) -> None:
             out[r, c] += p * B[0, c] + q * B[1, c] + t * B[2, c]
 
 
-@kernel("void(f8[:, ::1], f8[::1], f8[::1])")
+@kernel("void(f8[:, ::1], f8[::1], f8[::1])", inner=True)
 def subtract(A: Array, v: Array, out: Array) -> None:
     """``out -= A^T v``."""
     for r in range(3):
@@ -271,7 +271,7 @@ def subtract(A: Array, v: Array, out: Array) -> None:
 
 
 @kernel(f"void(f8[:, ::1], {GIVEN}, {ABSOLUTE}, Tuple((i8[::1], {PATTERN})), Tuple((f8[::1], i8[::1], f8)),"
-        " Tuple((f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])))", aside=True)  # fmt: skip
+        " Tuple((f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])))", inner=True)  # fmt: skip
 def linearise(
     poses: Array,
     given: Given,
@@ -323,7 +323,7 @@ def linearise(
                 add_product(A, H, B, below[slot[k]])
 
 
-@kernel(f"i8[::1](i8[:, ::1], i8[::1], {PATTERN})", aside=True)
+@kernel(f"i8[::1](i8[:, ::1], i8[::1], {PATTERN})", inner=True)
 def slots_of(edges: Ints, place: Ints, pattern: tuple[Ints, Ints, Ints, Ints]) -> Ints:
     """Where in the pattern the block of each edge lies, -1 where one of its poses is held."""
     start, down, _, _ = pattern

@@ -56,7 +56,7 @@ def spanning(n: int, edges: Ints, doubtful: Bools, free: Bools) -> tuple[Ints, I
     return order, parent
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], Tuple((i8[::1], i8[::1])), f8[:, ::1])", aside=True)
+@kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], Tuple((i8[::1], i8[::1])), f8[:, ::1])", inner=True)
 def carry_on(poses: Array, step: Array, place: Ints, tree: tuple[Ints, Ints], out: Array) -> None:
     """``out`` (n, 3) = ``poses`` after ``step`` (by ``place``, which is negative where a pose is held)."""
     order, parent = tree
