@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tools.bench.vm import bench, common, guests, image, places
+from tools.bench.vm import bench, common, guests, places
+from tools.bench.vm.booted import Booted
 from tools.bench.vm.guests import Guest, run_all, tried
+from tools.bench.vm.image import Image
 
 
 class Lived:
@@ -126,13 +128,17 @@ def errs(bench: bench.Bench) -> str:
     raise AttributeError("spelt wrongly")
 
 
+def kept(folder: Path) -> Booted:
+    return Booted(Image(folder), folder)
+
+
 def played_by_two(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *shares: list[common.Scenario]
 ) -> tuple[bool, list[list[str]], str]:
-    monkeypatch.setattr(guests, "bench", lambda image, folder, broken_off: Playing(broken_off))
+    monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off: Playing(broken_off))
     both = [Guest(k + 1, share) for k, share in enumerate(shares)]
     (tmp_path / "work").mkdir()
-    whole = run_all(both, image.Image(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    whole = run_all(both, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
     said = " ".join(one.skipped or one.said for guest in both for one in guest.results)
     return whole, [[one.outcome for one in guest.results] for guest in both], said
 
@@ -153,10 +159,10 @@ def test_a_computer_that_dies_leaves_a_report_of_what_was_and_what_was_not_run(
 def test_what_the_emulation_has_worked_is_told_with_each_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guests, "bench", lambda image, folder, broken_off: Playing(broken_off))
+    monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off: Playing(broken_off))
     (tmp_path / "work").mkdir()
     guest = Guest(1, [like(passes), passes])
-    run_all([guest], image.Image(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    run_all([guest], kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
     assert [str(figure) for one in guest.results for figure in one.figures] == 2 * ["work of the emulation: 1.5 CPU s"]
 
 

@@ -13,9 +13,10 @@ import time
 from pathlib import Path
 
 from tools.bench.report import About, CannotCompare, Result, facts, read, write
+from tools.bench.vm.booted import Booted, booted
 from tools.bench.vm.common import Scenario
 from tools.bench.vm.guests import Guest, run_all
-from tools.bench.vm.image import Image, image
+from tools.bench.vm.image import image
 from tools.bench.vm.places import CannotBench, workspace
 from tools.bench.vm.reference import outside
 from tools.bench.vm.scenarios import SCENARIOS, SHARES
@@ -42,7 +43,7 @@ def chosen(names: list[str]) -> list[list[Scenario]]:
     return [share[:end] for share, end in zip(SHARES, ends, strict=True) if end]
 
 
-def run(made: Image, shares: list[list[Scenario]], out: Path) -> tuple[bool, list[Result]]:
+def run(made: Booted, shares: list[list[Scenario]], out: Path) -> tuple[bool, list[Result]]:
     """Try them; whether that went to its end, and the results."""
     out.mkdir(parents=True, exist_ok=True)
     guests = [Guest(number, share) for number, share in enumerate(shares, 1)]
@@ -69,7 +70,7 @@ def main() -> int:
         if options.against is not None:
             read(options.against)  # what is wrong with it is told now, not in eight minutes
         shares = chosen(options.scenario)
-        made = image(say)
+        made = booted(image(say), say)
         outside()
         if options.image_only:
             return 0
@@ -81,7 +82,7 @@ def main() -> int:
         say("ended before it began; nothing of it is left running")
         return CANNOT
     seconds = f"{time.monotonic() - begun:.0f}"
-    told = facts(image=made.folder.name, configuration=CONFIGURATION.read_text(), **{"seconds in all": seconds})
+    told = facts(image=made.image.folder.name, configuration=CONFIGURATION.read_text(), **{"seconds in all": seconds})
     if not whole:
         told["broken off"] = "before its end; what was not run by then is named below"
     worse = write(options.out, results, About("bench-vm", "Virtual bench", told), options.against)

@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tools.bench.otherclock import OtherClock
-from tools.bench.vm.image import ROOT, Image
+from tools.bench.vm.booted import Booted
+from tools.bench.vm.image import ROOT
 from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
 from tools.bench.vm.places import LEASH, CannotBench
 from tools.clients.read_modbus import Reader
@@ -111,6 +112,7 @@ class Bench:
 
     def __init__(self, machine: Machine, world: subprocess.Popen[str], folder: Path, there: dict[str, Any]) -> None:
         self.machine, self.world, self.folder, self.there = machine, world, folder, there
+        self.booted_s = 0.0
         self.ears = Ears()
         self.start: Pose | None = None
         self.memory: dict[str, Any] = {}
@@ -271,8 +273,8 @@ def _end(child: subprocess.Popen[str]) -> None:
 
 
 @contextmanager
-def bench(image: Image, folder: Path, broken_off: threading.Event) -> Iterator[Bench]:
-    """Everything running, the emulated computer switched on; nothing of it is left at the end."""
+def bench(booted: Booted, folder: Path, broken_off: threading.Event) -> Iterator[Bench]:
+    """Everything running, the emulated computer held where its boot has ended; nothing of it is left at the end."""
     with ExitStack() as stack:
         truth, poses = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
         for one in (truth, poses):
@@ -281,8 +283,9 @@ def bench(image: Image, folder: Path, broken_off: threading.Event) -> Iterator[B
         world, there = _start_world(folder, odometry, truth.getsockname()[1], stack)
         there["poses"] = poses.getsockname()[1]
         ports = Ports(free_for_both(), odometry, int(there["lidar"]))
-        machine = stack.enter_context(started(image, folder, ports, broken_off))
+        machine = stack.enter_context(started(booted.start, folder, ports, broken_off))
         made = Bench(machine, world, folder, there)
+        made.booted_s = booted.seconds
         stop = threading.Event()
         ears = threading.Thread(target=made.ears.listen, args=(truth, poses, stop))
         ears.start()

@@ -14,8 +14,8 @@ from typing import Final
 
 from tools.bench.report import Figure, Result, Seen
 from tools.bench.vm.bench import Bench, bench
+from tools.bench.vm.booted import Booted
 from tools.bench.vm.common import AFTER, Scenario, unnoticed
-from tools.bench.vm.image import Image
 from tools.bench.vm.machine import Order
 from tools.bench.vm.places import BrokenOff, CannotBench
 
@@ -75,12 +75,12 @@ class Guest:
     results: list[Result] = field(default_factory=list)
     broken_off: threading.Event = field(default_factory=threading.Event)
 
-    def run(self, image: Image, folder: Path, out: Path, say: Say) -> None:
+    def run(self, booted: Booted, folder: Path, out: Path, say: Say) -> None:
         """Try them, until it ends or is broken off; its console and its journal stay in ``out``."""
         folder.mkdir()
         why = "the bench has met an error of its own, which it has written"
         try:
-            with bench(image, folder, self.broken_off) as whole:
+            with bench(booted, folder, self.broken_off) as whole:
                 for scenario in self.share:
                     before = whole.machine.worked_s()
                     one = tried(scenario, whole)
@@ -115,7 +115,7 @@ class Guest:
         say(f"{self.number}: {one.outcome:7} {one.seconds:6.1f} s  {one.title}\n{' ' * 21}{one.skipped or one.said}")
 
 
-def run_all(guests: list[Guest], image: Image, folder: Path, out: Path, say: Say) -> bool:
+def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: Say) -> bool:
     """Run them side by side; what they show is in them. False: somebody has broken it off (SIGINT, SIGTERM)."""
     broken_off = threading.Event()
 
@@ -126,7 +126,9 @@ def run_all(guests: list[Guest], image: Image, folder: Path, out: Path, say: Say
 
     before = {number: signal.signal(number, break_off) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        threads = [threading.Thread(target=one.run, args=(image, folder / str(one.number), out, say)) for one in guests]
+        threads = [
+            threading.Thread(target=one.run, args=(booted, folder / str(one.number), out, say)) for one in guests
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:

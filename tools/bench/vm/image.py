@@ -45,7 +45,8 @@ UNUSED = (
 )
 """Below drivers/ of the kernel's modules: three quarters of them."""
 CACHE_PLACE = Path("var/cache/private/lumiloop")
-WARM = {"NUMBA_CPU_NAME": "generic", "PYTHONPATH": str(ROOT)}
+WARM = {"NUMBA_CPU_NAME": "generic", "NUMBA_ENABLE_AVX": "0", "PYTHONPATH": str(ROOT)}
+"""As `guest/generic.conf` says inside: numba's settings name the kernels' folder."""
 DISK_BYTES = 3_000_000_000
 ROOM = 5_000_000_000
 BUILD_S = 1800.0

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import select
+import shlex
 import socket
 import subprocess
 import threading
@@ -19,7 +20,7 @@ from typing import IO, Any
 from tools.bench.vm.image import Image
 from tools.bench.vm.places import LEASH, BrokenOff, CannotBench
 
-BOOT_S, QUIT_S, LOOK_S = 400.0, 10.0, 0.5
+BOOT_S, QUIT_S, LOOK_S, KEEP_S = 400.0, 10.0, 0.5, 120.0
 MODBUS, ODOMETRY = 1502, 5601
 UNUSED = (
     *(f"{unit}.service" for unit in ("serial-getty@ttyS0", "getty@tty1", "systemd-logind", "systemd-binfmt")),
@@ -32,10 +33,13 @@ UNUSED = (
 NOBODYS = "ahci,libahci,libata,cfg80211,kvm,kvm_amd,iTCO_wdt,aesni_intel,ghash_clmulni_intel,powernow_k8,psmouse,pcspkr"
 """Modules of devices that nothing here needs."""
 COMMAND_LINE = " ".join([
-    "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off systemd.show_status=false",
+    "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off highres=off systemd.show_status=false",
     f"modprobe.blacklist={NOBODYS}",
     *(f"systemd.mask={unit}" for unit in UNUSED),
 ])  # fmt: skip
+"""``highres=off``: dummy_hcd looks after its bus at every tick of 4 ms, not 8000 times a second."""
+PROCESSOR = "Nehalem"
+"""The oldest that everything inside runs on (numpy wants x86-64-v2): wide vectors are the dearest to emulate."""
 OUTSIDE = "10.0.2.2"
 """This computer, as the emulated one sees it."""
 
@@ -58,6 +62,19 @@ def free_for_both() -> int:
                 continue
             return port
     raise CannotBench("no port of the loopback address is free for TCP and UDP")
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What it starts from: the image; changes of its disk (qcow2); memory, where it goes on from a state that was kept.
+
+    ``keep``: what it writes to its disk stays in the file of changes; otherwise it is gone when it ends.
+    """
+
+    image: Image
+    disk: Path
+    memory: Path | None = None
+    keep: bool = False
 
 
 @dataclass(slots=True)
@@ -94,10 +111,40 @@ class Machine:
                 return time.monotonic() - begun
         raise CannotBench(f"the emulated computer does not boot:\n{self.console()[-3000:]}")
 
+    def go_on(self) -> float:
+        """Let a computer whose state was kept go on, and tell it what time it is; how many seconds that took.
+
+        Raises:
+            CannotBench: QEMU does not take the state, or nobody answers inside.
+        """
+        begun = time.monotonic()
+        self._until_status("paused", "taking the state that was kept")
+        self._agent, self._heard = self._connected("agent"), b""
+        self._monitor("cont")
+        try:
+            self.run("date", "-s", f"@{time.time():.3f}")
+        except Order as error:
+            raise CannotBench(f"the emulated computer does not go on: {error}") from error
+        return time.monotonic() - begun
+
+    def keep(self, path: Path) -> None:
+        """Stop it for good, and write its memory to a file, for :meth:`go_on` of another one with the same disk."""
+        self._monitor("stop")
+        self._monitor("migrate", uri=f"exec:cat > {shlex.quote(str(path))}")
+        self._until_status("postmigrate", "keeping its memory")
+
+    def _until_status(self, status: str, what: str) -> None:
+        until = time.monotonic() + KEEP_S
+        while self._monitor("query-status")["status"] != status:
+            self.check()
+            if time.monotonic() > until:
+                raise CannotBench(f"{what} has not come to its end within {KEEP_S:.0f} s")
+            time.sleep(0.1)
+
     def _greeted(self) -> bool:
         """Whether the agent has said that it is up, within a second."""
         if self._agent is None:
-            self._agent, self._heard = _connected(self.folder / "agent"), b""
+            self._agent, self._heard = self._connected("agent"), b""
         said = self._line(time.monotonic() + 1.0)
         if said is None:
             self._drop()
@@ -211,20 +258,36 @@ class Machine:
         path = self.folder / "console"
         return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", path.read_text(errors="replace")) if path.exists() else ""
 
-    def _monitor(self, command: str) -> None:
+    def _monitor(self, command: str, **arguments: str) -> dict[str, Any]:
         if self._qmp is None:
-            link = _connected(self.folder / "qmp")
+            link = self._connected("qmp")
             self._qmp = (link, link.makefile("rb"))
             self._qmp[1].readline()
-            self._tell("qmp_capabilities")
-        self._tell(command)
+            self._tell("qmp_capabilities", {})
+        return self._tell(command, arguments)
 
-    def _tell(self, command: str) -> None:
+    def _connected(self, name: str) -> socket.socket:
+        """To one of its sockets; raises `CannotBench` where it has ended, or does not offer it."""
+        link, end = socket.socket(socket.AF_UNIX), time.monotonic() + QUIT_S
+        while True:
+            try:
+                link.connect(str(self.folder / name))
+                return link
+            except OSError as error:
+                if self.process.poll() is not None or time.monotonic() > end:
+                    link.close()
+                    self.check()
+                    raise CannotBench(f"QEMU does not offer {name}: {error}") from error
+                time.sleep(0.1)
+
+    def _tell(self, command: str, arguments: dict[str, str]) -> dict[str, Any]:
         assert self._qmp is not None
-        self._qmp[0].sendall(json.dumps({"execute": command}).encode() + b"\n")
+        self._qmp[0].sendall(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
         while b'"return"' not in (line := self._qmp[1].readline()):
             if not line or b'"error"' in line:
                 raise CannotBench(f"QEMU does not take {command}: {line.decode()}")
+        answer: dict[str, Any] = json.loads(line)["return"]
+        return answer
 
     def stop(self) -> None:
         """Off."""
@@ -240,6 +303,14 @@ class Machine:
             self._qmp[0].close()
 
 
+def all_well(machine: Machine) -> None:
+    """Raise `Order` unless the system inside runs, and no unit has failed."""
+    state = machine.run("systemctl", "is-system-running", "--wait", check=False, seconds=120).strip()
+    if state != "running":
+        failed = machine.run("systemctl", "list-units", "--failed", "--no-legend", "--plain")
+        raise Order(f"the system is {state}: {failed}")
+
+
 def _waited_s(task: Path) -> float:
     """Of the threads in a folder of /proc those that are emulated processors, which QEMU names ``CPU 0/TCG``."""
     waited = 0.0
@@ -250,32 +321,21 @@ def _waited_s(task: Path) -> float:
     return waited
 
 
-def _connected(path: Path) -> socket.socket:
-    link = socket.socket(socket.AF_UNIX)
-    end = time.monotonic() + QUIT_S
-    while True:
-        try:
-            link.connect(str(path))
-            return link
-        except OSError as error:
-            if time.monotonic() > end:
-                raise CannotBench(f"QEMU does not offer {path.name}: {error}") from error
-            time.sleep(0.1)
-
-
-def _words(image: Image, folder: Path, ports: Ports) -> list[str]:
-    """QEMU's command line. ``snapshot=on``: what is written stays until it ends, and never reaches the image.
+def command_line(start: Start, folder: Path, ports: Ports) -> list[str]:
+    """QEMU's. ``snapshot=on``: what is written stays until it ends, and reaches neither the image nor what was kept.
 
     Everything is emulated, on a computer with KVM too: where virtual machines are nested, /dev/kvm may open and then
     run nothing.
     """
+    temporary = "off" if start.keep else "on"
+    incoming = ["-incoming", f"exec:cat {shlex.quote(str(start.memory))}"] if start.memory else []
     forwards = f"hostfwd=tcp:127.0.0.1:{ports.modbus}-:{MODBUS},hostfwd=udp:127.0.0.1:{ports.modbus}-:{MODBUS}"
     return [
         "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-name", "debug-threads=on", "-display", "none",
         "-machine", "q35",
-        "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "1", "-m", "1536",
-        "-kernel", str(image.kernel), "-initrd", str(image.initrd), "-append", COMMAND_LINE,
-        "-drive", f"file={image.disk},if=none,id=disk,format=raw,snapshot=on,cache=unsafe",
+        "-accel", "tcg,thread=multi", "-cpu", PROCESSOR, "-smp", "1", "-m", "1536",
+        "-kernel", str(start.image.kernel), "-initrd", str(start.image.initrd), "-append", COMMAND_LINE,
+        "-drive", f"file={start.disk},if=none,id=disk,format=qcow2,snapshot={temporary},cache=unsafe",
         "-device", "virtio-blk-pci,drive=disk", "-device", "virtio-rng-pci",
         "-netdev", f"user,id=net,{forwards},hostfwd=udp:127.0.0.1:{ports.odometry}-:{ODOMETRY}",
         "-device", "virtio-net-pci,netdev=net,romfile=",
@@ -285,16 +345,16 @@ def _words(image: Image, folder: Path, ports: Ports) -> list[str]:
         "-chardev", f"socket,id=lidar,host=127.0.0.1,port={ports.lidar},reconnect=1",
         "-device", "virtserialport,chardev=lidar,name=bench.lidar",
         "-chardev", f"file,id=console,path={folder / 'console'}", "-serial", "chardev:console",
-        "-qmp", f"unix:{folder / 'qmp'},server=on,wait=off",
+        "-qmp", f"unix:{folder / 'qmp'},server=on,wait=off", *incoming,
     ]  # fmt: skip
 
 
 @contextmanager
-def started(image: Image, folder: Path, ports: Ports, broken_off: threading.Event) -> Iterator[Machine]:
+def started(start: Start, folder: Path, ports: Ports, broken_off: threading.Event) -> Iterator[Machine]:
     """Switch it on; it is off at the end, whatever happens.
 
     Args:
-        image: what it starts from.
+        start: what it starts from.
         ports: where it can be reached, and where its lidar is.
         folder: for sockets and console; its disk's changes go there too, and are gone at the end.
         broken_off: once set, whoever waits for it gets `BrokenOff`.
@@ -303,7 +363,11 @@ def started(image: Image, folder: Path, ports: Ports, broken_off: threading.Even
         said = stack.enter_context((folder / "qemu").open("wb"))
         environment = {**os.environ, "TMPDIR": str(folder)}
         process = subprocess.Popen(
-            [*LEASH, *_words(image, folder, ports)], stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
+            [*LEASH, *command_line(start, folder, ports)],
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            env=environment,
         )
         machine = Machine(process, folder, ports, broken_off)
         stack.callback(machine.stop)

@@ -12,13 +12,14 @@ from pathlib import Path
 MEMORY = Path("/dev/shm")
 TOOLS = {
     "qemu-system-x86_64": "qemu-system-x86",
+    "qemu-img": "qemu-utils",
     "mmdebstrap": "mmdebstrap",
     "mkfs.ext4": "e2fsprogs",
     "dpkg-deb": "dpkg",
     "chroot": "coreutils",
     "setpriv": "util-linux",
 }
-BUILDING = frozenset({"mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot"})
+BUILDING = frozenset({"qemu-img", "mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot"})
 """Those that only making an image takes; running one takes QEMU alone."""
 
 
