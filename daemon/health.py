@@ -17,6 +17,14 @@ STALLED_PERIODS: Final = 2.0
 """Scan periods by which the loop may be late: the next one would be taken for a silent lidar."""
 FEW: Final = 2
 """Events that are no rate yet: shortly after the start a single one would be a large part of all."""
+REPLAYED: Final = frozenset(
+    (
+        *(Fault.NO_LAMPS, Fault.SURVEY_CONTRADICTED, Fault.TWIN_LAMPS, Fault.LAMP_MOVED, Fault.LAMP_DEAD),
+        *(Fault.LIDAR_MISFIT, Fault.ODOMETRY_SILENT, Fault.ODOMETRY_DISAGREES, Fault.PROTECTION_ALERT),
+    )
+)
+"""What the data alone say, moment by moment: a replay has them again. All others are said by drivers, by the computer,
+or are rates of what was lost before it was recorded."""
 
 
 @dataclass(frozen=True, slots=True)

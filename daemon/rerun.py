@@ -16,6 +16,8 @@ from daemon.bridge import SampleBridge, ScanBridge
 from daemon.budget import FixedBudget
 from daemon.config import Config
 from daemon.cycle import Cycle, CycleRecord, Parts
+from daemon.faults import Fault
+from daemon.health import REPLAYED, assess
 from daemon.ledger import Ledger
 from daemon.lights import Lights, begun, new_state
 from daemon.mapswitch import take_over
@@ -26,6 +28,7 @@ from daemon.results import finest
 from daemon.sources import Event, Source, Turn
 from daemon.store import Start, recorded_start
 from daemon.store_file import BadMap
+from daemon.vitals import vitals
 from daemon.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
 from estimator.grid import Grid
@@ -168,6 +171,12 @@ class Rerun:
     def t_mono(self) -> float:
         """Where the log's clock stands."""
         return self._clock.t_mono
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Those of :data:`~daemon.health.REPLAYED` that are present, gravest first; to be asked for once a second."""
+        now = vitals(self.cycle, set(), 0.0)
+        return tuple(fault for fault in assess(now, now) if fault in REPLAYED)
 
     def feed(self, event: Event) -> None:
         """Take one event; runs a cycle where one is due."""

@@ -51,12 +51,17 @@ class StreamBeat:
         """Tell once."""
         server, cycle = self._server, self._cycle
         now = cycle.parts.clock.now()
-        server.on_faults(now, [(int(fault), *FAULTS[fault]) for fault in self._faults()])
+        server.on_faults(now, in_words(self._faults()))
         server.on_statistics(lambda: figures(cycle, now))
         if server.wanted("map"):
             self.tiles.follow(loop)
         else:
             self.tiles.forget()
+
+
+def in_words(faults: tuple[Fault, ...]) -> list[tuple[int, str, str]]:
+    """Number, meaning and remedy of each."""
+    return [(int(fault), *FAULTS[fault]) for fault in faults]
 
 
 def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:

@@ -12,6 +12,7 @@ from daemon.reasons import REASONS, Reason
 from daemon.replay import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.rerun import Rerun
 from daemon.sources import Source, open_log
+from daemon.streambeat import BEAT_S, in_words
 from hal.adc import RawSamples
 from hal.lidar import RawScan
 from hal.replay.recording import Kind, open_recording
@@ -64,13 +65,16 @@ class Retold:
             HalError: the log cannot be read on.
         """
         passed = self._raw() if raw and self.source.recorded else iter(())
-        waiting = next(passed, None)
+        waiting, beat_at = next(passed, None), -1.0
         for event in self.source.events():
             if isinstance(event, RawScan):
                 self._server.on_scan(event)
             elif isinstance(event, RawSamples) and raw:
                 self._server.on_samples(event)
             self.rerun.feed(event)
+            if self.rerun.t_mono >= beat_at:
+                beat_at = self.rerun.t_mono + BEAT_S
+                self._server.on_faults(self.rerun.t_mono, in_words(self.rerun.faults))
             while waiting is not None and waiting.t_mono <= self.rerun.t_mono:
                 yield waiting
                 waiting = next(passed, None)

@@ -26,7 +26,7 @@ from daemon.reasons import REASONS, Reason
 from daemon.replay import Given, config_for, lights_for, start_for
 from daemon.rerun import Rerun
 from daemon.sources import open_log
-from daemon.streambeat import place_of
+from daemon.streambeat import in_words, place_of
 from hal.errors import HalError
 from hal.lidar import RawScan
 from taps import frames
@@ -34,12 +34,12 @@ from taps.view.film import HEAD, KINDS
 from taps.view.viewers import History, about_of, encode, frame
 from taps.view.words import scene_of
 
-TOPICS: Final = frozenset({"pose", "lights", "scan", "state", "loop", "map"})
+TOPICS: Final = frozenset({"pose", "lights", "scan", "state", "loop", "faults", "map"})
 THINNED: Final = ("pose", "lights", "scan")
 STEP_S: Final = 0.05
 """Between two poses of a film."""
 BEAT_S: Final = 1.0
-"""Of the recording's time, between two looks at the map."""
+"""Of the recording's time, between two looks at the map, and at what is wrong."""
 DRAWN_S: Final = 20.0
 
 _pose: Final = msgspec.msgpack.Decoder(frames.Pose).decode
@@ -147,6 +147,7 @@ async def _run(log: Path, settings: Config, given: Given, server: StreamServer, 
         rerun.feed(event)
         if rerun.t_mono >= beat_at:
             camera.t_mono, beat_at = rerun.t_mono, rerun.t_mono + BEAT_S
+            server.on_faults(rerun.t_mono, in_words(rerun.faults))
             await _draw(tiles)
             camera.flush()
     await _draw(tiles)
