@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+from pathlib import Path
 from typing import Final
 
 from daemon import cli
@@ -35,14 +36,24 @@ def main(args: argparse.Namespace) -> int:
     except NotTheStream as error:
         return cli.fail(str(error))
     except NoRoom as error:
-        whole = "the file is whole up to here; " if file is not None else ""
+        whole = "the file is whole up to here; " if file is not None and file.messages else ""
         return cli.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
     except OSError as error:
         return cli.fail(f"{args.out}: {error.strerror}; free space or name another file")
-    cli.say(f"{args.out}: {file.messages} messages")
+    finally:
+        if file is not None and not file.messages:
+            _leave_none(args.out)
     if not file.messages:
-        return cli.fail("nothing was told; is the daemon running?")
+        return cli.fail("nothing was told, and no file is left; is the daemon running?")
+    cli.say(f"{args.out}: {file.messages} messages")
     return cli.OK
+
+
+def _leave_none(path: Path) -> None:
+    """An empty file is worth nothing, and who keeps so many of the latest files would give up a full one for it."""
+    if path.is_file():  # and no device
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 async def record(stream: Stream, settings: Config, file: McapFile) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daemon import cli
+from daemon.publish.stream import framed
 
 pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
 from mcap.reader import make_reader
@@ -54,6 +59,38 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
     assert "replace it with --force" in said
     assert "is the daemon running?" in said
     assert "No such file" in said
+
+
+def test_nothing_told_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The service keeps so many files: those of hours without a daemon would push out those of its last drives."""
+    assert record(tmp_path / "s", tmp_path / "a.mcap") == cli.FAILED
+    with other_version(tmp_path / "t"):
+        assert record(tmp_path / "t", tmp_path / "b.mcap") == cli.FAILED
+    said = capsys.readouterr().err
+    assert "nothing was told, and no file is left; is the daemon running?" in said
+    assert "install both from the same release" in said
+    assert not list(tmp_path.glob("*.mcap"))
+    assert record(tmp_path / "s", Path("/dev/null"), "--force") == cli.FAILED
+    assert Path("/dev/null").exists()
+
+
+@contextmanager
+def other_version(path: Path) -> Iterator[None]:
+    """Somebody who speaks another version of the stream."""
+    hello = framed({"topic": "hello", "schema": 99, "name": "agv", "pid": 1, "topics": {}})
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(path))
+        listening.listen()
+
+        def greet() -> None:
+            with listening.accept()[0] as client:
+                client.sendall(hello)
+                client.recv(1)
+
+        greeting = threading.Thread(target=greet, daemon=True)
+        greeting.start()
+        yield
+        greeting.join(5.0)
 
 
 def test_a_disk_is_not_filled(
