@@ -14,7 +14,7 @@ from taps.frames import Faults, Frame, Hello, Lights, Pose, Statistics
 from taps.stream import Lost
 
 OLD_S: Final = 3.0
-"""A daemon that has told no pose for so long does not know where the robot is."""
+"""A daemon that has told no pose for so long does not know where the robot is; without any word it stands."""
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _QUANTILES: Final = ("0.5", "0.99", "1")
 _COUNTERS: Final = {
@@ -41,7 +41,7 @@ class Told:
 
     Attributes:
         up: whether the daemon is there. held: the last frame with a pose of this run of it, also when it has gone.
-        t_heard: when the latest pose came.
+        t_heard: when the latest pose came. t_spoke: when anything came.
     """
 
     up: bool = False
@@ -52,6 +52,11 @@ class Told:
     faults: Faults | None = None
     statistics: Statistics | None = None
     t_heard: float = -math.inf
+    t_spoke: float = -math.inf
+
+    def answers(self, now: float) -> bool:
+        """Whether the daemon is there and speaks; one that stands keeps its connection, and says nothing."""
+        return self.up and now - self.t_spoke <= OLD_S
 
     def latest(self, now: float) -> Pose | None:
         """The pose told last; once the daemon has gone, or stood for :data:`OLD_S`, without a place in the map."""
@@ -61,6 +66,7 @@ class Told:
 
     def take(self, frame: Frame | Lost, now: float) -> None:
         """Take one in, at ``now`` of our own clock (CLOCK_MONOTONIC, which is also the daemon's)."""
+        self.t_spoke = now
         match frame:
             case Lost():
                 self.up, self.pose, self.lights, self.faults, self.statistics = False, None, None, None, None
@@ -85,8 +91,11 @@ def exposition(told: Told, now: float) -> str:
 
 
 def _families(told: Told, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
-    yield "lumiloop_up", "gauge", "whether the daemon answers", [({}, float(told.up))]
-    if told.hello is not None and told.up:
+    answers = told.answers(now)
+    yield "lumiloop_up", "gauge", "whether the daemon answers", [({}, float(answers))]
+    if not answers:
+        return
+    if told.hello is not None:
         yield "lumiloop_info", "gauge", "name of the robot", [({"robot": told.hello.name}, 1.0)]
     if told.pose is not None:
         yield from _of_pose(told.pose, now)

@@ -15,7 +15,7 @@ import pytest
 
 from daemon.publish.snapshot import State
 from taps import serve_metrics
-from taps.frames import Fault, Faults, Hello, Pose
+from taps.frames import Fault, Faults, Hello, Pose, Statistics
 from taps.metrics import Told, exposition
 from taps.serve_metrics import serve
 from taps.stream import Lost, Stream
@@ -128,9 +128,20 @@ def test_a_daemon_that_has_gone_is_down_and_has_no_pose() -> None:
 
 
 def test_texts_are_escaped() -> None:
-    told = Told(up=True, faults=Faults(present=(Fault(fault=1, meaning='a "b"\\\n'),)))
+    told = Told(up=True, t_spoke=0.0, faults=Faults(present=(Fault(fault=1, meaning='a "b"\\\n'),)))
     (family,) = [one for one in families(exposition(told, 0.0)) if one.name == "lumiloop_fault"]
     assert family.samples[0].labels["meaning"] == 'a "b"\\\n'
+
+
+def test_a_daemon_that_stands_still_is_not_up() -> None:
+    """Its connection stays, and nothing comes: what it said last, TRACKING perhaps, is not so any more."""
+    told = Told()
+    told.take(Hello(schema=1, name="agv", pid=1), 0.0)
+    told.take(POSE, 1.0)
+    assert "lumiloop_up 1" in exposition(told, 4.0)
+    assert exposition(told, 4.5).splitlines()[2:] == ["lumiloop_up 0"]
+    told.take(Statistics(t_mono=5.0), 5.0)
+    assert "lumiloop_up 1" in exposition(told, 5.5)
 
 
 def test_a_daemon_that_stands_still_does_not_localize() -> None:
