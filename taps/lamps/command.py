@@ -11,7 +11,9 @@ from typing import Final
 
 from daemon import cli
 from daemon.config import Config
+from daemon.faults import Fault
 from daemon.folders import maps_folder, stream_path
+from daemon.publish.snapshot import LinkUse
 from taps.doctor.host import Heard, Host
 from taps.lamps.history import BadHistory, by_lamp, in_maps, load, merged, save
 from taps.lamps.judge import Verdict, judge, together
@@ -19,6 +21,8 @@ from taps.lamps.judge import Verdict, judge, together
 FILE: Final = "lamps.csv"
 TOGETHER: Final = -0.02
 """A year; that all lamps dim by so much together is worth a word."""
+SAID_AS: Final[dict[int, int]] = {LinkUse.MISSING: Fault.LAMP_DEAD, LinkUse.REJECTED: Fault.LAMP_MOVED}
+"""The fault that a running daemon has when a lamp has been so for long (`daemon.lampwatch`)."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -46,12 +50,24 @@ def tell(args: argparse.Namespace, host: Host) -> int:
             f"{error.filename or path}: {error.strerror}; run it as the daemon's user, or name --history FILE"
         )
     heard = host.listen(args.stream or stream_path(settings.name))
-    uses = {lamp: use for (_, lamp), use in heard.lamps.items() if lamp is not None} if isinstance(heard, Heard) else {}
-    verdicts = judge(by_lamp(looks), host.utc(), uses)
+    verdicts = judge(by_lamp(looks), host.utc(), _said_of(heard) if isinstance(heard, Heard) else {})
     if not verdicts:
         return cli.fail("nothing is known of any lamp yet: drive under surveyed lamps until the map has been saved")
+    if not isinstance(heard, Heard):
+        why = heard if isinstance(heard, str) else heard.text
+        cli.say(f"which lamps are dead or moved just now is not known, no daemon tells it: {why}")
     sys.stdout.write(_as_json(verdicts) if args.json else _table(verdicts))
     return cli.FAILED if any(one.urgent for one in verdicts) else cli.OK
+
+
+def _said_of(heard: Heard) -> dict[int, int]:
+    """What the daemon uses each lamp for; dead or moved only where its faults say so: a passing shadow is none."""
+    present = set() if heard.faults is None else {one.fault for one in heard.faults.present}
+    return {
+        lamp: use
+        for (_, lamp), use in heard.lamps.items()
+        if lamp is not None and (use not in SAID_AS or SAID_AS[use] in present)
+    }
 
 
 def _table(verdicts: list[Verdict]) -> str:

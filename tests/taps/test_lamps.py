@@ -13,9 +13,11 @@ import pytest
 
 from daemon import cli
 from daemon.config import Config, MapConfig
+from daemon.faults import Fault as Said
 from daemon.publish.snapshot import LinkUse
 from daemon.store_image import meta_of, packed
-from taps.doctor.host import Heard
+from taps.doctor.host import Heard, Mute
+from taps.frames import Fault, Faults
 from taps.lamps.command import tell
 from taps.lamps.history import DAY_S, BadHistory, Look, by_lamp, in_maps, load, merged, save
 from taps.lamps.judge import YEAR_S, Array, Finding, Verdict, judge, together
@@ -171,7 +173,8 @@ def test_the_command_gathers_from_maps_and_remembers_them(tmp_path: Path, capsys
     put_map(folder, 2, NOW)
     (folder / "00001234-00000003.lumimap").write_bytes(b"torn")
     assert len(in_maps(folder)) == 2 * len(LAMPS)
-    host = Computer(t_utc=NOW, heard=Heard("agv", 1, lamps={(3, 4): int(LinkUse.MISSING)}))
+    dead = Faults(present=(Fault(fault=int(Said.LAMP_DEAD)),))
+    host = Computer(t_utc=NOW, heard=Heard("agv", 1, faults=dead, lamps={(3, 4): int(LinkUse.MISSING)}))
     assert tell(args(folder), host) == cli.FAILED
     told = json.loads(capsys.readouterr().out)
     assert (told[0]["lamp"], told[0]["finding"], told[0]["urgent"]) == (4, "dead", True)
@@ -183,6 +186,29 @@ def test_the_command_gathers_from_maps_and_remembers_them(tmp_path: Path, capsys
     said = capsys.readouterr().out
     assert "is not received where it must be" in said
     assert said.splitlines()[-1].startswith("go to: lamp 4")
+
+
+def test_a_passing_shadow_sends_nobody_to_a_lamp(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a link is at the moment of asking is no verdict: the daemon's own takes ten seconds, and is a fault."""
+    put_map(tmp_path / "maps", 1, NOW)
+    odd = {(3, 4): int(LinkUse.REJECTED), (2, 3): int(LinkUse.MISSING)}
+    heard = Heard("agv", 1, faults=Faults(present=(Fault(fault=int(Said.NO_LAMPS)),)), lamps=odd)
+    assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == cli.OK
+    assert "no lamp is urgent" in capsys.readouterr().out
+    heard.faults = Faults(present=(Fault(fault=int(Said.LAMP_MOVED)),))
+    assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == cli.FAILED
+    assert capsys.readouterr().out.splitlines()[-1] == "go to: lamp 4"
+
+
+def test_that_no_daemon_was_heard_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Else `no lamp is urgent` would seem to be said of dead lamps, too."""
+    put_map(tmp_path / "maps", 1, NOW)
+    assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == cli.OK
+    told = capsys.readouterr()
+    assert "dead or moved just now is not known, no daemon tells it: nobody listens there" in told.err
+    assert json.loads(told.out)
+    tell(args(tmp_path / "maps"), Computer(t_utc=NOW, heard=Mute("the socket: anna may not listen there", "")))
+    assert "may not listen" in capsys.readouterr().err
 
 
 def test_where_nothing_is_known_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
