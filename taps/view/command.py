@@ -13,13 +13,14 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Final
 
 from aiohttp import web
 
-from daemon import cli
+from daemon import cli, configfile
 from daemon.config import Config
 from daemon.lights import SurveyError
 from daemon.logs import to_journal
@@ -29,7 +30,7 @@ from taps.stream import Stream
 from taps.view.film import Film
 from taps.view.guard import Guard, TokenRefused, token_for
 from taps.view.server import TOPICS, View
-from taps.view.words import Scene, scene_of
+from taps.view.words import CannotLook, Scene, scene_of
 
 PORT: Final = 8090
 NICENESS: Final = 5
@@ -57,7 +58,10 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
     settings: Config = args.settings
     if args.log is None:
         modbus = address_of(None, settings) if settings.modbus.port else ("127.0.0.1", 0)
-        view = View(guard, scene_of(settings), Stream(args.stream or settings.name, TOPICS), modbus=modbus)
+        stream = Stream(args.stream or settings.name, TOPICS)
+        view = View(
+            guard, scene_of(settings), stream, modbus=modbus, again=partial(_scene, args.config, tuple(args.set))
+        )
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:
         return cli.fail("a recording takes no orders: leave --write out", cli.USAGE)
@@ -65,6 +69,18 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
         return cli.fail(f"{args.log}: there is no such recording")
     with _film(args) as film:
         return _serve(View(guard, Scene(settings.name), film=film), guard, args.port, f"recording {args.log}")
+
+
+def _scene(file: Path | None, words: tuple[str, ...]) -> Scene:
+    """As configuration and survey are by now.
+
+    Raises:
+        CannotLook: one of them cannot be read.
+    """
+    try:
+        return scene_of(configfile.load(file, list(words)))
+    except (configfile.ConfigError, SurveyError) as error:
+        raise CannotLook(str(error)) from None
 
 
 @contextlib.contextmanager

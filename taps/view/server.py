@@ -10,6 +10,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from socket import SO_SNDBUF, SOL_SOCKET
@@ -25,7 +26,7 @@ from taps.view.guard import HEADERS, Guard
 from taps.view.orders import OrderRefused, Orders
 from taps.view.player import Player
 from taps.view.viewers import Hub, Viewer, frame
-from taps.view.words import Scene, welcome
+from taps.view.words import CannotLook, Scene, welcome
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +66,7 @@ class View:
     Args:
         guard: who may look, and who may order. scene: what the stream does not tell.
         stream: of the daemon; None where a ``film`` is shown. modbus: host and port for orders.
+        again: reads the scene anew, for each daemon that begins; raises `CannotLook`.
     """
 
     def __init__(
@@ -74,10 +76,11 @@ class View:
         stream: Stream | None = None,
         film: Film | None = None,
         modbus: tuple[str, int] = ("127.0.0.1", 0),
+        again: Callable[[], Scene] | None = None,
     ) -> None:
         self.hub = Hub()
         self.page, self._files = pages()
-        self._guard, self._scene, self._stream, self._film = guard, scene, stream, film
+        self._guard, self._scene, self._stream, self._film, self._again = guard, scene, stream, film, again
         self._orders = Orders(*modbus, tell=lambda told: self.hub.tell("order", told))
         self._count = 0
         self._guesses = asyncio.Semaphore(GUESSES)
@@ -214,6 +217,7 @@ class View:
                 async for told in stream.frames():
                     if isinstance(told, Hello):
                         self.hub.met()
+                        self._look_again()
                     elif isinstance(told, Lost):
                         self.hub.lost(told.text)
                         log.warning("%s", told.text)
@@ -226,6 +230,17 @@ class View:
                 self.hub.lost("what the daemon told could not be shown; the log of `lumiloop view` says why")
                 log.exception("what the daemon told could not be shown")
             await asyncio.sleep(TRY_AGAIN_S)
+
+    def _look_again(self) -> None:
+        """A daemon has begun, perhaps with another survey or mount: pages draw what it has read."""
+        try:
+            scene = self._scene if self._again is None else self._again()
+        except CannotLook as error:
+            log.warning("lamps and mount are shown as they were before: %s", error)
+            return
+        if scene != self._scene:
+            self._scene = scene
+            self.hub.tell("scene", asdict(scene))
 
     async def _part(self, app: web.Application) -> None:
         """The server stops: pages are told, and look whether another one comes."""

@@ -19,6 +19,10 @@ PROTOCOL: Final = 1
 """Of the messages between page and server; a page of another one loads itself anew."""
 
 
+class CannotLook(Exception):
+    """Configuration or survey cannot be read; the text says why."""
+
+
 @dataclass(frozen=True, slots=True)
 class Scene:
     """What the stream does not tell and a picture needs.

@@ -49,7 +49,7 @@ function frame(topic, data) {
   if (topic === "daemon") daemon(data);
   else if (topic === "order") orders.take(data);
   else if (topic === "film") timebar.take(data);
-  else if (topic === "scene") { world.scene = { ...world.scene, ...data }; put("name", recording); }
+  else if (topic === "scene") { world.scene = { ...world.scene, ...data }; put("name", recording || data.name); }
   else if (world.take(topic, data)) {
     if (topic === "pose") { unshown = data; gone = ""; poseAt = performance.now(); }
     if (topic === "map") baseDirty = true;

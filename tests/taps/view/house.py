@@ -98,12 +98,13 @@ async def serving(
     film: Film | None = None,
     modbus: int = 0,
     scene: Scene | None = None,
+    again: Callable[[], Scene] | None = None,
 ) -> AsyncIterator[House]:
     path = folder / "stream"
     stream = StreamServer(path, "agv", lambda reason: ("as it should be", ""))
     task = asyncio.create_task(stream.run())
     source = None if film is not None else Stream(path, TOPICS)
-    view = View(guard or Guard("127.0.0.1"), scene or Scene("agv"), source, film, ("127.0.0.1", modbus))
+    view = View(guard or Guard("127.0.0.1"), scene or Scene("agv"), source, film, ("127.0.0.1", modbus), again)
     await until(path.is_socket)
     runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=0.1)
     await runner.setup()
