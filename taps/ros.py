@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.config import Mount
-from daemon.publish.snapshot import State
+from daemon.publish.snapshot import GUESSED, State
 from taps import rostypes as ros
 from taps.frames import Faults, Frame, Lights, Loop, MapTiles, Pose, Raw, Scan, StateChange, Statistics, Triple
 from taps.tiles import Tiles, trinary
@@ -40,7 +40,7 @@ class Topic:
 
 TOPICS: Final = {
     "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan after REP-117; the stamp is the first beam's"),
-    "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while there is one"),
+    "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while the place is known"),
     "/odom": Topic("nav_msgs/msg/Odometry", "the pose in odom, smooth, with the velocity"),
     "/tf": Topic("tf2_msgs/msg/TFMessage", "map > odom > base_link"),
     "/tf_static": Topic("tf2_msgs/msg/TFMessage", "base_link > laser", latched=True),
@@ -157,7 +157,7 @@ class Translator:
             if frame.pose is not None:
                 moving.insert(0, ros.transform(t, MAP, ODOM, beside(frame.pose, frame.odom)))
             yield self._out("/tf", t, transforms=moving)
-        if frame.pose is not None and frame.covariance is not None:
+        if frame.pose is not None and frame.covariance is not None and frame.state not in GUESSED:
             place = ros.make(
                 "geometry_msgs/msg/PoseWithCovariance",
                 pose=ros.pose(*frame.pose),

@@ -14,6 +14,7 @@ pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
 from rosbags.typesys import Stores, get_typestore
 
 from daemon.config import Mount
+from daemon.publish.snapshot import State
 from daemon.publish.stream import SIDE, scan_message
 from taps.frames import MapTiles, Pose, Scan
 from taps.ros import AGAIN_S, Translator
@@ -33,7 +34,11 @@ def tile(fill: int) -> MapTiles:
 
 def told(translator: Translator, topic: str, *frames: Any) -> list[Any]:
     out = [one for frame in frames for one in translator.take(frame) if one.topic == topic]
-    kind = {"/map": "nav_msgs/msg/OccupancyGrid", "/scan": "sensor_msgs/msg/LaserScan"}[topic]
+    kind = {
+        "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/map": "nav_msgs/msg/OccupancyGrid",
+        "/scan": "sensor_msgs/msg/LaserScan",
+    }[topic]
     return [STORE.deserialize_cdr(one.data, kind) for one in out]
 
 
@@ -52,3 +57,11 @@ def test_beams_without_an_echo_are_infinite_and_those_that_say_nothing_are_no_nu
     raw = replace(raw_scan(), code=np.array([GEOMETRY.dmax + 1, 0, 8], np.int32), ranges=np.zeros(3, np.int32))
     (scan,) = told(Translator(Mount()), "/scan", pose(1.0), msgspec.convert(scan_message(raw), Scan))
     np.testing.assert_array_equal(scan.ranges, np.array([np.inf, np.nan, np.nan], np.float32))
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_a_guess_is_no_pose(state: State) -> None:
+    """Who reads /pose alone takes it for where the robot is, as evo does; trajectories leave guesses out, too."""
+    known = msgspec.structs.replace(pose(1.0), pose=(1.0, 2.0, 0.5), covariance=(1.0, 0.0, 1.0, 0.0, 0.0, 1.0))
+    found = told(Translator(Mount()), "/pose", msgspec.structs.replace(known, state=int(state)))
+    assert len(found) == (state not in (State.LOST, State.RELOCATING, State.AMBIGUOUS))
