@@ -47,9 +47,9 @@ class Whose:
         return said + (passed_on if self.apart and self.pid != self.meant else "")
 
 
-def whose(name: str, host: str, port: int) -> Whose:
-    """Who answers at a UDP port of this computer, and who is the daemon of that name; what cannot be seen is 0."""
-    meant = _listener(stream_path(name))
+def whose(of: str | Path, host: str, port: int) -> Whose:
+    """Who answers at a UDP port of this computer, and who is the daemon of that name or stream; unseen ones are 0."""
+    meant = _listener(of if isinstance(of, Path) else stream_path(of))
     inodes = _sockets(host, port)
     holders = dict(_holders(inodes))
     pid = 0

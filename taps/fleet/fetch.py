@@ -134,7 +134,7 @@ class Fetcher:
         Raises:
             Refused: it does not, or that cannot be noted.
         """
-        await switched(modbus, taken.map_id)
+        await switched(self._args.settings.name, modbus, taken.map_id)
         try:
             self._records.switched(taken)
         except OSError as error:
@@ -166,14 +166,14 @@ class Fetcher:
         raise Refused(f"{offer.said()}: is announced, and does not come; is the connection to who shares it broken?")
 
 
-async def switched(modbus: tuple[str, int], map_id: int) -> None:
+async def switched(name: str, modbus: tuple[str, int], map_id: int) -> None:
     """Ask the daemon to go on in the map.
 
     Raises:
         Refused: it does not, or cannot be asked.
     """
     try:
-        outcome = await switch_map(*modbus, map_id)
+        outcome = await switch_map(name, *modbus, map_id)
     except OrderRefused as error:
         raise Refused(f"the daemon could not be asked to go on in it: {error}") from None
     if outcome != "done":

@@ -10,9 +10,14 @@ import math
 import secrets
 import struct
 from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any, Final, cast
 
 from daemon.publish.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
+from daemon.publish.whose import whose
+from hal.beside import beside
+from taps.stream import Stream
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
 TRIES: Final = 4
@@ -106,6 +111,21 @@ class Wire(asyncio.DatagramProtocol):
         mine = told[2:].startswith(ours) and told.endswith(map_id)
         return mine, acknowledged == number and outcome is not Outcome.RUNNING, outcome
 
+    async def only(self, meant: str | Path) -> None:
+        """Whether it is that daemon, by name or by stream, who would obey; what cannot be seen is taken for it.
+
+        Raises:
+            OrderRefused: it is another one's port.
+        """
+        assert self._transport is not None
+        host, port = self._transport.get_extra_info("peername")[:2]
+        found = await beside(partial(whose, meant, host, port), "whose")
+        if found.another:
+            raise OrderRefused(
+                f"{host}:{port} is answered by {found}, not by the daemon that is meant (process {found.meant}): name "
+                "its configuration with --config, or give one of them another `modbus.port`"
+            )
+
     def close(self) -> None:
         """Close the socket."""
         if self._transport is not None:
@@ -117,10 +137,11 @@ class Orders:
 
     Args:
         host, port: of the daemon's Modbus server. tell: told of every order and of its end, for all viewers.
+        stream: of the daemon that is shown, who alone is meant.
     """
 
-    def __init__(self, host: str, port: int, tell: Tell) -> None:
-        self._where, self._tell = (host, port), tell
+    def __init__(self, host: str, port: int, tell: Tell, stream: Stream | None = None) -> None:
+        self._where, self._tell, self._stream = (host, port), tell, stream
         self._wire: Wire | None = None
         self._following: asyncio.Task[None] | None = None
         self._latest: dict[str, object] = {}
@@ -142,6 +163,8 @@ class Orders:
 
     async def _give(self, viewer: int, name: str, pose: tuple[float, float, float]) -> None:
         wire = await self._ready()
+        if self._stream is not None:
+            await wire.only(self._stream.path)
         number = await wire.next_number()
         x, y, yaw = round(pose[0] * 1e4), round(pose[1] * 1e4), round(pose[2] * 1e6)
         words = struct.pack(">HHiii", number, NAMES[name], x, y, yaw)
@@ -195,14 +218,15 @@ async def _wired(host: str, port: int) -> Wire:
     return wire
 
 
-async def switch_map(host: str, port: int, map_id: int) -> str:
-    """Have the daemon go on in another stored map; how that ended, in a word.
+async def switch_map(name: str, host: str, port: int, map_id: int) -> str:
+    """Have the daemon of that name go on in another stored map; how that ended, in a word.
 
     Raises:
         OrderRefused: it cannot be ordered.
     """
     wire = await _wired(host, port)
     try:
+        await wire.only(name)
         number = await wire.next_number()
         named = struct.pack(">I", map_id)
         await wire.ask(struct.pack(">BHHB", 16, MAP_ADDRESS, 2, 4) + named)

@@ -81,7 +81,7 @@ class View:
         self.hub = Hub()
         self.page, self._files = pages()
         self._guard, self._scene, self._stream, self._film, self._again = guard, scene, stream, film, again
-        self._orders = Orders(*modbus, tell=lambda told: self.hub.tell("order", told))
+        self._orders = Orders(*modbus, tell=lambda told: self.hub.tell("order", told), stream=stream)
         self._count = 0
         self._guesses = asyncio.Semaphore(GUESSES)
         self._sockets: set[web.WebSocketResponse] = set()

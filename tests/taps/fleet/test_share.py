@@ -136,10 +136,10 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
     path = tmp_path / "hall.lumimap"
     path.write_bytes(mapmaker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
     assert path.stat().st_size > 1_000_000
-    asked: list[tuple[str, int, int]] = []
+    asked: list[tuple[str, str, int, int]] = []
 
-    async def switch(host: str, port: int, map_id: int) -> str:
-        asked.append((host, port, map_id))
+    async def switch(name: str, host: str, port: int, map_id: int) -> str:
+        asked.append((name, host, port, map_id))
         return "done"
 
     monkeypatch.setattr("taps.fleet.fetch.switch_map", switch)
@@ -151,7 +151,7 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
             assert not one.failed, capsys.readouterr().err
             (found,) = (tmp_path / place / "lumiloop" / "maps").glob("*.lumimap")
             assert found.read_bytes() == path.read_bytes()
-            assert asked == ([("127.0.0.1", 1502, 0x77)] if wished else [])
+            assert asked == ([("lumiloop", "127.0.0.1", 1502, 0x77)] if wished else [])
     assert "the daemon goes on in it" in capsys.readouterr().err
 
 
@@ -163,7 +163,7 @@ def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     outcomes = ["refused", "refused", "done"]
 
-    async def switch(host: str, port: int, map_id: int) -> str:
+    async def switch(name: str, host: str, port: int, map_id: int) -> str:
         assert map_id == 0x77
         return outcomes.pop(0)
 

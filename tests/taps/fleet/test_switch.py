@@ -19,7 +19,7 @@ def ask(outcome: Outcome) -> None:
     async def run() -> None:
         asked: list[Request] = []
         async with publishing(write=True, on_command=asked.append) as modbus:
-            asking = asyncio.ensure_future(switched(("127.0.0.1", modbus.port), 0x89ABCDEF))
+            asking = asyncio.ensure_future(switched("agv", ("127.0.0.1", modbus.port), 0x89ABCDEF))
             await until(lambda: asked)
             assert (asked[0].code, asked[0].map_id) == (CommandCode.SWITCH_MAP, 0x89ABCDEF)
             modbus.acknowledge(asked[0].number, outcome)
@@ -40,10 +40,10 @@ def test_a_daemon_that_does_not_go_on_in_it_is_a_failure() -> None:
 def test_a_daemon_that_takes_no_orders_or_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     async def refused() -> None:
         async with publishing(write=False) as modbus:
-            await switched(("127.0.0.1", modbus.port), 1)
+            await switched("agv", ("127.0.0.1", modbus.port), 1)
 
     with pytest.raises(Refused, match=r"set `modbus\.write = true`"):
         asyncio.run(refused())
     monkeypatch.setattr("taps.view.orders.TRY_S", 0.05)
     with pytest.raises(Refused, match="does not answer"):
-        asyncio.run(switched(("127.0.0.1", free_port()), 1))
+        asyncio.run(switched("agv", ("127.0.0.1", free_port()), 1))

@@ -420,7 +420,7 @@ def test_another_map_that_somebody_names_in_between_is_no_map_of_ours(
 ) -> None:
     async def body(house: House, asked: list[Request], modbus: Any) -> None:
         wire = await orders._wired("127.0.0.1", modbus.port)
-        switching = asyncio.create_task(orders.switch_map("127.0.0.1", modbus.port, 0x77))
+        switching = asyncio.create_task(orders.switch_map("agv", "127.0.0.1", modbus.port, 0x77))
         try:
             await until(lambda: bool(asked))
             assert (asked[0].code, asked[0].map_id) == (CommandCode.SWITCH_MAP, 0x77)
