@@ -129,6 +129,20 @@ def _megabytes(text: str) -> float:
     return size
 
 
+def _port(text: str) -> int:
+    number = int(text)
+    if not 0 <= number < 1 << 16:
+        raise argparse.ArgumentTypeError(f"{text}: a port is 1 to 65535; 0: any that is free")
+    return number
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0.0 < seconds < 1e9:
+        raise argparse.ArgumentTypeError(f"{text} s: name more than 0, or leave it out")
+    return seconds
+
+
 def _plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP", help="floor plan: map_server's YAML or PGM, or a *.lumimap")
     parser.add_argument("--height", type=float, default=2.5, metavar="M", help="of the lamps above the floor; 2.5")
@@ -165,7 +179,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
 def _record_mcap(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="FILE", help="MCAP file to write")
     parser.add_argument("--raw", action="store_true", help="also the bytes between daemon and devices")
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after so long; default: when interrupted")
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after so long; default: when interrupted")
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
     parser.add_argument(
         "--reserve", type=_megabytes, default=200.0, metavar="MB", help="stop while so much is free; default: 200"
@@ -177,7 +191,7 @@ def _record_mcap(parser: argparse.ArgumentParser) -> None:
 def _view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", nargs="?", type=Path, metavar="REC", help="a recording or a log; default: the daemon")
     parser.add_argument("--bind", default="127.0.0.1", metavar="ADDR", help="address to serve at; default: %(default)s")
-    parser.add_argument("--port", type=int, default=8090, help="default: %(default)s; 0: any that is free")
+    parser.add_argument("--port", type=_port, default=8090, help="default: %(default)s; 0: any that is free")
     parser.add_argument("--write", action="store_true", help="take orders from those who have the token")
     parser.add_argument("--token", type=Path, metavar="FILE", help="that holds the token; default: a new one each time")
     listening(parser)

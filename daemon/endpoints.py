@@ -73,6 +73,11 @@ def parse_endpoint(text: str) -> tuple[str, int]:
     return match["v6"] or match["host"], port
 
 
+def in_url(host: str) -> str:
+    """A host as it stands before the colon of a port: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
 def is_address(text: str) -> bool:
     """Whether this is an IP address."""
     for family in (socket.AF_INET, socket.AF_INET6):

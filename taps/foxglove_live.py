@@ -14,7 +14,7 @@ import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from daemon import cli
-from daemon.endpoints import parse_endpoint
+from daemon.endpoints import in_url, parse_endpoint
 from hal.serving import work_until_told
 from taps import rostypes
 from taps.follow import follow
@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
         return cli.fail(f"--listen: {error}", cli.USAGE)
     except (OSError, RuntimeError) as error:
         return cli.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
-    cli.say(f"ws://{host}:{bridge.port}")
+    cli.say(f"ws://{in_url(host)}:{bridge.port}")
     try:
         stream = Stream(args.stream or args.settings.name, WANTED)
         asyncio.run(work_until_told(follow(stream, args.settings, bridge)))

@@ -13,7 +13,7 @@ import time
 from typing import Final
 
 from daemon import cli
-from daemon.endpoints import parse_endpoint
+from daemon.endpoints import in_url, parse_endpoint
 from hal.serving import work_until_told
 from taps import vda5050
 from taps.frames import NotTheStream
@@ -59,7 +59,7 @@ async def serve(stream: Stream, host: str, port: int) -> None:
     told = Told()
     answering = Answering(told)
     server = await asyncio.start_server(answering, host, port, limit=LONGEST_REQUEST)
-    cli.say(f"http://{host}:{server.sockets[0].getsockname()[1]}/metrics")
+    cli.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
     try:
         async with contextlib.aclosing(stream.frames()) as frames:
             async for frame in frames:

@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol
 import zenoh
 
 from daemon import cli
-from daemon.endpoints import parse_endpoint
+from daemon.endpoints import in_url, parse_endpoint
 from hal.beside import beside
 
 LEASE_S: Final = 5.0
@@ -56,7 +56,7 @@ def locator(text: str) -> str:
         host, port = parse_endpoint(text)
     except ValueError as error:
         raise BadEndpoint(f"{error}; or name one as Zenoh does, tls/HOST:PORT") from None
-    return f"tcp/[{host}]:{port}" if ":" in host else f"tcp/{host}:{port}"
+    return f"tcp/{in_url(host)}:{port}"
 
 
 def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:

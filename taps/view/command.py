@@ -22,6 +22,7 @@ from aiohttp import web
 
 from daemon import cli, configfile
 from daemon.config import Config
+from daemon.endpoints import in_url
 from daemon.lights import SurveyError
 from daemon.logs import to_journal
 from daemon.publish.client import NoAnswer, address_of
@@ -172,7 +173,5 @@ def address(guard: Guard, port: int, whole: bool = True) -> str:
     host = guard.bind
     if host in ("0.0.0.0", "::", ""):
         host = socket.gethostname()
-    if ":" in host:
-        host = f"[{host}]"
     token = guard.token if whole else "..."
-    return f"http://{host}:{port}/" + (f"#token={token}" if guard.token else "")
+    return f"http://{in_url(host)}:{port}/" + (f"#token={token}" if guard.token else "")

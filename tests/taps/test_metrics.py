@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 import socket
 import time
 from collections.abc import Awaitable, Callable
@@ -113,6 +114,17 @@ def test_position_and_what_is_no_request(tmp_path: Path) -> None:
 
     with served(tmp_path / "s"):
         with_server(tmp_path / "s", body)
+
+
+def test_the_address_that_is_printed_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    async def run() -> None:
+        serving = asyncio.ensure_future(serve(Stream(tmp_path / "s", serve_metrics.TOPICS), "::1", 0))
+        await asyncio.sleep(0.1)
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+
+    asyncio.run(run())
+    assert re.search(r"http://\[::1\]:\d+/metrics", capsys.readouterr().err)
 
 
 def test_a_daemon_that_has_gone_is_down_and_has_no_pose() -> None:

@@ -120,6 +120,14 @@ def test_without_room_no_file_is_begun(tmp_path: Path, capsys: pytest.CaptureFix
     assert out.read_bytes() == b"precious"
 
 
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan"])
+def test_a_time_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: str) -> None:
+    """It had been taken for no time at all, and recorded for ever."""
+    with pytest.raises(SystemExit):
+        record(tmp_path / "s", tmp_path / "a.mcap", "--seconds", seconds)
+    assert f"{seconds} s: name more than 0" in capsys.readouterr().err
+
+
 def test_a_disk_that_is_full_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with served(tmp_path / "s"):
         assert record(tmp_path / "s", Path("/dev/full"), "--force") == cli.FAILED

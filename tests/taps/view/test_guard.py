@@ -117,6 +117,9 @@ def test_what_cannot_be_shown_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     assert "cannot be read" in capsys.readouterr().err
     assert main(["view", "--bind", "203.0.113.1", "--port", "0"]) == 1
     assert "--bind" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["view", "--port", "70000"])
+    assert "70000: a port is 1 to 65535" in capsys.readouterr().err
 
 
 def test_the_page_is_served_without_the_estimator() -> None:
