@@ -32,6 +32,14 @@ class BrowserError(RuntimeError):
     """A process or a page does not do what it should; the text says what."""
 
 
+class PageLeft(BrowserError):
+    """The page was asked while it is being left for another one."""
+
+
+LEFT: Final = ("navigated or closed", "context was destroyed", "Cannot find default execution context")
+"""What the browser says then."""
+
+
 @dataclass(frozen=True)
 class Robot:
     """A daemon that follows a simulated robot. `config` names it; `env` leads to its stream; `port`: Modbus."""
@@ -115,7 +123,8 @@ class Tab:
             message = await self.socket.receive_json()
             if message.get("id") == number:
                 if "error" in message:
-                    raise BrowserError(f"{method}: {message}")
+                    left = any(words in message["error"].get("message", "") for words in LEFT)
+                    raise (PageLeft if left else BrowserError)(f"{method}: {message}")
                 return dict(message["result"])
             self._note(message)
 
@@ -127,16 +136,22 @@ class Tab:
         return told["result"].get("value")
 
     async def until(self, expression: str, seconds: float = 20.0) -> None:
-        """Until an expression is true in the page.
+        """Until an expression is true in the page, or in the one that is loaded in its place meanwhile.
 
         Raises:
             BrowserError: it does not become so.
         """
         end = asyncio.get_running_loop().time() + seconds
-        while not await self.js(f"!!({expression})"):
+        while not await self._is(expression):
             if asyncio.get_running_loop().time() > end:
                 raise BrowserError(f"it does not happen that {expression}; {self.said}")
             await asyncio.sleep(0.1)
+
+    async def _is(self, expression: str) -> bool:
+        try:
+            return bool(await self.js(f"!!({expression})"))
+        except PageLeft:
+            return False
 
     async def click(self, selector: str) -> None:
         """As a finger would: in the middle of an element, again where the page has moved away beneath the finger.
