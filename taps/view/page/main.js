@@ -6,10 +6,12 @@ import { Link } from "./link.js";
 import { Orders } from "./orders.js";
 import { $, element, Panel, put } from "./panel.js";
 import { Plots } from "./plots.js";
+import { CAN_INFLATE } from "./tiles.js";
 import { TimeBar } from "./timebar.js";
 import { World } from "./world.js";
 
 const WORDS_MS = 200, PLOTS_MS = 500, SLOW_MS = 400, TOAST_MS = 4000, OLD_MS = 3000, LATE = 200;
+const TOO_OLD = CAN_INFLATE ? "" : "This browser is too old to draw the map; one of 2023 or later does";
 
 const world = new World();
 const camera = new Camera($("stage"), () => { baseDirty = true; schedule(); });
@@ -67,7 +69,8 @@ function daemon(data) {
 // Refused for want of a token: nothing is tried again until there is one.
 function barred() { return link.refused === "token"; }
 
-function banner(text) {
+function banner(told) {
+  const text = told || TOO_OLD;
   $("banner").hidden = !text;
   $("banner").textContent = text;
 }

@@ -2,6 +2,8 @@
 
 const SEEN = 12, CLEAR = 8;   // log-odds, in units of the stream's 0.1, at which a cell has its full colour
 
+export const CAN_INFLATE = "DecompressionStream" in globalThis;   // Chrome 80, Firefox 113, Safari 16.4
+
 export class Tiles {
   constructor(changed) {
     this.all = new Map();
@@ -27,7 +29,7 @@ export class Tiles {
     if (tile.number > number) return;
     tile.number = number;
     this.all.set(key, tile);
-    const cells = packed.length ? await inflated(packed) : null;
+    const cells = packed.length && CAN_INFLATE ? await inflated(packed) : null;
     if (tile.number !== number || this.all.get(key) !== tile) return;
     tile.cells = cells && cells.some((cell) => cell !== 0) ? cells : null;
     tile.side = side;

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import zlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from taps.frames import MapTiles
 from taps.view import server
 from taps.view.guard import Guard
 from tests.taps.view.house import TOKEN, House, serving, snapshot
@@ -115,6 +117,27 @@ def test_a_dead_wire_is_no_daemon_that_stands_and_the_page_comes_back(browser: s
             await page.until(f"({BANNER}) === ''")
 
     run(tmp_path, body, guard=Guard("127.0.0.1", TOKEN, True))
+
+
+def test_a_browser_that_cannot_draw_the_map_says_so(browser: str, tmp_path: Path) -> None:
+    """A phone of 2022 had shown everything but the map, and no word of why."""
+
+    async def body(house: House) -> None:
+        async with tab(browser, house.address) as page:
+            await page.ask("Page.addScriptToEvaluateOnNewDocument", source="delete globalThis.DecompressionStream")
+            await page.ask("Page.reload")
+            await page.until("!('DecompressionStream' in globalThis) && globalThis.lumiloop")
+            await shows(page, "too old to draw the map")
+            tiles = MapTiles(
+                map_id=7, resolution=0.05, side=128, unit=0.1, version=1, more=False,
+                tiles=((0, 0, zlib.compress(bytes([20]) * 128 * 128)),),
+            )  # fmt: skip
+            house.view.hub.take(tiles)
+            house.stream.publish(snapshot(1))
+            await page.until(f"{POSE} === 1")
+            assert page.said == []
+
+    run(tmp_path, body)
 
 
 def test_a_daemon_that_stands_is_still_named(browser: str, tmp_path: Path) -> None:
