@@ -37,11 +37,7 @@ HUB, VIEWER = "hub", "viewer"
 ROUTER: Final = "10.77.0.1:7447"
 LOSSY, CUT = "agv2", "agv3"
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.timeout(180),
-    pytest.mark.skipif(os.geteuid() != 0 or shutil.which("ip") is None, reason="needs root and iproute2"),
-]
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
 
 def ip(*words: str) -> None:
@@ -198,6 +194,7 @@ def test_the_commands_of_the_documents(tmp_path: Path) -> None:
     assert len(list((tmp_path / "lumiloop" / "maps").glob("*.lumimap"))) == 1
 
 
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("ip") is None, reason="needs root and iproute2")
 def test_five_robots_a_lossy_line_a_partition_and_a_dead_router(tmp_path: Path) -> None:
     shared = tmp_path / "hall.lumimap"
     shared.write_bytes(mapmaker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
