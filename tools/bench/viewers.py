@@ -20,9 +20,10 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -49,6 +50,19 @@ def free_port() -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])
+
+
+class Others(Protocol):
+    """What is there in every other stretch."""
+
+    def turn(self, on: bool) -> None:
+        """On or off."""
+
+    def end(self) -> tuple[int, int]:
+        """Messages and bytes that they were told."""
+
+    def kill(self) -> None:
+        """Whatever has become of them."""
 
 
 class Page:
@@ -83,8 +97,8 @@ class Page:
             one.wait()
 
 
-def paced(folder: Path, turns: int) -> dict[str, Any]:
-    """One run of the daemon: what it told, with the browsers' counts."""
+def paced(folder: Path, turns: int, make: Callable[[str], Others] = Page) -> dict[str, Any]:
+    """One run of the daemon: what it told, with the counts of what was ``make``-d of its stream's path."""
     drive, stream = prepared(folder, SETTLE_S + 2 * turns * STRETCH_S), str(folder / "stream")
     wanted = {
         "drive": str(drive), "stream": stream, "modbus": free_port(), "fifo": os.geteuid() == 0, "turns": turns,
@@ -92,7 +106,7 @@ def paced(folder: Path, turns: int) -> dict[str, Any]:
         "change_s": CHANGE_S,
     }  # fmt: skip
     with ExitStack() as undo:
-        page = Page(stream)
+        page = make(stream)
         undo.callback(page.kill)
         command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
         pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE}
@@ -111,29 +125,33 @@ def paced(folder: Path, turns: int) -> dict[str, Any]:
     raise CannotRun("the daemon ended before its time; its log says why")
 
 
-def figures(told: dict[str, Any], turns: int) -> list[Figure]:
-    """All rows."""
+def compared(told: dict[str, Any], other: str, command: str) -> list[Figure]:
+    """What is later, and what takes longer, in the stretches that are ``other``."""
     rows = []
     for what in ("late", "cycle"):
         alone, loaded = (1e-3 * np.array(told[what][stretch]) for stretch in ("alone", "loaded"))
         words = {"late": "cycles begin late", "cycle": "a cycle takes"}[what]
         for q in (50.0, 99.0):
-            rows.append(Figure(f"{words}, p{q:g}, alone", float(np.percentile(alone, q)), "ms", command=COMMAND))
-            rows.append(Figure(f"{words}, p{q:g}, watched", float(np.percentile(loaded, q)), "ms", command=COMMAND))
+            rows.append(Figure(f"{words}, p{q:g}, alone", float(np.percentile(alone, q)), "ms", command=command))
+            rows.append(Figure(f"{words}, p{q:g}, {other}", float(np.percentile(loaded, q)), "ms", command=command))
         more = float(np.percentile(loaded, 99) - np.percentile(alone, 99))
-        rows.append(bounded(f"{words}, p99, watched over alone", more, "ms", "<= 0.5", COMMAND))
+        rows.append(bounded(f"{words}, p99, {other} over alone", more, "ms", "<= 0.5", command))
         pairs = by_pair(told, what)
-        name = f"{words}, p99, watched over alone, of {len(pairs)} pairs"
-        rows.append(bounded(f"{name}, median", float(np.median(pairs)), "ms", "<= 0.5", COMMAND))
+        name = f"{words}, p99, {other} over alone, of {len(pairs)} pairs"
+        rows.append(bounded(f"{name}, median", float(np.median(pairs)), "ms", "<= 0.5", command))
         for q, end in ((25.0, "lower quarter"), (75.0, "upper quarter")):
-            rows.append(Figure(f"{name}, {end}", float(np.percentile(pairs, q)), "ms", command=COMMAND))
+            rows.append(Figure(f"{name}, {end}", float(np.percentile(pairs, q)), "ms", command=command))
+    counted = float(sum(len(stretch) for stretch in told["late"].values()))
+    rows.append(Figure(f"cycles, alone and {other}", counted, "", command=command))
+    rows.append(Figure("scans missed", float(told["missed"]), "", command=command))
+    return rows
+
+
+def figures(told: dict[str, Any], turns: int) -> list[Figure]:
+    """All rows."""
+    rows = compared(told, "watched", COMMAND)
     watched_s = turns * STRETCH_S * BROWSERS
-    counts = {
-        "cycles, alone and watched": float(sum(len(stretch) for stretch in told["late"].values())),
-        "kB a second to each browser": 1e-3 * told["size"] / watched_s,
-        "scans missed": float(told["missed"]),
-    }
-    rows += [Figure(name, value, "", command=COMMAND) for name, value in counts.items()]
+    rows.append(Figure("kB a second to each browser", 1e-3 * told["size"] / watched_s, "", command=COMMAND))
     each = told["messages"] / watched_s
     return [*rows, bounded("messages a second to each browser", each, "", f">= {LEAST_HZ:g}", COMMAND)]
 
