@@ -39,6 +39,12 @@ OFFLINE: Final = ("calibrate", "floorplan", "survey")
 TIMED_CODES: Final = 129
 TIMED_TURNS: Final = 5
 
+CPUINFO: Final = Path("/proc/cpuinfo")
+MAKE: Final = frozenset({
+    "vendor_id", "cpu family", "model", "model name", "stepping", "flags",
+    "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "CPU revision", "Features",
+})  # fmt: skip
+"""Of an x86 processor, and of an ARM one."""
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
 _one: Final = threading.Lock()
@@ -132,7 +138,7 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
 
 def _import(module: str) -> None:
     """Import a module of kernels that no daemon loads."""
-    from estimator.kernel import CACHE_DIR
+    from estimator.kernel_folder import CACHE_DIR
 
     with KernelLock(CACHE_DIR) as lock, before_compiling(lock.take):
         import_module(module)
@@ -159,21 +165,25 @@ def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
 
 
 def _compiled() -> set[Path]:
-    from estimator.kernel import CACHE_DIR
+    from estimator.kernel_folder import CACHE_DIR
 
     return set(CACHE_DIR.rglob("*.nbc"))
 
 
 def mark_of(what: str) -> Path:
     """The file that says that an earlier start has compiled all that this one needs."""
-    from llvmlite.binding import get_host_cpu_name
-
-    from estimator.kernel import CACHE_DIR
+    from estimator.kernel_folder import CACHE_DIR
 
     # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
     # processor: a disk may be put into another computer
-    key = f"{ROOM} {os.environ.get('NUMBA_CPU_NAME') or get_host_cpu_name()}"
+    key = f"{ROOM} {os.environ.get('NUMBA_CPU_NAME') or _processor()}"
     return CACHE_DIR / f"{what}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+
+
+def _processor() -> str:
+    """What Linux says of the first one's make and abilities (proc(5)): more than the compiler goes by."""
+    first = CPUINFO.read_text().partition("\n\n")[0]
+    return "\n".join(line for line in first.splitlines() if line.partition("\t")[0].partition(":")[0].strip() in MAKE)
 
 
 def is_marked(what: str) -> bool:
@@ -199,8 +209,7 @@ def is_warm(lights: bool) -> bool:
 
 
 def _load(begun: float, lights: Lights | None) -> Warmth:
-    with _uncollected(True):
-        from estimator.kernel import CACHE_DIR
+    from estimator.kernel_folder import CACHE_DIR
 
     what = _what(lights is not None)
     with KernelLock(CACHE_DIR) as lock:
@@ -294,7 +303,7 @@ def _exercise_lights(lights: Lights) -> float:
 
 def _progress_line(seconds: float, lights: bool = False) -> str:
     """How far compiling has come after ``seconds``, or what is waited for; empty until the compiler is loaded."""
-    kernel = sys.modules.get("estimator.kernel")
+    kernel = sys.modules.get("estimator.kernel_folder")
     directory: Path | None = getattr(kernel, "CACHE_DIR", None)
     if directory is None:
         return ""

@@ -22,7 +22,7 @@ ESTIMATOR_NEVER = {
     *("os", "pathlib", "io", "subprocess", "logging"),
     *("asyncio", "threading", "time", "socket", "serial", "random"),
 }
-ESTIMATOR_EXCEPTION = "kernel.py"  # finds the kernel cache once, at import
+ESTIMATOR_EXCEPTION = "kernel_folder.py"  # finds the kernel cache once, at import
 
 
 def imports_of(path: Path) -> set[str]:

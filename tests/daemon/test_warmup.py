@@ -7,6 +7,7 @@ import fcntl
 import gc
 import hashlib
 import os
+import random
 import shutil
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from daemon.kernellock import KernelLock, waits
 from daemon.lights import Lights
 from daemon.warmup import Warmth, kernel_count, warm_up
 from estimator.cdma_profile import PROFILE_A
-from estimator.kernel import CACHE_DIR
+from estimator.kernel_folder import CACHE_DIR
 from estimator.lamps import Survey
 
 ROOT = Path(__file__).parents[2]
@@ -162,7 +163,7 @@ def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_
 def test_a_first_start_waits_for_another_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.kernel_folder.CACHE_DIR", tmp_path)
     monkeypatch.setattr(warmup, "_exercise", lambda: None)
     caplog.set_level("INFO")
     with ThreadPoolExecutor(1) as pool:
@@ -190,7 +191,7 @@ def test_a_start_loads_nothing_it_does_not_use() -> None:
 
 
 def test_progress_counts_what_was_compiled_since_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.kernel_folder.CACHE_DIR", tmp_path)
     old = tmp_path / "old.nbc"
     old.touch()
     os.utime(old, (time.time() - 1000.0,) * 2)
@@ -295,7 +296,7 @@ def test_what_a_command_compiles_beyond_the_daemons_kernels_it_compiles_under_th
 ) -> None:
     taken: list[str] = []
     monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
-    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.kernel_folder.CACHE_DIR", tmp_path)
     monkeypatch.setattr(KernelLock, "take", lambda lock: taken.append("taken"))
     (tmp_path / "of_its_own.py").write_text("import numba\nnumba.njit('f8(f8)')(lambda x: x + 1.0)\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -318,7 +319,7 @@ def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
     code = (
         "import sys; from daemon.cli import main\n"
         "assert main(['warm', '--set', 'modbus.port=0']) == 0\n"
-        "print(sorted({'estimator.pipeline', 'estimator.matching'} & set(sys.modules)))"
+        "print(sorted({'numba', 'llvmlite', 'estimator.pipeline', 'estimator.kernel'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
@@ -327,7 +328,7 @@ def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
 
 def test_a_mark_without_kernels_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who makes room on the disk deletes what is large: the kernels, and not the mark."""
-    monkeypatch.setattr("estimator.kernel.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.kernel_folder.CACHE_DIR", tmp_path)
     monkeypatch.setattr(warmup, "_exercise", lambda: None)
     worked: list[str] = []
     for what in ("warm", "export"):
@@ -344,15 +345,21 @@ def test_a_mark_without_kernels_is_none(tmp_path: Path, monkeypatch: pytest.Monk
     assert worked == ["export"]
 
 
-def test_another_processor_s_kernels_are_none_of_this_one_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def other_processor(folder: Path, name: str) -> Path:
+    path = folder / name
+    path.write_text(f"processor\t: 0\nmodel name\t: {name}\ncpu MHz\t\t: {random.random()}\n\nprocessor\t: 1\n")
+    return path
+
+
+def test_another_processor_s_kernels_are_none_of_this_one_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ours = warmup.mark_of("warm")
     assert warmup.mark_of("warm") == ours
-    monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: "another")
+    monkeypatch.setattr(warmup, "CPUINFO", other_processor(tmp_path, "another"))
     monkeypatch.delenv("NUMBA_CPU_NAME", raising=False)
     assert warmup.mark_of("warm") != ours
     monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
     assert warmup.mark_of("warm") != ours
-    monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: "a third")
+    monkeypatch.setattr(warmup, "CPUINFO", other_processor(tmp_path, "a third"))
     generic = warmup.mark_of("warm")
     monkeypatch.undo()
     monkeypatch.setenv("NUMBA_CPU_NAME", "generic")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from estimator import kernel
+from estimator import kernel, kernel_folder
 
 DAY = 86400.0
 
@@ -31,53 +31,53 @@ def test_the_latest_used_are_kept(root: Path) -> None:
     old = [left_behind(root, f"{k:02}", 10.0 + k) for k in range(10)]
     alien = root / "maps"
     alien.mkdir()
-    ours = kernel._choose_cache()
-    assert ours == root / f"kernels-{kernel.source_key()}"
-    assert sorted(root.iterdir()) == sorted([alien, ours, *old[: kernel.KEPT]])
+    ours = kernel_folder._choose_cache()
+    assert ours == root / f"kernels-{kernel_folder.source_key()}"
+    assert sorted(root.iterdir()) == sorted([alien, ours, *old[: kernel_folder.KEPT]])
 
 
 def test_what_was_used_this_week_is_kept(root: Path) -> None:
     fresh = [left_behind(root, f"{k:02}", 0.5 * k) for k in range(10)]
-    kernel._choose_cache()
+    kernel_folder._choose_cache()
     assert all(folder.exists() for folder in fresh)
 
 
 def test_not_even_a_busy_week_fills_the_disk(root: Path) -> None:
-    fresh = [left_behind(root, f"{k:02}", 0.01 * k) for k in range(kernel.MOST + 5)]
-    ours = kernel._choose_cache()
-    assert sorted(root.iterdir()) == sorted([ours, *fresh[: kernel.MOST]])
+    fresh = [left_behind(root, f"{k:02}", 0.01 * k) for k in range(kernel_folder.MOST + 5)]
+    ours = kernel_folder._choose_cache()
+    assert sorted(root.iterdir()) == sorted([ours, *fresh[: kernel_folder.MOST]])
 
 
 def test_nothing_is_looked_at_when_ours_is_there_already(root: Path) -> None:
-    ours = kernel._choose_cache()
+    ours = kernel_folder._choose_cache()
     os.utime(ours, (0.0, 0.0))
     old = [left_behind(root, f"{k:02}", 100.0) for k in range(10)]
-    assert kernel._choose_cache() == ours
+    assert kernel_folder._choose_cache() == ours
     assert all(folder.exists() for folder in old)
     assert time.time() - ours.stat().st_mtime < DAY  # it counts as used
 
 
 def test_what_cannot_be_removed_stays(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    old = [left_behind(root, f"{k:02}", 100.0) for k in range(kernel.KEPT + 1)]
+    old = [left_behind(root, f"{k:02}", 100.0) for k in range(kernel_folder.KEPT + 1)]
     old[-1].rename(root / "elsewhere")
     (root / old[-1].name).symlink_to(root / "elsewhere")  # rmtree refuses a link
-    kernel._choose_cache()
+    kernel_folder._choose_cache()
     assert (root / "elsewhere").exists()
 
 
-@pytest.mark.parametrize(("name", "value"), [("BOUNDSCHECK", 1), ("CPU_NAME", "generic"), ("OPT", 0)])
+@pytest.mark.parametrize(("name", "value"), [("BOUNDSCHECK", "1"), ("CPU_NAME", "generic"), ("OPT", "0")])
 def test_other_machine_code_has_another_directory(
-    root: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: object
+    root: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
-    ours = kernel._choose_cache()
-    monkeypatch.setattr(kernel._numba_config, name, value)
-    other = kernel._choose_cache()
+    ours = kernel_folder._choose_cache()
+    monkeypatch.setenv(f"NUMBA_{name}", value)
+    other = kernel_folder._choose_cache()
     assert other != ours
     monkeypatch.undo()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(root))
-    assert kernel._choose_cache() == ours
+    assert kernel_folder._choose_cache() == ours
 
 
 def test_every_setting_that_is_looked_at_exists() -> None:
     """A name that numba has renamed would no longer tell the two apart."""
-    assert [name for name in kernel.SHAPING if not hasattr(kernel._numba_config, name)] == []
+    assert [name for name in kernel_folder.SHAPING if not hasattr(kernel._numba_config, name)] == []

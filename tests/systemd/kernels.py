@@ -22,7 +22,7 @@ def plant(compiled: Path, sources: Path, cache: Path, root: Path) -> list[Path]:
     """Copy the kernels of ``sources`` for the installation below ``root``; returns what was left out of what it loads.
 
     Args:
-        compiled: this version's directory of compiled kernels, as for `estimator.kernel.CACHE_DIR`.
+        compiled: this version's directory of compiled kernels, as for `estimator.kernel_folder.CACHE_DIR`.
         sources: folder that they were compiled from.
         cache: CacheDirectory of the service, below ``root``.
         root: the machine's files.

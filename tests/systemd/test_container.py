@@ -106,7 +106,7 @@ def machine(folder: Path, package: Path, lidar: Path) -> Iterator[Container]:
 @pytest.fixture(scope="module")
 def left_out(machine: Container, warm_kernels: None) -> list[Path]:
     """Kernels that the machine has to compile itself; it has all others."""
-    from estimator.kernel import CACHE_DIR
+    from estimator.kernel_folder import CACHE_DIR
 
     return kernels.plant(CACHE_DIR, ROOT / "estimator", machine.root / CACHE, machine.root)
 

@@ -135,7 +135,7 @@ def kept(folder: Path) -> Booted:
 def played_by_two(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *shares: list[common.Scenario]
 ) -> tuple[bool, list[list[str]], str]:
-    monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off: Playing(broken_off))
+    monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off, nice: Playing(broken_off))
     both = [Guest(k + 1, share) for k, share in enumerate(shares)]
     (tmp_path / "work").mkdir()
     whole = run_all(both, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
@@ -159,7 +159,7 @@ def test_a_computer_that_dies_leaves_a_report_of_what_was_and_what_was_not_run(
 def test_what_the_emulation_has_worked_is_told_with_each_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off: Playing(broken_off))
+    monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off, nice: Playing(broken_off))
     (tmp_path / "work").mkdir()
     guest = Guest(1, [like(passes), passes])
     run_all([guest], kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)

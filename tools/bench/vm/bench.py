@@ -273,7 +273,7 @@ def _end(child: subprocess.Popen[str]) -> None:
 
 
 @contextmanager
-def bench(booted: Booted, folder: Path, broken_off: threading.Event) -> Iterator[Bench]:
+def bench(booted: Booted, folder: Path, broken_off: threading.Event, nice: int = 0) -> Iterator[Bench]:
     """Everything running, the emulated computer held where its boot has ended; nothing of it is left at the end."""
     with ExitStack() as stack:
         truth, poses = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
@@ -283,7 +283,7 @@ def bench(booted: Booted, folder: Path, broken_off: threading.Event) -> Iterator
         world, there = _start_world(folder, odometry, truth.getsockname()[1], stack)
         there["poses"] = poses.getsockname()[1]
         ports = Ports(free_for_both(), odometry, int(there["lidar"]))
-        machine = stack.enter_context(started(booted.start, folder, ports, broken_off))
+        machine = stack.enter_context(started(booted.start, folder, ports, broken_off, nice))
         made = Bench(machine, world, folder, there)
         made.booted_s = booted.seconds
         stop = threading.Event()

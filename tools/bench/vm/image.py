@@ -276,7 +276,7 @@ def _compile(say: Say) -> Path:
     say("compiling kernels for any processor")
     warm = [sys.executable, "-m", "daemon", "warm", "--config", str(GUEST / "lumiloop.toml")]
     _do([*warm, "--set", "photodiode.bus=adapter:bench"], "compiling kernels", WARM)
-    where = "from estimator.kernel import CACHE_DIR; print(CACHE_DIR)"
+    where = "from estimator.kernel_folder import CACHE_DIR; print(CACHE_DIR)"
     compiled = Path(_do([sys.executable, "-c", where], "finding the kernels", WARM).split()[-1])
     _do([sys.executable, "-m", "tools.bench.vm.reference"], "driving outside", {"PYTHONPATH": str(ROOT)})
     return compiled

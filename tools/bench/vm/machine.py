@@ -350,7 +350,7 @@ def command_line(start: Start, folder: Path, ports: Ports) -> list[str]:
 
 
 @contextmanager
-def started(start: Start, folder: Path, ports: Ports, broken_off: threading.Event) -> Iterator[Machine]:
+def started(start: Start, folder: Path, ports: Ports, broken_off: threading.Event, nice: int = 0) -> Iterator[Machine]:
     """Switch it on; it is off at the end, whatever happens.
 
     Args:
@@ -358,12 +358,13 @@ def started(start: Start, folder: Path, ports: Ports, broken_off: threading.Even
         ports: where it can be reached, and where its lidar is.
         folder: for sockets and console; its disk's changes go there too, and are gone at the end.
         broken_off: once set, whoever waits for it gets `BrokenOff`.
+        nice: how far it stands back behind the others (nice(1)).
     """
     with ExitStack() as stack:
         said = stack.enter_context((folder / "qemu").open("wb"))
         environment = {**os.environ, "TMPDIR": str(folder)}
         process = subprocess.Popen(
-            [*LEASH, *command_line(start, folder, ports)],
+            [*LEASH, "nice", "-n", str(nice), *command_line(start, folder, ports)],
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=said,

@@ -1,34 +1,21 @@
-"""Scenarios: what happens to the files and the computer; the package is removed at last."""
+"""Scenarios: what happens to the computer; the package is removed at last."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from tools.bench.vm.bench import CONFIG, DONE, REFUSED, SAVE_MAP, UNIT, Bench
-from tools.bench.vm.common import RIGHT_S, back, map_id, need, right, scenario
+from tools.bench.vm.bench import CONFIG, DONE, SAVE_MAP, UNIT, Bench
+from tools.bench.vm.common import RIGHT_S, begin, come_up, map_id, need, right, scenario, start
 
 
-@scenario()
-def meets_a_clock_step(bench: Bench) -> str:
-    """The computer's clock is set back by a day and on again."""
-    pid = bench.main_pid()
-    for step in ("-100000", "100000"):
-        bench.machine.run("sh", "-c", f"date -s @$(( $(date +%s) + {step} ))")
-        bench.wait(2.0)
-    return back(bench, pid)
-
-
-@scenario()
-def meets_a_full_disk(bench: Bench) -> str:
-    """No room for a map: refused and named, the pose goes on; room again: saved."""
-    pid = bench.main_pid()
-    fill = "fallocate -l $(df --output=avail -B1 / | tail -1) /full || dd if=/dev/zero of=/full bs=1M"
-    bench.machine.run("sh", "-c", fill, check=False, seconds=120)
-    result = bench.command(SAVE_MAP, 60.0)
-    bench.machine.run("rm", "-f", "/full")
-    need(result == REFUSED, lambda: f"saving said {result}:\n{bench.log(10)}")
-    need(bench.command(SAVE_MAP, 60.0) == DONE, lambda: bench.log(10))
-    return f"refused, then done; {back(bench, pid)}"
+@scenario("anew")
+def comes_up_once_more(bench: Bench) -> str:
+    """A third computer: its map begins where it stands."""
+    said = come_up(bench)
+    seconds = start(bench)
+    worst = begin(bench)
+    bench.drive()
+    return f"{said}; READY after {seconds:.1f} s; {1e3 * worst:.0f} mm at most"
 
 
 def _up_again(bench: Bench) -> str:

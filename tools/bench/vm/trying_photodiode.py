@@ -25,11 +25,11 @@ GONE: Final = (151, 152, NACK, STUCK)
 
 @scenario("anew")
 def comes_up_with_a_photodiode(bench: Bench) -> str:
-    """A second computer, with a photodiode configured before the first start: its map begins where it stands."""
+    """A second computer, with a photodiode configured before the first start, whose converter gets its power later."""
     said = come_up(bench)
-    bench.machine.order(10.0, i2c=bench.there["bus"].replace("127.0.0.1", OUTSIDE))
     seconds = start(bench, PHOTODIODE)
     worst = begin(bench)
+    bench.machine.order(10.0, i2c=bench.there["bus"].replace("127.0.0.1", OUTSIDE))
     bench.drive()
     return f"{said}; READY after {seconds:.1f} s; {1e3 * worst:.0f} mm at most"
 

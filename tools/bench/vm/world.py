@@ -29,15 +29,18 @@ from tools.bench.world.room import LIDAR, room
 from tools.bench.world.stage import ForeignSender
 from tools.sim.feed import UdpSender, feed_odometry, feed_truth
 from tools.sim.hands import Hands
+from tools.sim.odometry import Wheels
 from tools.sim.scene import Scenario, SimulatedScene
 
 BUS = "bench"
 DWELL_S = 4.0
+WHEELS_HZ = 20.0
+"""Each datagram costs the emulated processor a millisecond."""
 
 
 def scenario() -> Scenario:
     """What is driven; also outside of the emulated computer, to compare with."""
-    return Scenario(lidar=LIDAR, people=False, dwell_s=DWELL_S)
+    return Scenario(lidar=LIDAR, people=False, dwell_s=DWELL_S, wheels=Wheels(rate_hz=WHEELS_HZ))
 
 
 async def serve(odometry: int, truth: int, control: Path) -> None:
