@@ -40,7 +40,7 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) >= 25
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
     names = [[part.__name__.rpartition("_")[2] for part in parts] for parts in PARTS]
-    assert names == [["system", "devices", "process"], ["photodiode", "computer"]]
+    assert names == [["system", "devices", "surroundings"], ["photodiode", "process"], ["computer"]]
 
 
 def test_scenarios_up_to_the_named_ones_and_only_the_computers_that_they_take() -> None:
@@ -192,6 +192,11 @@ def test_a_computer_goes_on_from_what_was_kept_of_it(tmp_path: Path) -> None:
     with pytest.raises(places.CannotBench, match=r"QEMU (has ended|does not)"):
         third._until_status("paused", "taking what is no memory")
     third.stop()
+
+
+def test_kernels_are_compiled_outside_with_the_settings_that_are_set_inside() -> None:
+    inside = (image.GUEST / "generic.conf").read_text().partition("Environment=")[2].split()
+    assert dict(word.split("=") for word in inside) == {k: v for k, v in image.WARM.items() if k.startswith("NUMBA")}
 
 
 def test_what_was_kept_is_of_one_qemu_and_one_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
