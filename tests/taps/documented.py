@@ -17,7 +17,7 @@ RUN: Final = {
         r"replay.md: lumiloop run", r"README.md: lumiloop run",
     ),
     "beside": (
-        r"README.md: lumiloop status", r"README.md: mbpoll", r"view.md: lumiloop view(?! drive)",
+        r"(README|operations).md: lumiloop status", r"README.md: mbpoll", r"view.md: lumiloop view(?! drive)",
         r"formats.md: lumiloop (metrics|foxglove)", r"formats.md: curl", r"stream.md: python tools/clients",
         r"planning.md: lumiloop lamps",
     ),
