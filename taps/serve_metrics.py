@@ -19,6 +19,7 @@ from taps import vda5050
 from taps.frames import NotTheStream
 from taps.metrics import CONTENT_TYPE, Told, exposition
 from taps.stream import Stream
+from taps.view.guard import Guard
 
 LONGEST_REQUEST: Final = 8192
 PATIENCE_S: Final = 5.0
@@ -28,6 +29,7 @@ _JSON: Final = "application/json"
 _REASONS: Final = {
     200: "OK",
     400: "Bad Request",
+    403: "Forbidden",
     404: "Not Found",
     405: "Method Not Allowed",
     503: "Service Unavailable",
@@ -57,7 +59,7 @@ async def serve(stream: Stream, host: str, port: int) -> None:
         OSError: it cannot be listened there. NotTheStream: the other end is no daemon of this version.
     """
     told = Told()
-    answering = Answering(told)
+    answering = Answering(told, Guard(bind=host))
     server = await asyncio.start_server(answering, host, port, limit=LONGEST_REQUEST)
     cli.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
     try:
@@ -69,10 +71,10 @@ async def serve(stream: Stream, host: str, port: int) -> None:
 
 
 class Answering:
-    """Answers requests of what has been told."""
+    """Answers requests of what has been told; not those that somebody's web page makes a browser here send."""
 
-    def __init__(self, told: Told) -> None:
-        self._told = told
+    def __init__(self, told: Told, guard: Guard) -> None:
+        self._told, self._guard = told, guard
         self._clients = 0
 
     async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -94,11 +96,20 @@ class Answering:
         words = request.partition(b"\r\n")[0].decode("latin-1").split(" ")
         if len(words) != 3 or not words[2].startswith("HTTP/1."):
             return _response(400, "text/plain", "not a request of HTTP/1\n")
+        if not self._is_ours(request):
+            return _response(
+                403, "text/plain", "this computer is asked under a name that is not its own: use its address\n"
+            )
         method, path = words[0], words[1].partition("?")[0]
         if method not in ("GET", "HEAD"):
             return _response(405, "text/plain", "this only tells: GET\n")
         status, kind, body = self._document(path)
         return _response(status, kind, body, head=method == "HEAD")
+
+    def _is_ours(self, request: bytes) -> bool:
+        """Browsers always say which name they ask; other programs need not."""
+        named = [line.partition(b":")[2] for line in request.split(b"\r\n")[1:] if line.lower().startswith(b"host:")]
+        return all(not self._guard.local or self._guard.host_ok(one.decode("latin-1").strip()) for one in named)
 
     def _document(self, path: str) -> tuple[int, str, str]:
         told = self._told

@@ -20,7 +20,7 @@ from daemon.probe import is_bus
 from daemon.publish.snapshot import LinkUse, State
 from daemon.surveyfile import SurveyError, read_survey
 from hal.inet import refusal
-from taps.doctor.host import Heard, Host, Mute
+from taps.doctor.host import Heard, Host, Mute, standing
 
 FREE_BYTES: Final = 200 << 20
 """A map of a large building, twice, and some recording."""
@@ -341,10 +341,15 @@ def lamps(case: Case) -> Iterator[Finding]:
     received = sum(use != LinkUse.MISSING for use in seen.values())
     if not received:
         yield fix("lamps", "none is received", "is it dark here, the photodiode covered, or the air interface another?")
+    lasts = standing(case.heard)
     for (code, lamp_id), use in sorted(seen.items(), key=lambda one: (one[0][0], one[0][1] or 0)):
         if use in _ODD:
             text, remedy = _ODD[LinkUse(use)]
-            yield fix("lamps", f"code {code}{'' if lamp_id is None else f' (lamp {lamp_id})'} {text}", remedy)
+            named = f"code {code}{'' if lamp_id is None else f' (lamp {lamp_id})'}"
+            if lasts(use):
+                yield fix("lamps", f"{named} {text}", remedy)
+            else:
+                yield remark("lamps", f"{named} {text} at this moment", f"ask again; if it stays so: {remedy}")
     if received:
         yield good("lamps", f"{received} in view, {used} used")
 

@@ -10,10 +10,13 @@ import resource
 import shutil
 import socket
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from daemon.faults import Fault
+from daemon.publish.snapshot import LinkUse
 from hal import i2c_linux
 from hal.hokuyo import discover
 from hal.opening import open_bus, open_port
@@ -43,6 +46,16 @@ class Heard:
     faults: Faults | None = None
     lights: Lights | None = None
     lamps: dict[tuple[int, int | None], int] = field(default_factory=dict)
+
+
+SAID_AS: Final[dict[int, int]] = {LinkUse.MISSING: Fault.LAMP_DEAD, LinkUse.REJECTED: Fault.LAMP_MOVED}
+"""The fault that a running daemon has when a lamp has been so for long (`daemon.lampwatch`)."""
+
+
+def standing(heard: Heard) -> Callable[[int], bool]:
+    """Whether what a lamp is used for is more than a passing shadow: dead or moved only where the faults say so."""
+    present = set() if heard.faults is None else {one.fault for one in heard.faults.present}
+    return lambda use: use not in SAID_AS or SAID_AS[use] in present
 
 
 @dataclass(frozen=True, slots=True)

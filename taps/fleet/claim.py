@@ -88,7 +88,10 @@ class Claim:
     def _heard(self, instance: str, there: bool) -> None:
         if instance == self._instance:
             return
-        self._others[instance] = there
+        if there or not self._instance:  # while the list is awaited, who has gone must not come back by it
+            self._others[instance] = there
+        else:
+            self._others.pop(instance, None)
         if self.mine and self._before():
             self._settle(False)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ KINDS: Final = (SURVEY, MAP)
 MOST_BYTES: Final = 256 << 20
 RECORD: Final = "fleet.json"
 BEFORE: Final = ".before"
-"""Behind the name of a survey that was replaced."""
+"""Behind the name of a survey that was replaced; and a number, from the second one on."""
 
 
 class Refused(Exception):
@@ -292,13 +293,23 @@ def place_survey(shared: Survey, where: Path) -> tuple[Path, str]:
     words = "its receiver is the shared file's: look at [receiver]"
     try:
         if where.exists():
-            own = read_survey(where)
+            own, old = read_survey(where), where.read_bytes()
             shared = replace(shared, receiver=own.receiver)
-            words = f"[receiver] is this robot's own as before; the old file is {where.name}{BEFORE}"
-            write_whole(where.with_name(where.name + BEFORE), where.read_bytes())
+            aside = _aside(where, old)
+            words = f"[receiver] is this robot's own as before; the old file is {aside.name}"
+            write_whole(aside, old)
         write_whole(where, dump(shared, ("Lamps as shared in the fleet.",)).encode())
     except SurveyError as error:
         raise Refused(f"{error}; mend it, or move it away") from None
     except OSError as error:
         raise Refused(f"{where}: cannot be written: {reason_of(error)}") from None
     return where, f"the daemon takes it at its next start; {words}"
+
+
+def _aside(where: Path, old: bytes) -> Path:
+    """Where the old file goes: over none that holds anything else, for one of these is the robot's own."""
+    names = (
+        where.with_name(f"{where.name}{BEFORE}{number}")
+        for number in itertools.chain(("",), map(str, itertools.count(2)))
+    )
+    return next(path for path in names if not path.exists() or path.read_bytes() == old)

@@ -37,6 +37,7 @@ WANTED: Final = ("pose", "loop", "faults", "map")
 STATE_S: Final = 5.0
 """The state is told at a change, and so often."""
 MAP_S: Final = 10.0
+NAME_S: Final = 10.0
 """The map is told at most so often, and only when it has changed."""
 OLD_S: Final = 3.0
 """A daemon that has told no pose for so long stands, and does not know where the robot is."""
@@ -134,6 +135,7 @@ class Robot:
         self._lost = False
         self._said: StateTold | None = None
         self._name: tuple[int, str] = 0, ""
+        self._looked = 0.0
 
     def take(self, frame: Frame | Lost) -> None:
         """Take one in; loops are told at once."""
@@ -194,9 +196,10 @@ class Robot:
         return messages.state_told(self._pose, self._faults, self._records.held(), self._map_name(self._pose.map_id))
 
     def _map_name(self, map_id: int) -> str:
-        """What its file calls the map; looked up once for each."""
-        if self._name[0] != map_id:
-            self._name = map_id, name_of(self._folder, map_id)
+        """What its file calls the map; one that has no name yet, or no file, is looked for again."""
+        now = time.monotonic()
+        if self._name[0] != map_id or (not self._name[1] and now - self._looked >= NAME_S):
+            self._name, self._looked = (map_id, name_of(self._folder, map_id)), now
         return self._name[1]
 
     def _draw(self) -> None:

@@ -11,18 +11,14 @@ from typing import Final
 
 from daemon import cli
 from daemon.config import Config
-from daemon.faults import Fault
 from daemon.folders import maps_folder, stream_path
-from daemon.publish.snapshot import LinkUse
-from taps.doctor.host import Heard, Host
+from taps.doctor.host import Heard, Host, standing
 from taps.lamps.history import BadHistory, by_lamp, in_maps, load, merged, save
 from taps.lamps.judge import Verdict, judge, together
 
 FILE: Final = "lamps.csv"
 TOGETHER: Final = -0.02
 """A year; that all lamps dim by so much together is worth a word."""
-SAID_AS: Final[dict[int, int]] = {LinkUse.MISSING: Fault.LAMP_DEAD, LinkUse.REJECTED: Fault.LAMP_MOVED}
-"""The fault that a running daemon has when a lamp has been so for long (`daemon.lampwatch`)."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -62,12 +58,8 @@ def tell(args: argparse.Namespace, host: Host) -> int:
 
 def _said_of(heard: Heard) -> dict[int, int]:
     """What the daemon uses each lamp for; dead or moved only where its faults say so: a passing shadow is none."""
-    present = set() if heard.faults is None else {one.fault for one in heard.faults.present}
-    return {
-        lamp: use
-        for (_, lamp), use in heard.lamps.items()
-        if lamp is not None and (use not in SAID_AS or SAID_AS[use] in present)
-    }
+    lasts = standing(heard)
+    return {lamp: use for (_, lamp), use in heard.lamps.items() if lamp is not None and lasts(use)}
 
 
 def _table(verdicts: list[Verdict]) -> str:

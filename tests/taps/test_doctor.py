@@ -139,7 +139,8 @@ def broken(**changes: object) -> Callable[[], Computer]:
 TORN = BusFinding(BUS, error=DeviceFault(BUS, "SDA is held low", "switch the converter off and on"))
 WRONG = BusFinding(BUS, "i2c", (Chip(0x4D, "ADC121C021", True),))
 EMPTY = BusFinding(BUS, "i2c", (Chip(0x48, "ADS1015 or ADS1115"),))
-ODD = Heard("agv", 7, POSE, lamps={(5, 3): 1, (9, None): 7, (6, 4): 8, (7, 5): 3, (8, 6): 6})
+AWRY = Faults(present=tuple(Fault(fault=number, meaning="a lamp", remedy="look") for number in (174, 175)))
+ODD = Heard("agv", 7, POSE, AWRY, lamps={(5, 3): 1, (9, None): 7, (6, 4): 8, (7, 5): 3, (8, 6): 6})
 FAULTY = Heard("agv", 7, POSE, Faults(present=(Fault(fault=104, meaning="no valid scan", remedy="check the cable"),)))
 
 CASES = {
@@ -357,3 +358,12 @@ def test_a_daemon_that_cannot_be_heard_is_there_all_the_same(
     assert asked(file, Opened(heard=heard)) == cli.FAILED
     said = capsys.readouterr().out
     assert "1 to fix; first: daemon: sudo usermod" in said
+
+
+@pytest.mark.parametrize("use", [3, 8])
+def test_a_lamp_in_a_passing_shadow_is_nothing_to_fix(file: Path, capsys: pytest.CaptureFixture[str], use: int) -> None:
+    shaded = Heard("agv", 7, POSE, lamps={(5, 3): 1, (7, 5): use})
+    asked(file, Computer(heard=shaded))
+    said = capsys.readouterr().out
+    assert not re.search(r"FIX +lamps", said)
+    assert "at this moment" in said

@@ -21,6 +21,7 @@ from taps.metrics import Told, exposition
 from taps.serve_metrics import serve
 from taps.stream import Lost, Stream
 from taps.vda5050 import position, position_v2
+from taps.view.guard import Guard
 from tests.taps.serving import served
 
 families = pytest.importorskip("prometheus_client.parser").text_string_to_metric_families
@@ -68,7 +69,7 @@ def with_server(path: Path, body: Callable[[int], Awaitable[None]]) -> None:
 
 def test_prometheus_reads_every_series(tmp_path: Path) -> None:
     async def body(port: int) -> None:
-        head, _, text = (await ask(port, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")).partition(b"\r\n\r\n")
+        head, _, text = (await ask(port, b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n")).partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 200 OK")
         assert b"text/plain; version=0.0.4" in head
         assert f"Content-Length: {len(text)}".encode() in head
@@ -160,7 +161,7 @@ def test_a_daemon_that_stands_still_does_not_localize() -> None:
     """It is connected and says nothing: the kernel has not noticed, and a vehicle must not trust what was."""
     told = Told()
     told.take(POSE, time.monotonic())
-    answering = serve_metrics.Answering(told)
+    answering = serve_metrics.Answering(told, Guard(bind="127.0.0.1"))
     request = b"GET /vda5050 HTTP/1.1\r\n\r\n"
     assert b'"localized": true' in answering._answer(request)
     told.t_heard -= 3.5
@@ -169,10 +170,28 @@ def test_a_daemon_that_stands_still_does_not_localize() -> None:
     assert b'"x": 1.0' in said
 
 
+@pytest.mark.parametrize(
+    ("bind", "named", "status"),
+    [
+        ("127.0.0.1", b"Host: 127.0.0.1:9464\r\n", b"200"),
+        ("127.0.0.1", b"host: localhost:9464\r\n", b"200"),
+        ("127.0.0.1", b"", b"200"),
+        ("127.0.0.1", b"Host: evil.example:9464\r\n", b"403"),
+        ("127.0.0.1", b"Accept: */*\r\nHost:evil.example\r\n", b"403"),
+        ("0.0.0.0", b"Host: robot-7.plant.example:9464\r\n", b"200"),
+    ],
+)
+def test_a_page_whose_name_was_turned_to_this_computer_reads_nothing(bind: str, named: bytes, status: bytes) -> None:
+    answering = serve_metrics.Answering(Told(), Guard(bind=bind))
+    said = answering._answer(b"GET /metrics HTTP/1.1\r\n" + named + b"\r\n")
+    assert said.split(b" ")[1] == status
+    assert (b"under a name that is not its own" in said) == (status == b"403")
+
+
 def test_of_a_daemon_that_has_gone_the_last_place_is_told_and_of_the_next_one_its_own() -> None:
     """A vehicle that asks for its position learns where it was last known to be, and that this is not known to hold."""
     told = Told()
-    answering = serve_metrics.Answering(told)
+    answering = serve_metrics.Answering(told, Guard(bind="127.0.0.1"))
     request = b"GET /vda5050/2 HTTP/1.1\r\n\r\n"
     told.take(Hello(schema=1, name="agv", pid=1), 0.0)
     assert b"503" in answering._answer(request)

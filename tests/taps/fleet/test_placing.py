@@ -56,6 +56,17 @@ def test_a_survey_keeps_the_robots_own_receiver_and_the_file_before(tmp_path: Pa
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml", "lights.toml.before"}
 
 
+def test_a_later_fetch_leaves_alone_what_an_earlier_one_has_put_aside(tmp_path: Path, survey: Path) -> None:
+    offer, content = offer_of(SURVEY, survey, 3)
+    own = tmp_path / "lights.toml"
+    versions = [dump(Survey(LAMPS[:1], Receiver(x=x))) for x in (-0.25, -0.5)]
+    for text, aside in ((versions[0], ""), (versions[1], "2"), (versions[1], "2"), (versions[0], "")):
+        own.write_text(text)
+        _, note = place(offer, content, settings(tmp_path), None)
+        assert f"the old file is lights.toml.before{aside}" in note
+    assert [(tmp_path / f"lights.toml.before{number}").read_text() for number in ("", "2")] == versions
+
+
 def test_a_survey_is_read_for_the_air_interface_that_this_robot_has(tmp_path: Path) -> None:
     """Where it says no depth, the profile's counts; codes that the profile does not have are refused."""
     path = tmp_path / "shared.toml"
