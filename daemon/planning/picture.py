@@ -99,12 +99,28 @@ def _walls(axes: Any, hall: Hall, window: Window) -> None:
     axes.set_aspect("equal")
 
 
+def _gridded(hall: Hall, value: Array) -> tuple[tuple[float, float, float, float], Array]:
+    """Left, right, lower, upper edge in m, and the places' values (n,) as rows from below; not a number between them.
+
+    One square a place, side by side in the plan's own metres: markers have a size on the paper, and leave gaps.
+    """
+    low = hall.places.min(axis=0)
+    column, row = np.rint((hall.places - low) / hall.step).astype(np.int64).T
+    grid = np.full((row.max() + 1, column.max() + 1), np.nan)
+    grid[row, column] = value
+    left, below = low - 0.5 * hall.step
+    rows, columns = grid.shape
+    return (left, left + columns * hall.step, below, below + rows * hall.step), grid
+
+
 def _places(
     axes: Any, hall: Hall, plan: Plan, window: Window, value: Array, colours: str, span: tuple[float, float]
 ) -> Any:
     _walls(axes, hall, window)
-    size = (hall.step * _points_per_m(window)) ** 2
-    drawn = axes.scatter(*hall.places.T, c=value, s=size, marker="s", cmap=colours, vmin=span[0], vmax=span[1], lw=0)
+    extent, grid = _gridded(hall, value)
+    drawn = axes.imshow(
+        grid, origin="lower", extent=extent, cmap=colours, vmin=span[0], vmax=span[1], interpolation="nearest"
+    )
     _lamps(axes, plan, window)
     return drawn
 
