@@ -26,6 +26,8 @@ from estimator.lamps import Lamp, Receiver, Survey
 
 HEADROOM_M: Final = 0.2
 HIGHEST_M: Final = 30.0
+OPEN_M: Final = 1.0
+"""An axis with a larger deviation is as good as unknown."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -54,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _wrong(args: argparse.Namespace) -> str:
     if not HEADROOM_M < args.height <= HIGHEST_M:
-        return f"--height {args.height:g}: name metres above the floor, up to {HIGHEST_M:g}"
+        return f"--height {args.height:g}: name metres above the floor, more than {HEADROOM_M:g}, {HIGHEST_M:g} at most"
     metres = args.accuracy, args.reach, args.spacing
     if not (all(0.0 < m < math.inf for m in metres) and 0.0 < args.share <= 100.0 and args.links >= 1):
         return "--accuracy, --reach, --spacing, --links have to be above 0 and finite, --share above 0 and at most 100"
@@ -113,8 +115,8 @@ def report(hall: Hall, plan: Plan, goals: Goals, fitting: Fitting) -> str:
         f"{fitting.reach:.1f} m",
         f"links: {_percent(plan.links >= goals.links)} of places see {goals.links} or more"
         + (f"; of {len(plan.links)}, {fewer}" if fewer else ""),
-        f"light alone: {_deviations(plan.light_sigma)}",
-        f"laser and light: {_deviations(plan.sigma)}; a blind axis is left at {_percent(still)}",
+        f"light alone: {deviations(plan.light_sigma)}",
+        f"laser and light: {deviations(plan.sigma)}; a blind axis is left at {_percent(still)}",
     ]
     if not plan.possible.all():
         never = "cannot have that whatever hangs there: corners and narrow places, or lamps are too low"
@@ -136,9 +138,13 @@ def _percent(which: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> str:
     return f"{100.0 * float(which.mean()):.1f} %"
 
 
-def _deviations(sigma: Array) -> str:
-    median, most = (f"{100.0 * value:.1f} cm" if math.isfinite(value) else "unknown" for value in _quantiles(sigma))
-    return f"median {median}, 95 % within {most}"
+def deviations(sigma: Array) -> str:
+    """Of places, (n,) m of the worse axis, in words; from :data:`OPEN_M` on, no length is told."""
+    median, most = _quantiles(sigma)
+    middle = f"median {100.0 * median:.1f} cm" if median <= OPEN_M else f"median over {OPEN_M:g} m"
+    if most <= OPEN_M:
+        return f"{middle}, 95 % within {100.0 * most:.1f} cm"
+    return f"{middle}, over {OPEN_M:g} m at {_percent(sigma > OPEN_M)} of places"
 
 
 def _quantiles(sigma: Array) -> tuple[float, float]:

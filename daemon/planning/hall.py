@@ -67,8 +67,12 @@ def read_hall(path: Path, spacing: float) -> Hall:
     """
     if path.suffix == ".lumimap":
         return hall_of(*_of_map(path), spacing)
+    if path.is_dir():
+        raise NoHall(f"{path}: is a folder; name the picture in it, its YAML, or a map file, *.lumimap")
+    if not path.exists():
+        raise NoHall(f"{path}: no such file; name map_server's picture, its YAML, or a map file, *.lumimap")
     yaml = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
-    if not yaml.exists() and path.exists():
+    if not yaml.exists():
         raise NoHall(f"{path}: {yaml.name}, which says how large a pixel is, is not beside it")
     try:
         described, cells = load(yaml)

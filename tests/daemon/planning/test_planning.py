@@ -13,7 +13,7 @@ import pytest
 
 from daemon import cli
 from daemon.planning.choose import Goals, Plan, choose, codes_for, plan_of
-from daemon.planning.command import report
+from daemon.planning.command import deviations, report
 from daemon.planning.hall import Hall, NoHall, clear, hall_of, read_hall
 from daemon.planning.picture import draw
 from daemon.planning.sight import Fitting, information, seen_from, told, worst
@@ -232,6 +232,28 @@ def test_the_picture_of_a_long_floor_is_not_mostly_paper(width: float, depth: fl
         assert np.all(edge[:, :3] == 1.0)  # nothing is cut off
 
 
+def test_places_of_the_picture_lie_side_by_side() -> None:
+    """No line of paper runs through the floor: no white pixel has floor on both sides of it."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread
+
+    floor = hall(23.0, 17.0)
+    x, y = np.meshgrid(np.linspace(2.0, 21.0, 5), np.linspace(2.0, 15.0, 4))
+    plan = plan_of(floor, FITTING, wall_information(floor), Goals(), np.column_stack((x.ravel(), y.ravel())))
+    drawn = draw(floor, plan)
+    assert drawn is not None
+    pixels = imread(io.BytesIO(drawn))[:, :, :3]
+    pixels = pixels[:, : 2 * pixels.shape[1] // 3]  # links and accuracy
+    coloured = np.ptp(pixels, axis=2) > 0.15
+    white = pixels.min(axis=2) > 0.97
+    assert coloured.mean() > 0.2
+    for a, b, between in (
+        (coloured[:, :-4], coloured[:, 4:], white[:, 2:-2]),
+        (coloured[:-4], coloured[4:], white[2:-2]),
+    ):
+        assert np.sum(a & b & between) == 0
+
+
 def test_a_plan_that_lies_turned_in_the_map() -> None:
     turned = hall_of(room(6.0, 5.0), 0.05, (1.0, 2.0, math.pi / 2), 1.0)
     ((x, y),) = turned.in_map(np.array(((2.0, 1.0),)))
@@ -242,7 +264,7 @@ def test_a_plan_that_lies_turned_in_the_map() -> None:
     ("words", "text"),
     [
         (["--height", "0.4"], "not above the receiver"),
-        (["--height", "99"], "name metres above the floor"),
+        (["--height", "99"], "name metres above the floor, more than 0.2, 30 at most"),
         (["--lamps", "0"], "name one or more"),
         (["--lamps", "3", "--survey", "none.toml"], "name one of them"),
         (["--accuracy", "0"], "have to be above 0"),
@@ -260,8 +282,11 @@ def test_what_cannot_be_planned_is_said(
 
 
 def test_plans_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(NoHall, match="cannot be read"):
-        read_hall(tmp_path / "none.yaml", 0.5)
+    for name in ("none.yaml", "none.pgm"):
+        with pytest.raises(NoHall, match=rf"{name}: no such file"):
+            read_hall(tmp_path / name, 0.5)
+    with pytest.raises(NoHall, match="is a folder; name the picture in it"):
+        read_hall(tmp_path, 0.5)
     (tmp_path / "alone.pgm").touch()
     with pytest.raises(NoHall, match="not beside it"):
         read_hall(tmp_path / "alone.pgm", 0.5)
@@ -281,4 +306,7 @@ def test_a_lamp_in_a_corner_tells_only_those_within_reach() -> None:
     text = report(
         small, plan_of(small, FITTING, wall_information(small), Goals(), np.array(((0.5, 0.5),))), Goals(), FITTING
     )
-    assert "light alone: median unknown" in text
+    assert "light alone: median over 1 m, over 1 m at 100.0 % of places" in text
+    some = np.array((0.05, 0.06, math.inf, 0.07, 0.08, 0.09, 0.04, 0.05, 0.06, math.inf))
+    assert deviations(some) == "median 7.0 cm, over 1 m at 20.0 % of places"
+    assert deviations(some[:2]) == "median 6.0 cm, 95 % within 6.0 cm"
