@@ -81,8 +81,12 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _hint(asked: str, everything: Sequence[Entry]) -> str:
+    kind = asked.lower()
+    for entry in everything:
+        if entry.numbers and kind in (entry.kind, entry.kind.rpartition(" ")[2]):
+            return f"name a number, too, as in: {kind} {entry.numbers[0]}"
     names = {entry.name.lower() for entry in everything}
-    near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.6)
+    near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.7)
     if near:
         return f"did you mean {' or '.join(near)}?"
     kinds = "a key, a state, a fault, a reason, a command, a register, a bit or a port"

@@ -86,8 +86,17 @@ def test_names_in_any_case(capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", "sigma_jaw"]) == FAILED
     assert "sigma_yaw" in capsys.readouterr().err
-    assert main(["explain", "99999"]) == FAILED
-    assert "ask for" in capsys.readouterr().err
+    for strange in ("99999", "nonsense"):
+        assert main(["explain", strange]) == FAILED
+        assert "ask for" in capsys.readouterr().err
+
+
+def test_a_kind_alone_wants_its_number(capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in ("register", "Input register"):
+        assert main(["explain", kind]) == FAILED
+        example = capsys.readouterr().err.rpartition("as in: ")[2]
+        assert example.startswith(f"{kind.lower()} ")
+        assert _told(capsys, *example.split())
 
 
 def test_what_the_documents_show_below_is_named_by_what_to_ask(capsys: pytest.CaptureFixture[str]) -> None:
