@@ -38,7 +38,7 @@ MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 
 
 class WouldLose(Exception):
-    """What is asked for would write over what is read, or over itself."""
+    """What is asked for would write over what is read, or over itself, or could not be written when it is made."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -118,7 +118,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> None:
-    """Before anything is replayed: a target that is read from, or one that is named twice.
+    """Before anything is replayed: a target that is read from, that is named twice, or whose folder is not there.
 
     Raises:
         WouldLose: naming the option.
@@ -130,6 +130,8 @@ def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> Non
             continue
         if target.resolve() in taken:
             raise WouldLose(f"--{option} {target}: is {taken[target.resolve()]}; name another one")
+        if not target.parent.is_dir():
+            raise WouldLose(f"--{option} {target}: there is no folder {target.parent}; make it, or name another file")
         taken[target.resolve()] = f"what --{option} writes, too"
 
 

@@ -22,6 +22,10 @@ LONGEST: Final = 256 << 20
 """Bytes of a record; what is longer is damage."""
 
 
+CUT: Final = "its writer still writes or was killed, or the disk was full"
+"""What leaves a file without an end."""
+
+
 class NotMcap(Exception):
     """This is no MCAP file, or nothing of it can be read; the text says what, and what to do."""
 
@@ -103,7 +107,7 @@ def _whole(data: IO[bytes], found: Recovered) -> Iterator[McapRecord]:
         except StopIteration:
             return
         except EndOfFile:
-            found.torn = "" if ended else f"it is cut at byte {data.tell()}, its writer was killed or the disk was full"
+            found.torn = "" if ended else f"it is cut at byte {data.tell()}, {CUT}"
             return
         except (McapError, ZstdError, struct.error, ValueError, RuntimeError) as error:
             found.torn = f"it is damaged before byte {data.tell()} ({error})"

@@ -223,7 +223,9 @@ def test_an_export_says_how_long_it_goes_on(done: int, seconds: float, said: str
     assert export.progress(done, 100, seconds) == said
 
 
-def test_of_a_killed_writer_all_but_the_last_half_second_is_there(tmp_path: Path) -> None:
+def test_of_a_killed_writer_all_but_the_last_half_second_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     torn, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
     child = (
         "import os, time\nfrom pathlib import Path\nfrom taps.mcapfile import McapFile\nfrom taps.ros import Out\n"
@@ -238,6 +240,7 @@ def test_of_a_killed_writer_all_but_the_last_half_second_is_there(tmp_path: Path
     with torn.open("rb") as file, pytest.raises((McapError, ValueError)):
         make_reader(file).get_summary()
     assert cli.main(["export", str(torn), "--mcap", str(whole)]) == cli.OK
+    assert "its writer still writes or was killed" in capsys.readouterr().err
     (told,) = raw_messages(whole)
     assert 400 - 20 <= len(told) <= 400, "half a second at 40 Hz are 20"
 
@@ -315,6 +318,8 @@ def test_an_export_never_writes_over_what_it_reads_nor_over_itself(
     assert "writes, too; name another one" in capsys.readouterr().err
     assert segment.read_bytes() == before
     assert not (tmp_path / "t").exists()
+    assert cli.main(["export", str(segment), option, str(tmp_path / "none" / "t")]) == cli.USAGE
+    assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
 
 
 @pytest.mark.system
