@@ -32,7 +32,7 @@ from typing import Any, Final
 from daemon.publish.client import NoAnswer, Reader, Reading
 from daemon.publish.snapshot import State
 from tools.demo_acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
-from tools.demo_score import READY, Score, Track, pose_of, summary, verdict
+from tools.demo_score import READY, Score, Track, cause, pose_of, summary, verdict
 
 ROOT: Final = Path(__file__).parents[1]
 OUT: Final = Path("out/demo")
@@ -341,7 +341,7 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
     (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
     print(f"figures: {out / 'summary.json'}")
     if wrong:
-        print(f"FAILED: {wrong} (logs: {out})", file=sys.stderr)
+        print(f"FAILED: {wrong}{cause(figures)} (logs: {out})", file=sys.stderr)
     return 1 if wrong else 0
 
 

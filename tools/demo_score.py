@@ -18,6 +18,8 @@ from tools.demo_acts import Act
 
 ABSURD_M: Final = 0.5
 """Median position error beyond which the demo has failed."""
+SLOW_SHARE: Final = 0.1
+"""Of the readings, from which on a slow computer is named beside what went wrong."""
 GOOD: Final = (State.MAPPING, State.TRACKING)
 READY: Final = (*GOOD, State.DEGRADED, State.RELOCATING)
 """States in which the daemon follows a sensor."""
@@ -62,6 +64,7 @@ class Score:
     tracking_m: float = 0.0  # the largest error while the state was TRACKING
     states: dict[str, int] = field(default_factory=dict)
     reads: int = 0
+    slow: int = 0  # readings that say that the computer is too slow
     unanswered: int = 0
     cycle_s: list[float] = field(default_factory=list)
     trip_s: list[float] = field(default_factory=list)
@@ -77,6 +80,7 @@ class Score:
         self.last = reading
         state = State(int(reading["state"] or 0)).name
         self.states[state] = self.states.get(state, 0) + 1
+        self.slow += reading.get("reason") == Reason.OVERLOADED
         if reading["cycle"] is not None:
             self.cycle_s.append(float(reading["cycle"]))
         pose = pose_of(reading)
@@ -133,6 +137,7 @@ def summary(score: Score) -> dict[str, Any]:
         "error_while_tracking_m": score.tracking_m if known else None,
         "error_deg": {"median": statistics.median(angles), "max": max(angles), "last": angles[-1]} if known else None,
         "states": score.states,
+        "too_slow": score.slow / max(score.reads, 1),
         "acts": [act.figures for act in score.acts],
         "scan_rate_hz": score.last.get("scan_rate"),
         "scans_missed": score.last.get("missed"),
@@ -144,12 +149,20 @@ def summary(score: Score) -> dict[str, Any]:
     }
 
 
+def cause(figures: dict[str, Any]) -> str:
+    """What a person can do about a run that went wrong, as a half sentence; empty where nothing is known of it."""
+    share = figures["too_slow"]
+    return (
+        f"; the computer was too slow for {100.0 * share:.0f} % of it: end other programs" if share > SLOW_SHARE else ""
+    )
+
+
 def verdict(figures: dict[str, Any]) -> str:
     """What is wrong with the run; empty when nothing is."""
     if not any(figures["states"].get(state.name) for state in GOOD):
         return f"the pose was never MAPPING or TRACKING, but: {figures['states'] or 'nothing was read'}"
     if figures["error_m"] is None:
-        return "no pose could be compared with the truth"
+        return f"no pose could be compared with the truth, the states were {figures['states']}"
     if figures["error_m"]["median"] > ABSURD_M:
         return f"the median position error is {figures['error_m']['median']:.2f} m"
     return ""

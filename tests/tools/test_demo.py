@@ -19,10 +19,11 @@ from typing import Any
 import pytest
 
 from daemon.publish.snapshot import State
+from daemon.reasons import Reason
 from tests.rotation import share
 from tools.demo import free_port, line, links, write_config
 from tools.demo_acts import ROBOT, Act, OrderRefused, Stage, complaint, programme
-from tools.demo_score import Score, Track, in_map, summary, verdict
+from tools.demo_score import Score, Track, cause, in_map, summary, verdict
 from tools.sim.robot import Body
 
 
@@ -90,6 +91,21 @@ def test_verdict(state: State, off: float, complaint: str) -> None:
     for _ in range(4):
         score.take(reading(state, (off, 0.0, 0.0)), (0.0, 0.0, 0.0))
     assert verdict(summary(score)) == complaint or (complaint and complaint in verdict(summary(score)))
+
+
+def test_a_computer_that_is_too_slow_is_named_beside_what_went_wrong() -> None:
+    score = Score(surveyed=True)
+    for k in range(10):
+        score.take(
+            {**reading(State.DEGRADED), "reason": int(Reason.OVERLOADED if k < 2 else Reason.LIDAR_SILENT)}, None
+        )
+    score.take(reading(State.MAPPING), None)
+    figures = summary(score)
+    assert (
+        verdict(figures) == "no pose could be compared with the truth, the states were {'DEGRADED': 10, 'MAPPING': 1}"
+    )
+    assert cause(figures) == "; the computer was too slow for 18 % of it: end other programs"
+    assert cause(summary(Score())) == ""
 
 
 def test_verdict_on_nothing() -> None:
