@@ -92,7 +92,7 @@ export class Panel {
     const bound = trust.horizontal_m == null ? "none" : `${metres(trust.horizontal_m)}${rests ? ` (${rests})` : ""}`;
     put("bound", trust.alert ? `${bound}, ALERT above ${metres(trust.limit_m)}` : bound);
     $("bound").className = trust.alert ? "alert" : "";
-    put("speed", known(told.velocity, (v) => `${Math.hypot(v[0], v[1]).toFixed(2)} m/s, ${degrees(v[2]).toFixed(0)}°/s`));
+    put("speed", known(told.velocity, (v) => `${Math.hypot(v[0], v[1]).toFixed(2)} m/s, ${Math.round(degrees(v[2])) || 0}°/s`));
     put("map-id", `${told.map_id ? told.map_id.toString(16).padStart(8, "0") : "–"}, ${told.jumps} jump${told.jumps === 1 ? "" : "s"}`);
   }
 

@@ -20,6 +20,16 @@ pytestmark = [
 POSE = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose"
 PHONE = (390, 844)
 NARROWEST, TABLET = 320, 768
+SLOW = """import("./panel.js").then(({Panel}) => {
+    const pose = {pose: [0, 0, 0], covariance: null, known: [true, true, true], state: 3, map_id: 1, jumps: 0};
+    const panel = new Panel({pose: {...pose, velocity: [0, 0, -0.001]}});
+    panel.pose();
+    panel.bars([["cycle", [105750, 151200, 200000], "total"]], 50000);
+    const figures = document.querySelector(".bars .row span:last-child");
+    return [Math.round(figures.offsetHeight / parseFloat(getComputedStyle(figures).lineHeight)),
+            document.getElementById("speed").textContent];
+})"""
+"""How many lines the figures of a cycle take that is slow, and how fast a robot is said to be that hardly turns."""
 HEAD = """(() => {
   scrollTo(0, 0);
   document.getElementById("state-name").textContent = "RELOCATING";  // the longest
@@ -151,6 +161,9 @@ def test_a_phone(browser: str, address: str) -> None:
         assert small == []  # a finger finds them
         edge = await page.js("document.getElementById('theme').getBoundingClientRect().right")
         assert edge <= PHONE[0]
+        lines, speed = await page.js(SLOW)
+        assert lines == 1  # of a slow cycle's figures
+        assert speed == "0.00 m/s, 0°/s"
         await page.click("[data-order=save_map]")  # not behind the map, which stays where it is
         await page.until("document.getElementById('told').textContent.includes('map')")
         for width in (PHONE[0], NARROWEST, TABLET):
