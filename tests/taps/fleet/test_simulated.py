@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -33,6 +34,12 @@ def script(address: str) -> str:
     for verb in ("share", "fetch", "join"):
         block = block.replace(f"fleet {verb}", f"fleet {verb} --router {address}")
     return block.replace("agv 1 fleet   ", f"agv 1 fleet --router {address}   ")
+
+
+def ending() -> str:
+    """How the page ends them."""
+    page = (ROOT / "docs" / "fleet.md").read_text()
+    return next(line for line in page.splitlines() if line.startswith("pkill "))
 
 
 def command(folder: Path, name: str, words: str) -> None:
@@ -70,8 +77,11 @@ def test_two_robots_on_one_map(tmp_path: Path) -> None:
             for name, told in robots().items():
                 if told.get("state") and told["state"]["state_name"] in KNOWS:
                     known[name] = told["pose"]["agvPosition"]["mapId"]
+        subprocess.run(["bash", "-c", ending()], cwd=tmp_path, check=True)
+        walk.wait(60.0)  # for each of them; the last look at the fleet may still be to come, and finds no router
     finally:
-        os.killpg(walk.pid, signal.SIGTERM)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(walk.pid, signal.SIGTERM)
         walk.wait(20.0)
     assert set(known) == {"agv1", "agv2"}, log.read_text()
     assert known["agv1"] == known["agv2"], log.read_text()
