@@ -84,7 +84,7 @@ def _fleet(parser: argparse.ArgumentParser) -> None:
     cli.config_arguments(share)
     share.set_defaults(body=needing("zenoh", "taps.fleet.share", "main"))
     fetch = verbs.add_parser("fetch", help="take what is offered, check it, put it to its place")
-    fetch.add_argument("what", nargs="*", choices=("survey", "map", []), metavar="survey|map", help="default: both")
+    fetch.add_argument("what", nargs="*", type=_shared, metavar="survey|map", help="default: both")
     fetch.add_argument("--survey", type=Path, metavar="FILE", help="where the survey goes; default: `lights.survey`")
     fetch.add_argument("--switch", action="store_true", help="have the running daemon go on in the map (SWITCH_MAP)")
     fetch.add_argument("--follow", action="store_true", help="take newer ones, too, until stopped")
@@ -106,6 +106,12 @@ def _meeting(parser: argparse.ArgumentParser) -> None:
         "--router", default="127.0.0.1:7447", metavar="HOST:PORT", help="Zenoh router; default: 127.0.0.1:7447"
     )
     parser.add_argument("--zenoh", type=Path, metavar="FILE", help="Zenoh's own configuration: certificates, rights")
+
+
+def _shared(text: str) -> str:
+    if text not in ("survey", "map"):  # argparse's own `choices` have no way to say that none is allowed, too
+        raise argparse.ArgumentTypeError(f"{text}: name survey, map, or none for both")
+    return text
 
 
 def _domain(text: str) -> int:

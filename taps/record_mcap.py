@@ -28,6 +28,8 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.out.exists() and not args.force:
         return cli.fail(f"{args.out} is there already; name another file, or replace it with --force", cli.USAGE)
+    if not args.out.parent.is_dir():
+        return cli.fail(f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", cli.USAGE)
     stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
     file = None
     try:

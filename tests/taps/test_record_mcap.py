@@ -120,6 +120,13 @@ def test_without_room_no_file_is_begun(tmp_path: Path, capsys: pytest.CaptureFix
     assert out.read_bytes() == b"precious"
 
 
+def test_a_folder_that_is_not_there_is_named_before_any_daemon_is_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert record(tmp_path / "s", tmp_path / "none" / "a.mcap", "--seconds", "2") == cli.USAGE
+    assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan"])
 def test_a_time_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: str) -> None:
     """It had been taken for no time at all, and recorded for ever."""

@@ -421,6 +421,14 @@ def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixtur
     assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
 
 
+def test_what_is_not_shared_cannot_be_fetched(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fleet", "fetch", "maps"])
+    assert capsys.readouterr().err.endswith("maps: name survey, map, or none for both\n")
+    for words in ([], ["map"], ["survey", "map"]):
+        assert cli.parser().parse_args(["fleet", "fetch", *words]).what == words
+
+
 @pytest.mark.parametrize(
     ("content", "said"), [(None, "cannot be read: No such file"), ("rubbish", "no certificate or")]
 )
