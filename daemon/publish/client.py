@@ -199,15 +199,17 @@ def _once(reader: Reader, as_json: bool) -> int:
 
 def _watch(reader: Reader, as_json: bool) -> int:
     before: Value = None
-    who = None
+    who, told = None, ""
     while True:
         try:
             reading = reader.read()
             who = reader.whose() if before is None or who is None else who
         except NoAnswer as error:
-            sys.stderr.write(f"lumiloop: {error}\n")
-            before = None
+            if str(error) != told:
+                sys.stderr.write(f"lumiloop: {error}; waiting\n")
+            before, told = None, str(error)
         else:
+            told = ""
             on_screen = sys.stdout.isatty() and not as_json
             _show(reading, as_json, reading["seq"] == before, who, on_screen)
             before = reading["seq"]

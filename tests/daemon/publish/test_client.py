@@ -336,7 +336,26 @@ def test_watching_shows_when_the_daemon_is_away(
     monkeypatch.setattr("daemon.publish.client.time.sleep", nap)
     with pytest.raises(KeyboardInterrupt):
         status(f"127.0.0.1:{port}", watch=True)
-    assert capsys.readouterr().err.count("nothing serves Modbus there") == 3
+    assert capsys.readouterr().err.count("nothing serves Modbus there") == 1  # of three looks
+
+
+def test_watching_says_anew_what_is_new(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    away, refused = client.NoAnswer("away"), client.NoAnswer("refused")
+    looks = iter([away, away, refused, {"seq": 1}, refused])
+
+    def read(_: client.Reader) -> Any:
+        look = next(looks, KeyboardInterrupt())
+        if isinstance(look, BaseException):
+            raise look
+        return look
+
+    monkeypatch.setattr(client.Reader, "read", read)
+    monkeypatch.setattr("daemon.publish.client.time.sleep", lambda _: None)
+    monkeypatch.setattr("daemon.publish.client._show", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        status("127.0.0.1:1", watch=True)
+    said = [line.removeprefix("lumiloop: ") for line in capsys.readouterr().err.splitlines()]
+    assert said == ["away; waiting", "refused; waiting", "refused; waiting"]
 
 
 def test_on_a_small_terminal_watching_keeps_the_first_lines(
