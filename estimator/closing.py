@@ -141,6 +141,9 @@ def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found)
     """Accept a loop, or let it wait for others that agree where it would move the pose far."""
     if found.key not in atlas.submaps or atlas.submaps.get(frame.submap.key) is not frame.submap:
         return  # forgotten meanwhile, and its key may have been given to another
+    if not found.alone:  # places repeat here: what has agreed so far may have been the other one all along
+        atlas.waiting = []
+        return
     one = Waiting(found, frame, se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe)))
     if not within(found.moved, told, 1.0) and found.reason is not LoopReason.LIT:  # there light is the second witness
         friends = supporters(atlas, told, one)
@@ -152,12 +155,9 @@ def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found)
         for other in friends:
             join(atlas, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
         found = replace(found, reason=LoopReason.SUPPORTED)
-    else:
-        atlas.waiting = [  # the others are refuted, or were left long ago
-            other
-            for other in atlas.waiting
-            if comparable(atlas, one, other) and within(off(atlas, one, other), told, 1.0)
-        ]
+    atlas.waiting = [  # the others are refuted, or were left long ago
+        other for other in atlas.waiting if comparable(atlas, one, other) and within(off(atlas, one, other), told, 1.0)
+    ]
     join(atlas, frame, found)
 
 

@@ -131,7 +131,8 @@ class Found:
         T_submap_keyframe: where; P: covariance (3x3, axes of the submap). share, against, residual_m: how well.
         moved: (x, y, yaw) from where it was expected, in the keyframe's axes. reason: which conditions it passed.
         known: whether no axis is open. off: squared Mahalanobis distance from the expected place; light: from what
-            light says, None where it says nothing. shared: as of `Told`.
+            light says, None where it says nothing. shared: as of `Told`. alone: whether no other place passed too;
+            where one did it is no loop, but says that the surroundings repeat.
     """
 
     key: int
@@ -146,6 +147,7 @@ class Found:
     off: float = 0.0
     light: float | None = None
     shared: float = 1.0
+    alone: bool = True
 
 
 def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
@@ -155,10 +157,10 @@ def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSetti
 
 
 def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Found | None:
-    """Look for a keyframe in one submap."""
-    found = the_one([one for one in judged(frame, candidate, settings) if passed(one, settings)], settings)
-    if found is None:
-        return None
+    """Look for a keyframe in one submap; what is found is a loop only if it is ``alone``."""
+    found = foremost([one for one in judged(frame, candidate, settings) if passed(one, settings)], settings)
+    if found is None or not found.alone:
+        return found
     if found.light is not None and Condition.LIGHT in settings.conditions:
         return replace(found, reason=LoopReason.LIT)
     return replace(found, reason=LoopReason.SEARCHED) if unsure(candidate.P, settings) else found
@@ -186,16 +188,16 @@ def unsure(P: Array, settings: LoopSettings) -> bool:
     return bool(np.hypot(*deviation[:2]) > settings.sure_m or deviation[2] > settings.sure_rad)
 
 
-def the_one(fit: list[Found], settings: LoopSettings) -> Found | None:
-    """The best of several that passed, None where two of them are different places: which one cannot be told."""
+def foremost(fit: list[Found], settings: LoopSettings) -> Found | None:
+    """The best of several that passed; not ``alone`` where another is a different place: which one cannot be told."""
     if not fit:
         return None
-    best = max(fit, key=lambda found: found.share)
+    found = max(fit, key=lambda one: one.share)
     for other in fit:
-        x, y, yaw = se2.between(best.T_submap_keyframe, other.T_submap_keyframe).tolist()
+        x, y, yaw = se2.between(found.T_submap_keyframe, other.T_submap_keyframe).tolist()
         if np.hypot(x, y) > settings.supported_m or abs(yaw) > settings.supported_rad:
-            return None
-    return best
+            return replace(found, alone=False)
+    return found
 
 
 def judgement(view: View, local: LocalMap, result: MatchResult, candidate: Candidate, settings: LoopSettings) -> Found:

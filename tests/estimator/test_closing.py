@@ -117,6 +117,22 @@ def test_whatever_is_found_elsewhere_refutes_the_loops_that_wait() -> None:
     assert corridor([2.0] * 4 + [2.2] + [2.0] * 4).closures == 8  # neither agrees nor refutes
 
 
+def test_what_is_accepted_by_support_refutes_the_others_too() -> None:
+    """Else those go on to wait, and one more that is one door off finds them in agreement."""
+    accepted = corridor([6.0] * 10 + [2.0] * 9)
+    assert (accepted.closures, len(accepted.waiting)) == (9, 0)
+    assert corridor([6.0] * 24 + [2.0] * 9 + [6.0]).closures == 9
+
+
+def test_a_keyframe_that_fits_two_places_takes_away_what_has_agreed() -> None:
+    """Where doors repeat, both places are seen once the robot has come to where its map begins."""
+    atlas = corridor([2.0] * 8)
+    assert len(atlas.waiting) == 8
+    one = atlas.waiting[-1]
+    found_again(atlas, TOLD, one.frame, replace(one.found, alone=False))
+    assert (atlas.closures, len(atlas.waiting)) == (0, 0)
+
+
 def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
     state, truth = driven(laps=1.02)
     rng = np.random.default_rng(9)
@@ -256,7 +272,9 @@ def test_two_places_that_fit_close_nothing() -> None:
     known = look_in(frame, replace(candidate, P=np.diag((0.3**2, 0.3**2, 0.3**2))), TOLD)
     assert known is not None
     np.testing.assert_allclose(known.T_submap_keyframe, np.zeros(3), atol=0.02)
-    assert look_in(frame, replace(candidate, P=np.diag((1.5**2, 1.5**2, 1.5**2))), TOLD) is None
+    unsure = look_in(frame, replace(candidate, P=np.diag((1.5**2, 1.5**2, 1.5**2))), TOLD)
+    assert unsure is not None
+    assert not unsure.alone
 
 
 def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:

@@ -88,7 +88,9 @@ def test_light_tells_a_room_from_its_mirror_image() -> None:
     candidate, T = frame_at(scene, np.array((1.0, 0.5, 0.2)), wide=True)
     frame = keep(9, T, T, scan_in(scene, T, bearings(361, 359.0), np.random.default_rng(5)), 0.0)
     lost = replace(candidate, P=np.diag((1.5**2, 1.5**2, 1.5**2)))
-    assert look_in(frame, lost, TOLD) is None
+    either = look_in(frame, lost, TOLD)
+    assert either is not None
+    assert not either.alone
     told = Told(np.array((0.1, -0.05, 0.05)), np.diag((0.1**2, 0.1**2, 0.05**2)), 1.0)
     found = look_in(frame, replace(lost, told=told), TOLD)
     assert found is not None

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.loop import Condition, Found, LoopSettings, passed, the_one
+from estimator.loop import Condition, Found, LoopSettings, foremost, passed
 from tools.experiments.fig6_trial import Detection, Drive
 from tools.experiments.fig6_truth import RIGHT
 
@@ -82,8 +82,8 @@ def accepted(drive: Drive, asked: Rule) -> list[Detection]:
     for group in groups.values():
         pairs = [(as_found(one), one) for one in group]
         pairs = [(found, one) for found, one in pairs if passed(found, asked.settings)]
-        best = the_one([found for found, _ in pairs], asked.settings)
-        kept += [one for found, one in pairs if found is best]
+        chosen = foremost([found for found, _ in pairs], asked.settings)
+        kept += [one for found, one in pairs if found is chosen]
     return kept
 
 
