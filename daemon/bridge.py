@@ -58,7 +58,7 @@ class _Sweep:
     """What is the same for every scan of one geometry."""
 
     bearing_rad: Array
-    masked: npt.NDArray[np.bool_]
+    unmasked: npt.NDArray[np.bool_]
     duration_s: float
     facts: RangeFacts
 
@@ -77,12 +77,12 @@ class ScanBridge:
         """The same scan in SI units: mount, inversion, mask and the meaning of codes applied."""
         sweep = self._sweep(raw)
         unit = raw.geometry.range_unit_m
-        hit = (raw.code == VALID) & ~sweep.masked
-        range_m = raw.ranges.astype(np.float64) * unit
+        range_m: Array = raw.ranges * np.float64(unit)
+        hit = (raw.code == VALID) & sweep.unmasked
         hit &= range_m >= self._config.mask.near
-        beam = np.where(hit, np.uint8(Beam.HIT), np.uint8(Beam.NONE))
+        beam = hit.view(np.uint8)  # HIT or NONE
         if sweep.facts.free_m > 0.0:
-            free = (raw.code > raw.geometry.dmax) & ~sweep.masked
+            free = (raw.code > raw.geometry.dmax) & sweep.unmasked
             beam[free] = Beam.FREE
             range_m[free] = sweep.facts.free_m
         return Scan(
@@ -105,13 +105,13 @@ class ScanBridge:
 
     def _make_sweep(self, geometry: LidarGeometry, first_step: int, stride: int, count: int) -> _Sweep:
         bearing = geometry.bearings(first_step, stride, count)
-        masked = np.zeros(count, dtype=bool)
+        unmasked = np.ones(count, dtype=bool)
         for begin, end in self._config.mask.sectors:
-            masked |= in_sector(np.degrees(bearing), begin, end)
+            unmasked &= ~in_sector(np.degrees(bearing), begin, end)
         if self._config.mount.inverted:
             bearing = -bearing  # turned over about its own front axis
         duration = geometry.beam_dt_s * stride * max(0, count - 1)
-        return _Sweep(bearing, masked, duration, range_facts(geometry.model))
+        return _Sweep(bearing, unmasked, duration, range_facts(geometry.model))
 
 
 def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bool_]:
