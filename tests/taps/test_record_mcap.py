@@ -54,11 +54,11 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
     assert record(tmp_path / "s", tmp_path / "a.mcap") == cli.USAGE
     assert (tmp_path / "a.mcap").read_bytes() == b"precious"
     assert record(tmp_path / "s", tmp_path / "b.mcap") == cli.FAILED
-    assert record(tmp_path / "s", tmp_path / "none" / "b.mcap") == cli.FAILED
+    assert record(tmp_path / "s", tmp_path / "none" / "b.mcap") == cli.USAGE
     said = capsys.readouterr().err
     assert "replace it with --force" in said
     assert "is the daemon running?" in said
-    assert "No such file" in said
+    assert "there is no folder" in said
 
 
 def test_nothing_told_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
