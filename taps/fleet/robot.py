@@ -37,8 +37,9 @@ WANTED: Final = ("pose", "loop", "faults", "map")
 STATE_S: Final = 5.0
 """The state is told at a change, and so often."""
 MAP_S: Final = 10.0
-NAME_S: Final = 10.0
 """The map is told at most so often, and only when it has changed."""
+NAME_S: Final = 10.0
+"""How often a map's name is looked for that has none yet."""
 OLD_S: Final = 3.0
 """A daemon that has told no pose for so long stands, and does not know where the robot is."""
 

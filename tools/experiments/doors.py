@@ -1,6 +1,6 @@
 """Long corridors of equal doors by the laser alone: how many loops are wrong, and how far off poses are that are near.
 
-Drives of 0.7 km through `tools.sim.doors`, by wheels that are off by 1 to 2 %. Scored are pairs of keyframes as they
+Drives of 0.95 km through `tools.sim.doors`, by wheels that are off by 1 to 2 %. Scored are pairs of keyframes as they
 lie at the end, at most 2 m apart in truth and more than 15 m of way apart (what the relations of recorded logs are
 about), and loops that became constraints.
 """
