@@ -35,6 +35,12 @@ def stream_path(name: str) -> Path:
     return service if _there(service) and not _there(own) else own
 
 
+def streams_served(name: str) -> list[Path]:
+    """The local streams that daemons of that ``name`` serve on this computer now: ours, the service's."""
+    paths = [folder / f"{name}.stream" for folder in dict.fromkeys((runtime_folder(), SERVICE))]
+    return [path for path in paths if _served(path)]
+
+
 def daemons_in(folder: Path) -> list[str]:
     """Names of the daemons whose local streams are served in a folder."""
     try:

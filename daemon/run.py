@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from daemon import configfile
 from daemon.cli import FAILED, OK, USAGE
 from daemon.config import Config
-from daemon.folders import maps_folder, runtime_folder
+from daemon.folders import maps_folder, runtime_folder, streams_served
 from daemon.lights import SurveyError, load_lights
 from daemon.logs import start_log
 from daemon.main import EXTEND_US, Daemon
@@ -40,12 +40,19 @@ ANEW_S: Final = 10.0
 a crash. What was missing (a map, room for kernels or a recording) has not come by then, and each start takes seconds of
 processor time and lines of the log."""
 
+SECOND: Final = (
+    "what it has open, sensors, ports, maps, this one cannot have; stop it (systemctl stop lumiloop), or give this one "
+    "a `name`, devices and ports of its own"
+)
+
 
 def main(args: argparse.Namespace) -> int:
     """The command ``run``. ``args``: the configuration (``settings``), where to ``record``, how much (``last``)."""
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, configfile.dump(settings).rstrip())
+    for other in streams_served(settings.name):  # need not be a mistake, but each device has one owner
+        log.warning("a daemon named %s runs on this computer already (%s): %s", settings.name, other, SECOND)
     recorder = None
     give_back()
     try:

@@ -2,14 +2,20 @@
 
 Before a read its buffer is filled with 0xFF, what a released bus reads as: a transfer that ends early without an error
 then shows, instead of the previous block's bytes. Messages are built once and used again as long as they are the same.
+
+An address belongs to who spoke to it first, until he closes the bus (an advisory lock, as serial ports have): two
+programs that read blocks of one converter would take each other's time on the bus, and each would see blocks of a slow
+one. Programs that know nothing of it, i2cdetect for one, are not kept away.
 """
 
 from __future__ import annotations
 
 import ctypes
 import errno
+import fcntl
 import grp
 import os
+import struct
 import time
 from collections.abc import Generator
 from fcntl import ioctl
@@ -58,7 +64,7 @@ class LinuxBus:
         return self._about
 
     def transfer(self, messages: tuple[Message, ...]) -> Transferred:
-        """Carry out one transaction; raises `OSError`, EBUSY also where a kernel driver has taken the address."""
+        """Carry out one transaction; raises `OSError`, EBUSY also where a driver or another program has the address."""
         if self._link.fd is None:
             raise OSError(errno.ENODEV, "the bus is closed")
         if messages != self._built_for:
@@ -83,6 +89,7 @@ class LinuxBus:
         check(messages)
         for address in {message.address for message in messages} - self._claimed:
             ioctl(self._link.fd or 0, I2C_SLAVE, address)  # I2C_RDWR itself would not look for a driver's claim
+            _claim(self._link.fd or 0, address)
             self._claimed.add(address)
         self._built = [
             i2c_msg.write(message.address, message.data)
@@ -92,6 +99,15 @@ class LinuxBus:
         ]
         self._reads = [built for built, message in zip(self._built, messages, strict=True) if message.length]
         self._built_for = messages
+
+
+def _claim(fd: int, address: int) -> None:
+    """Lock the byte of the device node whose offset is the address; of the open file, so that closing it frees it."""
+    wanted = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)  # struct flock (fcntl(2)), l_pid 0
+    try:
+        fcntl.fcntl(fd, fcntl.F_OFD_SETLK, wanted)
+    except BlockingIOError:
+        raise OSError(errno.EBUSY, f"address {address:#04x} is in use by another program") from None
 
 
 def _fill(message: i2c_msg) -> None:

@@ -107,7 +107,7 @@ async def _look(bus: AsyncBus, address: int) -> Chip | None:
             raise
         if error.errno in NACKS or error.errno == errno.EIO:
             return None
-        taken = "taken by a kernel driver; unbind it to look"
+        taken = "in use by another program, or by a kernel driver; end or unbind it to look"
         return Chip(address, problem=taken if error.errno == errno.EBUSY else os.strerror(error.errno or 0))
 
 

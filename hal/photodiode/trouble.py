@@ -73,8 +73,8 @@ POLICIES: Final[dict[int, Policy]] = {
     ),
     errno.EBUSY: Policy(
         DeviceRefused,
-        "address {address} is taken by a kernel driver, or the bus is busy",
-        "remove the device-tree overlay or unbind that driver",
+        "address {address} is in use by another program, or by a kernel driver",
+        "end the other program (fuser -v /dev/i2c-N), or unbind the driver (device-tree overlay)",
     ),
     errno.EOPNOTSUPP: _TOO_MUCH,
     errno.EINVAL: _TOO_MUCH,

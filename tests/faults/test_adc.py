@@ -132,7 +132,7 @@ LASTING = [
         ("ENXIO", DeviceMissing, "no MCP3221"),
         ("EREMOTEIO", DeviceMissing, "no MCP3221"),
         ("EAGAIN", DeviceFault, "arbitration"),
-        ("EBUSY", DeviceRefused, "address 0x4d is taken by a kernel driver"),
+        ("EBUSY", DeviceRefused, "address 0x4d is in use by another program, or by a kernel driver"),
         ("EOPNOTSUPP", DeviceRefused, "does not do such reads"),
         ("EINVAL", DeviceRefused, "does not do such reads"),
         ("ENODEV", DeviceMissing, "adapter is gone"),

@@ -32,8 +32,6 @@ class Kernel:
         hang: transactions do not return until it is cleared.
     """
 
-    FD = 990
-
     def __init__(self, monkeypatch: pytest.MonkeyPatch, device: FakeAdc) -> None:
         self.device = device
         self.open_error = 0
@@ -45,6 +43,8 @@ class Kernel:
         self.paths: list[str] = []
         self.closed = 0
         self.fails: list[int] = []
+        self._node = os.memfd_create("i2c")  # each open is a file of its own, for locks
+        self._open: set[int] = set()
         fake_os = SimpleNamespace(open=self.open, close=self.close, O_RDWR=os.O_RDWR)
         monkeypatch.setattr("smbus2.smbus2.os", fake_os)
         monkeypatch.setattr("smbus2.smbus2.ioctl", self.ioctl)
@@ -54,14 +54,17 @@ class Kernel:
         self.paths.append(path)
         if self.open_error:
             raise OSError(self.open_error, os.strerror(self.open_error), path)
-        return self.FD
+        fd = os.open(f"/proc/self/fd/{self._node}", os.O_RDWR)
+        self._open.add(fd)
+        return fd
 
     def close(self, fd: int) -> None:
-        assert fd == self.FD
+        self._open.remove(fd)
+        os.close(fd)
         self.closed += 1
 
     def ioctl(self, fd: int, request: int, argument: Any) -> int:
-        assert fd == self.FD
+        assert fd in self._open
         if request == 0x0705:
             argument.value = self.funcs
         elif request == 0x0707:
@@ -71,6 +74,9 @@ class Kernel:
         else:
             self.settings[request] = argument
         return 0
+
+    def __del__(self) -> None:
+        os.close(self._node)
 
     def _transfer(self, raw: list[Any]) -> None:
         while self.hang:

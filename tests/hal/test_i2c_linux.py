@@ -11,7 +11,7 @@ import pytest
 
 import hal.i2c_linux
 from hal.errors import DeviceMissing, DeviceRefused
-from hal.i2c import read, write
+from hal.i2c import NACKS, read, write
 from hal.i2c_linux import open_linux
 from tests.hal.i2c_kernel import I2C_FUNC_SMBUS, kernel
 
@@ -107,6 +107,22 @@ def test_an_address_with_a_kernel_driver_is_busy(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(OSError, match="busy") as caught:
         open_linux("/dev/i2c-1").transfer((read(0x4D, 2),))
     assert caught.value.errno == errno.EBUSY
+
+
+def test_an_address_belongs_to_who_spoke_to_it_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    linux = kernel(monkeypatch)
+    first, second = open_linux("/dev/i2c-1"), open_linux("/dev/i2c-1")
+    for _ in range(2):  # its own lock is in nobody's way
+        first.transfer((read(0x4D, 2),))
+    with pytest.raises(OSError, match="address 0x4d is in use by another program") as caught:
+        second.transfer((read(0x4D, 2),))
+    assert caught.value.errno == errno.EBUSY
+    with pytest.raises(OSError) as caught:  # noqa: PT011 - nobody answers there: another address is not locked
+        second.transfer((read(0x4E, 2),))
+    assert caught.value.errno in NACKS
+    first.close()
+    second.transfer((read(0x4D, 2),))
+    assert linux.closed == 1
 
 
 def test_a_closed_bus(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,7 +98,28 @@ def test_a_kernel_driver_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None
         async with bench.running(driver):
             await asyncio.sleep(0.3)
             assert isinstance(error_of(driver), DeviceRefused)
-            assert "address 0x4d is taken by a kernel driver" in str(error_of(driver))
+            assert "address 0x4d is in use by another program, or by a kernel driver" in str(error_of(driver))
+
+    on_kernel(body, monkeypatch)
+
+
+def test_a_second_program_gets_the_converter_when_the_first_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes none of the first one's time on the bus, and needs nobody to begin when it is free."""
+    monkeypatch.setattr("hal.photodiode.driver._PAUSE_S", (0.05, 0.2))
+
+    async def body(bench: Bench, linux: Kernel) -> None:
+        first, second = bench.driver(), bench.driver()
+        async with bench.running(first):
+            await bench.more(3, 3.0 * SLACK, first)
+            async with bench.running(second):
+                await bench.more(10, 3.0 * SLACK, first)
+                assert isinstance(error_of(second), DeviceRefused)
+                assert "address 0x4d is in use by another program" in str(error_of(second))
+                assert second.status.blocks == 0
+                assert first.status.error is None
+        async with bench.running(second):
+            await bench.more(3, 3.0 * SLACK, second)
+            assert second.status.blocks >= 3
 
     on_kernel(body, monkeypatch)
 

@@ -111,7 +111,7 @@ def test_through_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     linux.claimed = {0x48}
     (finding,) = asyncio.run(probe_buses(open_bus, ["/dev/i2c-1"]))
     assert [str(chip) for chip in finding.chips] == [
-        "0x48: taken by a kernel driver; unbind it to look",
+        "0x48: in use by another program, or by a kernel driver; end or unbind it to look",
         "0x4d: MCP3221",
     ]
     assert linux.closed == 1
