@@ -178,6 +178,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tum", type=Path, metavar="FILE", help="trajectory: stamp x y z qx qy qz qw")
     parser.add_argument("--kitti", type=Path, metavar="FILE", help="trajectory: 12 numbers of a matrix a line")
     parser.add_argument("--online", action="store_true", help="trajectories as published, not as known at the end")
+    parser.add_argument("--force", action="store_true", help="replace an MCAP file that is there")
     cli.config_arguments(parser)
     parser.set_defaults(body=cli.estimating("taps.export", "main"))
 

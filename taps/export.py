@@ -118,7 +118,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> None:
-    """Before anything is replayed: a target that is read from, that is named twice, or whose folder is not there.
+    """Before anything is replayed: what is read from, is named twice, is there already, or has no folder.
 
     Raises:
         WouldLose: naming the option.
@@ -132,6 +132,8 @@ def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> Non
             raise WouldLose(f"--{option} {target}: is {taken[target.resolve()]}; name another one")
         if not target.parent.is_dir():
             raise WouldLose(f"--{option} {target}: there is no folder {target.parent}; make it, or name another file")
+        if option == "mcap" and target.exists() and not args.force:  # it may have been recorded live, once and for all
+            raise WouldLose(f"--mcap {target} is there already; name another file, or replace it with --force")
         taken[target.resolve()] = f"what --{option} writes, too"
 
 

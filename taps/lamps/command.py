@@ -33,6 +33,8 @@ def tell(args: argparse.Namespace, host: Host) -> int:
         return cli.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", cli.USAGE)
     maps = maps_folder(settings.map.folder) if settings.map.kept else None
     path: Path = args.history or (maps.parent / FILE if maps is not None else Path(FILE))
+    if args.history is not None and not path.parent.is_dir():
+        return cli.fail(f"--history {path}: there is no folder {path.parent}; make it, or name another file", cli.USAGE)
     try:
         kept = load(path)
         fresh = in_maps(maps) if maps is not None else []

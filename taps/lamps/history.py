@@ -68,7 +68,6 @@ def load(path: Path) -> list[Look]:
 def save(path: Path, looks: Iterable[Look]) -> None:
     """Write it whole or not at all; raises `OSError`."""
     lines = [f"{look.utc:.0f},{look.lamp},{look.ln_gain:.{DIGITS}f},{look.sigma:.{DIGITS}f}\n" for look in looks]
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, (HEAD + "".join(lines)).encode())
 
 

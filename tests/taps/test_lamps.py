@@ -220,3 +220,11 @@ def test_where_nothing_is_known_it_says_so(tmp_path: Path, capsys: pytest.Captur
     assert tell(args(tmp_path / "maps"), Computer()) == cli.FAILED
     assert "is no history of lamps" in capsys.readouterr().err
     assert replace(Verdict(1, Finding.GOOD), lamp=2).urgent is False
+
+
+def test_it_makes_no_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = tmp_path / "none" / "lamps.csv"
+    put_map(tmp_path / "maps", 1, NOW)
+    assert tell(args(tmp_path / "maps", history=where), Computer()) == cli.USAGE
+    assert f"--history {where}: there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
+    assert not where.parent.exists()

@@ -322,6 +322,20 @@ def test_an_export_never_writes_over_what_it_reads_nor_over_itself(
     assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
 
 
+def test_an_mcap_file_that_is_there_is_replaced_only_when_asked(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It may have been recorded live, and cannot be had again; a trajectory always can."""
+    there = tmp_path / "there.mcap"
+    there.write_bytes(b"a day of a robot")
+    command = ["export", str(exported / "drive.mcap"), "--mcap", str(there)]
+    assert cli.main(command) == cli.USAGE
+    assert "is there already; name another file, or replace it with --force" in capsys.readouterr().err
+    assert there.read_bytes() == b"a day of a robot"
+    assert cli.main([*command, "--force"]) == cli.OK
+    assert messages(there)
+
+
 @pytest.mark.system
 def test_a_dump_of_the_flight_recorder_opens_with_the_poses_that_were_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
