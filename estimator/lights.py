@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator import ekf, ekf_links, lights_motion, row, se2
+from estimator import ekf, ekf_iterate, ekf_links, lights_motion, row, se2
 from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
@@ -56,8 +56,6 @@ ANEW_M = 0.02
 """Way after which strengths say something new of the heading. Those of a robot that stands, or turns on the spot, say
 again what they have said: it sways, and errors of a percent would rule out the right heading within a second. Without
 wheels only what is faster than a crawl counts as way, and that is new."""
-ITERATE_M, ITERATE_RAD = 0.03, 0.03
-ITERATIONS = 4
 
 
 def new_lights(
@@ -268,26 +266,14 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
 
 
 def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array) -> float:
-    """One hypothesis takes the links in; iterated while the step is so large that the equations bend."""
+    """One hypothesis takes the links in; returns the ln of their likelihood under it."""
     kept, links = table(lights, track, seen)
     if not kept:
         return 0.0
     out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
     ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
     likelihood = judge(lights, track, kept, out)
-    x0, P0 = track.x.copy(), track.P.copy()
-    likelihood += ekf_links.absorb(track.x, track.P, track.n, x0, links, out)
-    around = x0
-    for _ in range(ITERATIONS):
-        step = track.x[:3] - around[:3]
-        if math.hypot(*step[:2].tolist()) < ITERATE_M and abs(se2.wrap(float(step[2]))) < ITERATE_RAD:
-            break
-        around, white = track.x.copy(), out[:, ekf_links.WHITE].copy()
-        ekf_links.linearise(around, P0, links, track.lamps, view, out)
-        out[:, ekf_links.WHITE] = white
-        track.x[:], track.P[:] = x0, P0
-        ekf_links.absorb(track.x, track.P, track.n, around, links, out)
-    return likelihood
+    return likelihood + ekf_iterate.take_in(track.x, track.P, track.n, links, track.lamps, view, out)
 
 
 def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:

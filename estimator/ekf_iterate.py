@@ -1,0 +1,113 @@
+"""Eq. 5-7 where the equations bend: the update is repeated around its own outcome, no farther than it betters the fit.
+
+What is minimised is the squared deviation from the prediction and from the links together (an iterated Kalman update is
+Gauss and Newton's way down that sum). Beside a row of lamps, or between two of them, strengths hardly change with the
+place across: a full step from there overshoots, and the next one from where it has come to more so. A step is therefore
+halved as long as that helps, and the state never ends where the sum is larger than it is at the prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from estimator import se2
+from estimator.ekf import COMMON, FIRST, OWN, YAW
+from estimator.ekf_links import OUT_COLUMNS, RESIDUAL, SLOT, WHITE, absorb, linearise
+from estimator.records import Array
+
+NEAR_M, NEAR_RAD = 0.03, 0.03
+"""A step of less needs no other."""
+STEPS: Final = 8
+SHORTEST: Final = 1.0 / 64.0
+"""Part of a step below which it is not worth going."""
+JITTER: Final = 1e-12
+"""Variance that is added to elements which are known for certain, so that a deviation of them has a price."""
+
+
+def take_in(x: Array, P: Array, n: int, links: Array, lamps: Array, view: Array, out: Array) -> float:
+    """Take links in, linearised anew where the outcome lies far from where they were.
+
+    Args:
+        x: state, changed in place.
+        P: its covariance, changed in place.
+        n: elements in use.
+        links: (L, LINK_COLUMNS).
+        lamps: (slots, 7), rows of `optics.pack_lamps`.
+        view: (VIEW_COLUMNS,), see `ekf_links.linearise`.
+        out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise that each link is given (infinite: left out).
+
+    Returns:
+        ln of the likelihood of these links at the prediction.
+    """
+    x0 = x.copy()
+    if not np.any(out[:, WHITE] < math.inf):
+        return 0.0
+    P0 = P.copy()
+    likelihood = absorb(x, P, n, x0, links, out)
+    if _near(x, x0):
+        return likelihood
+    price = _Price(x0, P0, links, out)
+    around, cost = x0, price.of(x0, out)
+    for _ in range(STEPS):
+        further = _further(price, around, x, cost, (links, lamps, view))
+        if further is None:
+            break
+        around, cost, out = further
+        x[:], P[:] = x0, P0
+        absorb(x, P, n, around, links, out)
+        if _near(x, around):
+            return likelihood
+    x[:] = around  # the last step led nowhere better: P is what the links tell there
+    return likelihood
+
+
+class _Price:
+    """Sum of squared deviations, each over its variance, of a state from the prediction and from the links in use.
+
+    States that differ from the prediction by ``P0 H'`` times anything are told by those elements that links depend on.
+    """
+
+    def __init__(self, x0: Array, P0: Array, links: Array, out: Array) -> None:
+        self.x0, self.P0 = x0, P0
+        self.used = out[:, WHITE] < math.inf
+        self.white = out[:, WHITE].copy()
+        own = FIRST + OWN * links[self.used, SLOT].astype(np.int64)[:, None] + np.arange(OWN)
+        self.at = np.concatenate((np.arange(3), np.arange(COMMON, FIRST), own.ravel()))
+        self.L = np.linalg.inv(P0[np.ix_(self.at, self.at)] + JITTER * np.eye(len(self.at)))
+
+    def of(self, x: Array, out: Array) -> float:
+        """``out``: what `linearise` says of the links at ``x``."""
+        off = x - self.x0
+        off[YAW] = se2.wrap(float(off[YAW]))
+        off, r = off[self.at], out[self.used, RESIDUAL]
+        return float(off @ self.L @ off + np.sum(r * r / self.white[self.used]))
+
+
+def _further(
+    price: _Price, around: Array, x: Array, cost: float, seen: tuple[Array, Array, Array]
+) -> tuple[Array, float, Array] | None:
+    """Where it is cheapest between ``around`` and ``x``, halving the way: there, its cost, the links; None: nowhere."""
+    links, lamps, view = seen
+    step = x - around
+    step[YAW] = se2.wrap(float(step[YAW]))
+    part, best = 1.0, None
+    while part >= SHORTEST:
+        there, out = around + part * step, np.zeros((len(links), OUT_COLUMNS))
+        there[YAW] = se2.wrap(float(there[YAW]))
+        linearise(there, price.P0, links, lamps, view, out)
+        out[:, WHITE] = price.white
+        less = price.of(there, out)
+        if less < cost:
+            best, cost = (there, less, out), less
+        elif best is not None:
+            break
+        part *= 0.5
+    return best
+
+
+def _near(x: Array, around: Array) -> bool:
+    step = x[:3] - around[:3]
+    return math.hypot(*step[:2].tolist()) < NEAR_M and abs(se2.wrap(float(step[2]))) < NEAR_RAD

@@ -1,0 +1,120 @@
+"""Links taken in where the equations bend: the fit never gets worse than the prediction's, and ends near its best."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from estimator import ekf, ekf_links, se2
+from estimator.ekf_iterate import take_in
+from estimator.records import Array
+from tests.estimator.test_ekf import N, lamp_table, links_of, view
+
+ROW = [5, 9]
+"""Two lamps of one row."""
+
+
+def beside_a_row(seed: int) -> tuple[Array, Array, Array]:
+    """Prediction, its covariance, links: near the line through two lamps, the place across it hardly known.
+
+    Walls make the lamps seem stronger or weaker by a tenth, three times as much as the filter takes them to.
+    """
+    rng = np.random.default_rng(seed)
+    lamps = lamp_table()[ROW, :2]
+    along = (lamps[1] - lamps[0]) / np.linalg.norm(lamps[1] - lamps[0])
+    across = np.array((-along[1], along[0]))
+    truth = np.zeros(ekf.SIZE)
+    truth[:2] = lamps[0] + rng.uniform(0.1, 0.9) * (lamps[1] - lamps[0]) + rng.normal(0, 0.3) * across
+    truth[ekf.YAW], truth[ekf.FLOOR] = rng.uniform(-3, 3), np.log(0.015)
+    P = np.zeros((ekf.SIZE, ekf.SIZE))
+    P[:2, :2] = 0.07**2 * np.outer(along, along) + 0.5**2 * np.outer(across, across)
+    P[2, 2] = 0.12**2
+    P[range(3, N), range(3, N)] = 0.02**2
+    P[range(ekf.FIRST + ekf.ERROR, N, ekf.OWN), range(ekf.FIRST + ekf.ERROR, N, ekf.OWN)] = 0.1
+    x = truth.copy()
+    x[:3] += np.linalg.cholesky(P[:3, :3]) @ rng.standard_normal(3)
+    links = links_of(truth, ROW, seed)
+    links[:, ekf_links.LN] += 0.1 * rng.standard_normal(len(ROW))
+    return x, P, links
+
+
+def seen_from(x: Array, P: Array, links: Array) -> Array:
+    out = np.zeros((len(links), ekf_links.OUT_COLUMNS))
+    ekf_links.linearise(x, P, links, lamp_table(), view(), out)
+    return out
+
+
+def deviations(x: Array, x0: Array, P: Array, links: Array) -> Array:
+    """Of a state from the prediction and from the links, each over its standard deviation."""
+    off = (x - x0)[:N]
+    off[ekf.YAW] = se2.wrap(float(off[ekf.YAW]))
+    out = seen_from(x, P, links)
+    apart = np.linalg.solve(np.linalg.cholesky(P[:N, :N]), off)
+    return np.concatenate((apart, out[:, ekf_links.RESIDUAL] / np.sqrt(out[:, ekf_links.WHITE])))
+
+
+def cost(*what: Array) -> float:
+    return float(np.sum(deviations(*what) ** 2))
+
+
+def undamped(x0: Array, P0: Array, links: Array) -> Array:
+    """Full steps, as often as the method may take them."""
+    x = x0.copy()
+    for _ in range(8):
+        around, P = x.copy(), P0.copy()
+        x = x0.copy()
+        ekf_links.absorb(x, P, N, around, links, seen_from(around, P0, links))
+    return x
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_outcome_fits_as_well_as_anything_near(seed: int) -> None:
+    x0, P0, links = beside_a_row(seed)
+    x, P = x0.copy(), P0.copy()
+    take_in(x, P, N, links, lamp_table(), view(), seen_from(x, P, links))
+    begun, ended = cost(x0, x0, P0, links), cost(x, x0, P0, links)
+    assert ended <= begun
+
+    def of_some(z: Array) -> Array:
+        y = x.copy()
+        y[:N] = z
+        return deviations(y, x0, P0, links)
+
+    best = 2.0 * float(least_squares(of_some, x[:N], x_scale=np.sqrt(np.diag(P0)[:N])).cost)
+    assert ended - best <= 0.1 * (begun - best) + 0.5
+    assert np.linalg.eigvalsh(P[:N, :N]).min() > 0.0
+    assert P[0, 0] + P[1, 1] <= P0[0, 0] + P0[1, 1]
+
+
+def test_full_steps_would_often_end_where_nothing_fits() -> None:
+    """Else the test above would test nothing."""
+    worse = 0
+    for seed in range(20):
+        x0, P0, links = beside_a_row(seed)
+        x, P = x0.copy(), P0.copy()
+        take_in(x, P, N, links, lamp_table(), view(), seen_from(x, P, links))
+        worse += cost(undamped(x0, P0, links), x0, P0, links) > 4.0 + cost(x, x0, P0, links)
+    assert worse >= 3
+
+
+def test_where_the_equations_are_straight_it_is_one_update() -> None:
+    x0, P0, links = beside_a_row(1)
+    P0[:N, :N] *= 1e-4
+    P0[range(ekf.FIRST + ekf.ERROR, N, ekf.OWN), range(ekf.FIRST + ekf.ERROR, N, ekf.OWN)] = 1.0
+    x, P = x0.copy(), P0.copy()
+    told = take_in(x, P, N, links, lamp_table(), view(), seen_from(x, P, links))
+    once, P_once = x0.copy(), P0.copy()
+    assert told == ekf_links.absorb(once, P_once, N, x0.copy(), links, seen_from(x0, P0, links))
+    np.testing.assert_array_equal(x, once)
+    np.testing.assert_array_equal(P, P_once)
+
+
+def test_links_that_are_all_left_out_change_nothing() -> None:
+    x0, P0, links = beside_a_row(2)
+    out = seen_from(x0, P0, links)
+    out[:, ekf_links.WHITE] = np.inf
+    x, P = x0.copy(), P0.copy()
+    assert take_in(x, P, N, links, lamp_table(), view(), out) == 0.0
+    np.testing.assert_array_equal(x, x0)
+    np.testing.assert_array_equal(P, P0)
