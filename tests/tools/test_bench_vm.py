@@ -415,6 +415,7 @@ def test_six_scenarios_where_there_is_an_image_of_these_sources(tmp_path: Path) 
 
 @pytest.mark.system
 @pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.timeout(3600)
 def test_the_package_in_an_emulated_computer(tmp_path: Path) -> None:
     if reason := places.missing():
