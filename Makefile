@@ -58,10 +58,10 @@ test-system: venv  ## real processes, real ttys, real time, fault and fuzz sampl
 	$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$(ORDERLY) and not realtime" $(ARGS) $(NONE)
 	$(BIN)/python -m pytest -q -m "$(ORDERLY) and realtime" $(ARGS) $(NONE)
 
-test-all: check  ## all of it, the long ones included
-	$(BIN)/python -m coverage run -m pytest -q $(ARGS)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -a -m pytest -q -m "not jit and not slow and not system" tests/estimator
-	$(BIN)/python -m tools.floors
+LONG = $(BIN)/python -m pytest -q --durations=15
+test-all: test test-system  ## all of it, the long ones included (root, about three quarters of an hour)
+	$(LONG) -n auto --dist load -m "slow and not realtime" $(ARGS) $(NONE)
+	$(LONG) -m "slow and realtime" $(ARGS) $(NONE)
 
 $(PEERS): $(STAMP) requirements/bench.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
