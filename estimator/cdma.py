@@ -11,6 +11,7 @@ Use::
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final
 
 import numpy as np
@@ -52,19 +53,21 @@ FULL_ROUND: Final = 8
 """Sweeps without a confirmed lamp until all sample clocks are tried."""
 
 
-def new_decoder(profile: Profile, clock_ppm: float | None = None) -> Decoder:
+def new_decoder(profile: Profile, clock_ppm: float | None = None, hung: Collection[int] = ()) -> Decoder:
     """A decoder that knows no lamps yet.
 
     Args:
         profile: air interface and front end.
         clock_ppm: stored error of the sample clock, good to 200 ppm; None: search the whole range of the profile.
+        hung: codes of the lamps that hang in the building, as far as is known: where nothing speaks for further lamps,
+            these are looked for more often than others. Empty: any may hang.
 
     Raises:
         ValueError: a stored clock outside the profile's range.
     """
     if clock_ppm is not None and not abs(clock_ppm) <= profile.clock_ppm + STORED_PPM:
         raise ValueError(f"clock_ppm = {clock_ppm} is outside +-{profile.clock_ppm:g}: delete the stored value")
-    return Decoder(profile, clock_ppm)
+    return Decoder(profile, clock_ppm, hung)
 
 
 def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
@@ -131,7 +134,7 @@ def _begin(decoder: Decoder) -> bool:
     clocks = _trial_clocks(decoder) if decoder.offered else []
     if decoder.offered is None:
         return False
-    decoder.search.start(decoder.offered, clocks)
+    decoder.search.start(decoder.offered, clocks, slow=decoder.watch.calm and len(clocks) == 1)
     decoder.offered = None
     decoder.barren *= len(clocks) == 1
     return True

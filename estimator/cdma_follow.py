@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -48,13 +49,13 @@ SPURIOUS: Final = 0.01
 class Decoder:
     """State of one photodiode's decoder; made by :func:`estimator.cdma.new_decoder`."""
 
-    def __init__(self, profile: Profile, clock_ppm: float | None) -> None:
+    def __init__(self, profile: Profile, clock_ppm: float | None, hung: Collection[int] = ()) -> None:
         self.profile = profile
         self.shape = Shape(profile)
         self.mains = Mains(profile.sample_rate, profile.mains_harmonics)
         self.clocks = Clocks(profile, clock_ppm)
         self.tracks = Tracks(profile)
-        self.search = Search(profile)
+        self.search = Search(profile, hung)
         self.search.warm(round(profile.epoch_s * profile.sample_rate), self.clocks.clock)
         self.watch = Watch(self.search.codes)
         self.offered: Job | None = None

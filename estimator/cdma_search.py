@@ -8,6 +8,7 @@ the rest wait for the next block, from which the strong ones will have been take
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
@@ -20,6 +21,7 @@ from estimator.cdma_kernels import align, columns, detect
 from estimator.cdma_pieces import without
 from estimator.cdma_profile import Profile
 from estimator.cdma_template import pulse_energy, pulse_table
+from estimator.cdma_watch import TURNS
 from estimator.codes import gold_codes
 
 Array = npt.NDArray[np.float64]
@@ -94,9 +96,13 @@ Outcome = tuple[Job, float, list[Found]]
 
 
 class Search:
-    """Works through one job at a time, `step` by `step`."""
+    """Works through one job at a time, `step` by `step`.
 
-    def __init__(self, profile: Profile) -> None:
+    Args:
+        profile: air interface. hung: codes that hang here; empty: any may.
+    """
+
+    def __init__(self, profile: Profile, hung: Collection[int] = ()) -> None:
         self._profile = profile
         self._codes = gold_codes(profile.degree)
         self._table = pulse_table(profile)
@@ -106,6 +112,10 @@ class Search:
         self._product: Spectrum = self._cache
         self._lags: npt.NDArray[np.float32] = np.empty((0, 0), np.float32)
         self._size = 0
+        every = np.arange(len(self._codes))
+        hangs = np.isin(every, list(hung)) if len(hung) else np.ones(len(every), np.bool_)
+        self._every, self._hung, self._foreign = every, every[hangs], every[~hangs]
+        self._order, self._turn = every, 0
         self._job: Job | None = None
         self._plan: list[float] = []
         self._next = 0
@@ -115,17 +125,21 @@ class Search:
 
     @property
     def codes(self) -> int:
-        """How many codes a sweep tries."""
-        return len(self._codes)
+        """How many codes a slow sweep tries at most."""
+        return len(self._hung) - (-len(self._foreign) // TURNS)
 
     @property
     def idle(self) -> bool:
         """Whether a new job would be taken."""
         return self._job is None
 
-    def start(self, job: Job, clocks: list[float]) -> None:
-        """Begin a sweep over all codes, once per trial clock."""
+    def start(self, job: Job, clocks: list[float], slow: bool = False) -> None:
+        """Begin a sweep over all codes, once per trial clock; a ``slow`` one: those that hang here, and some others."""
         self._fit_size(len(job.y))
+        self._order = self._every
+        if slow:
+            self._order = np.sort(np.concatenate((self._hung, self._foreign[self._turn :: TURNS])))
+            self._turn = (self._turn + 1) % TURNS
         self._job, self._plan, self._next = job, list(clocks), 0
         self._found = [[] for _ in clocks]
         self._limit = THRESHOLD if len(clocks) == 1 else COLD_THRESHOLD
@@ -142,19 +156,18 @@ class Search:
         self._fit_size(len(job.y))
         if len(self._spectrum) != self._cache.shape[1]:  # meanwhile a block of another length was followed
             self._spectrum = _spectrum(job.y, self._size)
-        trial, first = divmod(self._next, len(self._codes))
-        last = min(first + codes, len(self._codes))
-        cost = 1
-        if np.any(np.abs(self._cache_clock[first:last] - self._plan[trial]) > SAME_CLOCK):
-            last, cost = min(first + max(codes // STALE, 1), last), STALE
-        self._found[trial] += self._try(job, self._plan[trial], first, last)
-        self._next += last - first
-        if self._next < len(self._plan) * len(self._codes):
-            return codes - cost * (last - first), None
+        trial, first = divmod(self._next, len(self._order))
+        some, cost = self._order[first : first + codes], 1
+        if np.any(np.abs(self._cache_clock[some] - self._plan[trial]) > SAME_CLOCK):
+            some, cost = some[: max(codes // STALE, 1)], STALE
+        self._found[trial] += self._try(job, self._plan[trial], some)
+        self._next += len(some)
+        if self._next < len(self._plan) * len(self._order):
+            return codes - cost * len(some), None
         self._job = None
         strongest = [max((f.z for f in found), default=0.0) for found in self._found]
         best = int(np.argmax(strongest))
-        return codes - cost * (last - first), (job, self._plan[best], _dominant(self._found[best]))
+        return codes - cost * len(some), (job, self._plan[best], _dominant(self._found[best]))
 
     def _spc(self, clock: float) -> float:
         """Samples per chip."""
@@ -185,22 +198,26 @@ class Search:
         np.fft.irfft(product, self._size, out=out)  # type: ignore[arg-type]  # numpy's stubs know double only
         return out
 
-    def _try(self, job: Job, clock: float, first: int, last: int) -> list[Found]:
+    def _try(self, job: Job, clock: float, some: Index) -> list[Found]:
+        """What is found of some codes, which ascend."""
         n, spc = len(job.y), self._spc(clock)
-        self._prepare(np.arange(first, last), clock)
-        correlation = self._correlation(self._cache[first:last], self._spectrum)
+        self._prepare(some, clock)
+        whole = int(some[-1]) - int(some[0]) == len(some) - 1  # then the spectra need not be copied
+        correlation = self._correlation(
+            self._cache[some[0] : some[-1] + 1] if whole else self._cache[some], self._spectrum
+        )
         middle, period = 0.5 * (n - 1), self._profile.length * spc
-        known = (job.codes >= first) & (job.codes < last)
+        known = np.isin(job.codes, some)
         begin = (middle - job.phases[known] * spc) % period
         near = np.arange(-np.ceil(GUARD_CHIPS * spc), np.ceil(GUARD_CHIPS * spc) + 1)
         centre = begin[:, None] + np.arange(-1, int(n / period) + 1) * period
         at = np.round(centre[:, :, None] + near).astype(np.int64)
-        correlation[(job.codes[known] - first)[:, None, None], at % self._size] = 0.0
-        out = np.empty((last - first, 4))
+        correlation[np.searchsorted(some, job.codes[known])[:, None, None], at % self._size] = 0.0
+        out = np.empty((len(some), 4))
         detect(correlation, n, period, np.empty(int(period) + 3, np.float32), out)
-        whole = correlation[:, : max(n - int(period), 1)]  # the period lies inside the block
-        power = np.sort(np.einsum("ij,ij->i", whole, whole))  # its median; `np.median` takes ten times as long
-        noise = np.sqrt(0.5 * (power[(len(power) - 1) // 2] + power[len(power) // 2]) / (whole.shape[1] * period))
+        inside = correlation[:, : max(n - int(period), 1)]  # the period lies inside the block
+        power = np.sort(np.einsum("ij,ij->i", inside, inside))  # its median; `np.median` takes ten times as long
+        noise = np.sqrt(0.5 * (power[(len(power) - 1) // 2] + power[len(power) // 2]) / (inside.shape[1] * period))
         energy = self._energy * n
         z = out[:, 1] / (np.sqrt(n) * max(float(noise), 1e-9))
         amplitude = out[:, 1] / energy
@@ -208,7 +225,7 @@ class Search:
         offset = 0.5 * (out[:, 3] - out[:, 2]) / np.maximum(bend, 1e-9)
         phase = (middle - out[:, 0] - np.clip(offset, -0.5, 0.5)) / spc % self._profile.length
         good = np.flatnonzero((z > self._limit) & (amplitude > job.floor))
-        return [Found(first + int(k), float(phase[k]), float(amplitude[k]), float(z[k])) for k in good]
+        return [Found(int(some[k]), float(phase[k]), float(amplitude[k]), float(z[k])) for k in good]
 
     def common_lag(self, y: Array, clock: float, lamps: Lamps, window: float) -> float:
         """Lag in chips by which all lamps together are behind their predicted phases, within ``window`` chips.

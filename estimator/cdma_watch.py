@@ -8,7 +8,8 @@ effort; with all of it, at once, when any of this ends.
 A lamp of amplitude A adds A^2 to the residual's variance per sample as its correlation over n samples adds n A^2 to
 that of its own detector: a rise of the noise by `RISE` is a lamp 15 times its noise (n = 1111), which the very next
 sweep finds. One between the search's threshold of 5.2 and that takes up to two slow sweeps and the blocks that confirm
-it: `LONGEST` blocks.
+it: `LONGEST` blocks. Codes that no lamp of the survey has take turns there, `TURNS` sweeps for all of them: a lamp that
+hangs in no survey may be told later, and most codes hang nowhere.
 """
 
 from __future__ import annotations
@@ -29,6 +30,12 @@ LONGEST: Final = 2 * SPREAD + 4
 """Blocks until a new lamp is reported, however weak, where the effort offered suffices for `1 / SPREAD` of the codes
 per block: the sweep under way began before the lamp, the next finds it, and the rest is to confirm it."""
 
+TURNS: Final = 4
+"""Slow sweeps in which every code that does not hang here has its turn."""
+
+LONGEST_FOREIGN: Final = (TURNS + 1) * SPREAD + 4
+"""The same for a lamp whose code does not hang here."""
+
 
 class Watch:
     """Counts what speaks against further lamps.
@@ -38,7 +45,7 @@ class Watch:
     """
 
     def __init__(self, codes: int) -> None:
-        """``codes``: of a whole sweep."""
+        """``codes``: of a slow sweep."""
         self.empty = self.left = self._lit = 0
         self._share = ceil(codes / SPREAD)
 

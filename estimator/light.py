@@ -44,7 +44,8 @@ class Light:
     def __init__(self, setup: LightsSetup) -> None:
         """Nothing seen yet; raises ValueError for a stored clock out of range or an impossible survey."""
         self.setup = setup
-        self.decoder = cdma.new_decoder(setup.profile, setup.clock_ppm)
+        hung = {lamp.code for lamp in setup.survey.lamps}
+        self.decoder = cdma.new_decoder(setup.profile, setup.clock_ppm, hung)
         learned = None if setup.residuals is None else Learned(setup.residuals, setup.survey.receiver)
         self.filter = lights.new_lights(setup.survey, corrections=learned)
         self.result = lights.result(self.filter)

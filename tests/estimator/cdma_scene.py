@@ -65,10 +65,11 @@ class Run:
     samples: int = SAMPLES
     slices: int = 2
     t: float = 1.0
+    hung: tuple[int, ...] = ()
     decoder: Decoder = field(init=False)
 
     def __post_init__(self) -> None:
-        self.decoder = new_decoder(self.profile, self.clock_ppm)
+        self.decoder = new_decoder(self.profile, self.clock_ppm, self.hung)
 
     def block(self, stalls: tuple[tuple[int, float], ...] = ()) -> tuple[Block, LightEpoch]:
         block = self.ceiling.block(self.t, self.samples, stalls)

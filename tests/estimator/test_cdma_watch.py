@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.cdma_search import Search
-from estimator.cdma_watch import EMPTY, LONGEST, RISE, SPREAD, Watch
+from estimator.cdma_search import Index, Search
+from estimator.cdma_watch import EMPTY, LONGEST, LONGEST_FOREIGN, RISE, SPREAD, TURNS, Watch
 from estimator.codes import gold_codes
 from tests.estimator.cdma_scene import Run, ceiling, currents
 
@@ -92,14 +92,54 @@ def test_a_new_lamp_is_found_in_the_time_stated(seed: int, current_a: float, blo
 
 
 @pytest.mark.jit
+@pytest.mark.parametrize("seed", range(40, 44))
+@pytest.mark.parametrize(("hangs", "blocks"), [(True, LONGEST), (False, LONGEST_FOREIGN)])
+def test_one_that_hangs_here_is_looked_for_more_often(seed: int, hangs: bool, blocks: int) -> None:
+    scene = ceiling(seed, np.full(4, 80e-9))
+    run = Run(scene, hung=tuple(lamp.code for lamp in scene.lamps))
+    new = one_more(run, 9e-9)
+    weak = run.ceiling.lamps.pop()
+    run = Run(scene, hung=(*run.hung, new) if hangs else run.hung)
+    run.settle(20 + seed % SPREAD)
+    assert run.decoder.watch.calm
+    run.ceiling.lamps.append(weak)
+    took = next(k + 1 for k, (_, epoch) in enumerate(run.blocks(60)) if new in epoch.ids.tolist())
+    assert took <= blocks
+
+
+@pytest.mark.jit
+def test_calm_every_code_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that hang here in each slow sweep, all others in one of `TURNS`."""
+    scene, tried = ceiling(1, currents(4.6, 5.3)[:6]), list[int]()
+    hung = tuple(sorted(lamp.code for lamp in scene.lamps))
+    run = Run(scene, hung=hung)
+    run.settle(20)
+    attempt = Search._try
+
+    def noted(self: Search, job: object, clock: float, some: Index) -> object:
+        tried.extend(some.tolist())
+        return attempt(self, job, clock, some)  # type: ignore[arg-type]  # it is a Job
+
+    monkeypatch.setattr(Search, "_try", noted)
+    run.settle(4 * SPREAD * TURNS)
+    assert run.decoder.watch.calm
+    times = np.bincount(tried, minlength=CODES)
+    foreign = np.setdiff1d(np.arange(CODES), hung)
+    assert times[foreign].min() >= 3
+    assert times[foreign].max() <= 5
+    assert times[list(hung)].min() >= 4 * TURNS - 1
+    assert times[list(hung)].max() <= 5 * TURNS
+
+
+@pytest.mark.jit
 def test_calm_a_sixth_of_the_codes_is_tried_per_block(monkeypatch: pytest.MonkeyPatch) -> None:
     run, tried = Run(ceiling(1, currents(4.6, 5.3)[:6])), list[int]()
     run.settle(20)
     attempt = Search._try
 
-    def counted(self: Search, job: object, clock: float, first: int, last: int) -> object:
-        tried.append(last - first)
-        return attempt(self, job, clock, first, last)  # type: ignore[arg-type]  # it is a Job
+    def counted(self: Search, job: object, clock: float, some: Index) -> object:
+        tried.append(len(some))
+        return attempt(self, job, clock, some)  # type: ignore[arg-type]  # it is a Job
 
     monkeypatch.setattr(Search, "_try", counted)
     run.settle(4 * SPREAD)
