@@ -8,7 +8,7 @@ Every hot function is written as a plain Python function and decorated with :fun
   arithmetic of a small kernel, and while a background job runs Python, whoever has let go waits for it every time;
 * NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
 * ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
-* cached on disk, in the directory of `kernel_folder`.
+* cached on disk, in the directory of `kernel_folder`, and taken from there by `kernel_kept`.
 """
 
 from __future__ import annotations
@@ -16,25 +16,17 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, Final, ParamSpec, TypeVar
 
 import llvmlite.binding
+import numba
+from numba.core import config
 
 from estimator.kernel_folder import CACHE_DIR
+from estimator.kernel_kept import loaded
 
-# Importing numba asks whether scipy's BLAS is there, which loads a large part of scipy: a third of a warm start and
-# 17 MB. No kernel uses BLAS. None makes that one import fail, which numba takes for an answer.
 _BLAS: Final = "scipy.linalg.cython_blas"
-_hide = _BLAS not in sys.modules
-if _hide:
-    sys.modules[_BLAS] = None  # type: ignore[assignment]  # the documented way to block an import
-try:
-    import numba
-    import numba.np.arraymath  # the module that asks
-    from numba.core import config
-finally:
-    if _hide:
-        del sys.modules[_BLAS]
 
 _numba_config: Any = config  # untyped upstream; read by numba each time a function is decorated
 
@@ -81,8 +73,26 @@ def kernel(
 
 def _compile(compiled: Any, signature: str) -> None:
     """For this signature, and for no other ever: what `numba.njit` does that is given one."""
-    compiled.compile(signature)
+    if not loaded(compiled, signature):
+        _get_ready()
+        compiled.compile(signature)
     compiled.disable_compile()
+
+
+def _get_ready() -> None:
+    """Import the module of numba's that asks whether scipy's BLAS is there; it is told that there is none.
+
+    A large part of scipy would be loaded with it, 17 MB, and no kernel uses BLAS. None makes that one import fail,
+    which numba takes for an answer.
+    """
+    hide = _BLAS not in sys.modules
+    if hide:
+        sys.modules[_BLAS] = None  # type: ignore[assignment]  # the documented way to block an import
+    try:
+        import_module("numba.np.arraymath")
+    finally:
+        if hide:
+            del sys.modules[_BLAS]
 
 
 def _compile_on_use(compiled: Any, signature: str) -> None:
