@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from daemon import cli, warmup
 from daemon.config import Config
-from daemon.lights import SurveyError, load_lights
+from daemon.surveyfile import SurveyError
+
+if TYPE_CHECKING:
+    from daemon.lights import Lights
 
 
 def main(args: argparse.Namespace) -> int:
@@ -17,7 +21,7 @@ def main(args: argparse.Namespace) -> int:
     """
     settings: Config = args.settings
     try:
-        lights = load_lights(settings)
+        lights = _lights(settings)
         if warmup.is_warm(lights is not None):
             cli.say("an earlier start has compiled the kernels")
             return cli.OK
@@ -28,3 +32,12 @@ def main(args: argparse.Namespace) -> int:
         return cli.fail(str(error))
     cli.say(f"kernels compiled in {warmth.seconds:.1f} s")
     return cli.OK
+
+
+def _lights(settings: Config) -> Lights | None:
+    """What the configuration says of them; where it says nothing, numpy is not loaded to learn that."""
+    if not (settings.photodiode.fitted or settings.lights.survey):
+        return None
+    from daemon.lights import load_lights
+
+    return load_lights(settings)

@@ -319,7 +319,7 @@ def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
     code = (
         "import sys; from daemon.cli import main\n"
         "assert main(['warm', '--set', 'modbus.port=0']) == 0\n"
-        "print(sorted({'numba', 'llvmlite', 'estimator.pipeline', 'estimator.kernel'} & set(sys.modules)))"
+        "print(sorted({'numpy', 'numba', 'llvmlite', 'estimator.pipeline', 'estimator.kernel'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
