@@ -133,12 +133,15 @@ def kept(folder: Path) -> Booted:
 
 
 def played_by_two(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *shares: list[common.Scenario]
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    *shares: list[common.Scenario],
+    say: Callable[[str], None] = lambda text: None,
 ) -> tuple[bool, list[list[str]], str]:
     monkeypatch.setattr(guests, "bench", lambda booted, folder, broken_off, nice: Playing(broken_off))
     both = [Guest(k + 1, share) for k, share in enumerate(shares)]
     (tmp_path / "work").mkdir()
-    whole = run_all(both, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    whole = run_all(both, kept(tmp_path), tmp_path / "work", tmp_path, say)
     said = " ".join(one.skipped or one.said for guest in both for one in guest.results)
     return whole, [[one.outcome for one in guest.results] for guest in both], said
 
@@ -187,3 +190,19 @@ def test_a_run_that_is_broken_off_says_what_was_not_run(tmp_path: Path, monkeypa
     assert not whole
     assert outcomes == [["passed", "skipped", "skipped"]]
     assert said.count("not run: the run was broken off") == 2
+
+
+def test_a_run_that_is_broken_off_twice_is_so_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """timeout(1) sends its signal to a program and to the group that it is in."""
+    heard: list[str] = []
+
+    def say(text: str) -> None:
+        if text.startswith("broken off"):
+            heard.append(text)
+            if len(heard) == 1:
+                os.kill(os.getpid(), 15)  # the first one is still being seen to
+
+    whole, outcomes, _ = played_by_two(monkeypatch, tmp_path, [like(is_left), passes], say=say)
+    assert not whole
+    assert outcomes == [["skipped", "skipped"]]
+    assert len(heard) == 1

@@ -122,11 +122,15 @@ def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: S
     broken_off = threading.Event()
 
     def break_off(number: int, frame: object) -> None:
+        for one in before:  # a second one in the middle of this would wait for ever for what the first one holds
+            signal.signal(one, signal.SIG_IGN)
         say("broken off: the emulated computers are switched off, and what they have shown is reported")
-        for event in (broken_off, *(one.broken_off for one in guests)):
+        for event in (broken_off, *(guest.broken_off for guest in guests)):
             event.set()
 
-    before = {number: signal.signal(number, break_off) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, break_off)
     try:
         threads = [
             threading.Thread(target=one.run, args=(booted, folder / str(one.number), out, say)) for one in guests
