@@ -33,11 +33,13 @@ UNUSED = (
 NOBODYS = "ahci,libahci,libata,cfg80211,kvm,kvm_amd,iTCO_wdt,aesni_intel,ghash_clmulni_intel,powernow_k8,psmouse,pcspkr"
 """Modules of devices that nothing here needs."""
 COMMAND_LINE = " ".join([
-    "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off highres=off systemd.show_status=false",
+    "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off highres=off norandmaps",
+    "systemd.show_status=false",
     f"modprobe.blacklist={NOBODYS}",
     *(f"systemd.mask={unit}" for unit in UNUSED),
 ])  # fmt: skip
-"""``highres=off``: dummy_hcd looks after its bus at every tick of 4 ms, not 8000 times a second."""
+"""``highres=off``: dummy_hcd looks after its bus at every tick of 4 ms, not 8000 times a second. ``norandmaps``: QEMU
+keeps what it has translated by virtual address, and a program lies where it lay when it was last started."""
 PROCESSOR = "Nehalem"
 """The oldest that everything inside runs on (numpy wants x86-64-v2): wide vectors are the dearest to emulate."""
 OUTSIDE = "10.0.2.2"
