@@ -70,6 +70,10 @@ class Bus(Protocol):
         """The same transaction again and again, with as little pause between as this bus can do; raises `OSError`."""
         ...
 
+    def release(self) -> None:
+        """Give up what of the bus is this program's alone; from another thread, while a transaction hangs."""
+        ...
+
     def close(self) -> None:
         """Close; idempotent."""
         ...

@@ -16,6 +16,7 @@ import fcntl
 import grp
 import os
 import struct
+import threading
 import time
 from collections.abc import Generator
 from fcntl import ioctl
@@ -52,6 +53,7 @@ class LinuxBus:
         self._built: list[i2c_msg] = []
         self._reads: list[i2c_msg] = []
         self._claimed: set[int] = set()
+        self._closing = threading.Lock()
 
     @property
     def name(self) -> str:
@@ -81,9 +83,18 @@ class LinuxBus:
         while True:
             yield self.transfer(messages)
 
+    def release(self) -> None:
+        """Let others have the addresses: a transaction that hangs keeps the file, and its locks, open."""
+        with self._closing:
+            if self._link.fd is not None:
+                self._claimed.clear()
+                self._built_for = ()
+                _lock(self._link.fd, fcntl.F_UNLCK, 0, 0)
+
     def close(self) -> None:
         """Close the device node."""
-        self._link.close()
+        with self._closing:
+            self._link.close()
 
     def _build(self, messages: tuple[Message, ...]) -> None:
         check(messages)
@@ -103,11 +114,15 @@ class LinuxBus:
 
 def _claim(fd: int, address: int) -> None:
     """Lock the byte of the device node whose offset is the address; of the open file, so that closing it frees it."""
-    wanted = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)  # struct flock (fcntl(2)), l_pid 0
     try:
-        fcntl.fcntl(fd, fcntl.F_OFD_SETLK, wanted)
+        _lock(fd, fcntl.F_WRLCK, address, 1)
     except BlockingIOError:
         raise OSError(errno.EBUSY, f"address {address:#04x} is in use by another program") from None
+
+
+def _lock(fd: int, kind: int, start: int, length: int) -> None:
+    """Set or free an open file's lock on some of its bytes; a ``length`` of 0: all from ``start`` on."""
+    fcntl.fcntl(fd, fcntl.F_OFD_SETLK, struct.pack("hhqqi", kind, os.SEEK_SET, start, length, 0))  # fcntl(2): l_pid 0
 
 
 def _fill(message: i2c_msg) -> None:

@@ -5,6 +5,7 @@ Repeated transactions are ordered one ahead, so that the bus does not wait for t
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
@@ -132,6 +133,12 @@ class RemoteBus:
                 self._early.pop(number, None)
                 if number in self._ordered:
                     self._ordered[number].wanted = False
+
+    def release(self) -> None:
+        """Hang up: the server gives the bus up then, and who waits here for an answer is told that there is none."""
+        if (link := self._link) is not None:
+            with contextlib.suppress(OSError):  # it has been closed meanwhile
+                link.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Close the connection."""

@@ -83,6 +83,7 @@ class ThreadedBus:
 
     def __init__(self, name: str, opener: Callable[[str], Bus]) -> None:
         self._name, self._about = name, ""
+        self._bus: Bus | None = None
         self._loop = asyncio.get_running_loop()
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self.opened: asyncio.Future[None] = self._loop.create_future()
@@ -120,14 +121,15 @@ class ThreadedBus:
             job.stopped = True
 
     async def close(self) -> None:
-        """End the thread, which closes the bus; a transaction that hangs in the kernel is left to itself."""
+        """End the thread, which closes the bus; a transaction that hangs is left to itself, and has no address then."""
         if not self._closed:
             self._closed = True
             self._jobs.put(None)
         try:
             await asyncio.wait_for(self._ended.wait(), CLOSE_S)
         except TimeoutError:
-            return
+            if self._bus is not None:
+                self._bus.release()
 
     def _check_open(self) -> None:
         if self._closed:
@@ -147,7 +149,7 @@ class ThreadedBus:
         except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where the bus was opened
             self._post(_fail, self.opened, error)
             return
-        self._about = bus.about
+        self._bus, self._about = bus, bus.about
         self._post(_succeed, self.opened, None)
         with closing(bus):
             while (job := self._next()) is not None:

@@ -330,6 +330,30 @@ def test_a_server_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Monke
     server.join()
 
 
+def test_a_bus_that_is_closed_while_nothing_is_answered_hangs_up(tmp_path: Path) -> None:
+    """What the server has open for it, an address above all, is free for the next connection."""
+    hung_up = threading.Event()
+
+    def behave(link: socket.socket) -> None:
+        greet(link)
+        while link.recv(100):
+            pass
+        hung_up.set()
+
+    async def main() -> None:
+        server = Server(tmp_path / "s", behave)
+        bus = await open_bus(f"unix:{tmp_path}/s")
+        waiting = asyncio.create_task(bus.transfer((read(0x4D, 2),)))
+        await asyncio.sleep(0.05)
+        await bus.close()
+        assert await asyncio.to_thread(hung_up.wait, 1.0)
+        with pytest.raises(OSError, match="bus server"):
+            await waiting
+        server.join()
+
+    asyncio.run(main())
+
+
 def test_times_of_another_computer_are_translated(tmp_path: Path) -> None:
     def behave(link: socket.socket) -> None:
         greet(link, "another clock")

@@ -29,7 +29,7 @@ class Slow:
         self.done = 0
         self.closed = threading.Event()
         self.released = threading.Event()
-        self.hangs = False
+        self.hangs = self.given_up = False
         self.fails: dict[int, Exception] = {}
         self.threads: set[str] = set()
 
@@ -47,6 +47,9 @@ class Slow:
     def repeat(self, messages: tuple[Message, ...]) -> Generator[Transferred]:
         while True:
             yield self.transfer(messages)
+
+    def release(self) -> None:
+        self.given_up = True
 
     def close(self) -> None:
         self.closed.set()

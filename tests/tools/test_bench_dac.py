@@ -46,6 +46,9 @@ class Wire:
         while True:
             yield self.transfer(messages)
 
+    def release(self) -> None:
+        """Nothing is held."""
+
     def close(self) -> None:
         """Nothing is open."""
 
