@@ -75,6 +75,8 @@ POLICIES: Final[dict[int, Policy]] = {
         DeviceRefused,
         "address {address} is in use by another program, or by a kernel driver",
         "end the other program (fuser -v /dev/i2c-N), or unbind the driver (device-tree overlay)",
+        retries=3,  # who looks what is there (`lumiloop probe`) has an address for some hundredths of a second
+        pause_s=0.05,
     ),
     errno.EOPNOTSUPP: _TOO_MUCH,
     errno.EINVAL: _TOO_MUCH,

@@ -107,7 +107,7 @@ BUS = [
     Case("what = 'delayed'; by_s = 4.0", DeviceFault, "not returned for 3 s.*unbind", within=6.0, noticed=3.2),
 ]
 
-PASSING = ("EIO", "ENXIO", "EREMOTEIO", "EAGAIN")
+PASSING = ("EIO", "ENXIO", "EREMOTEIO", "EAGAIN", "EBUSY")
 """Tried again on the open bus, so that they do not even show. ETIMEDOUT is tried again as well, but takes a second."""
 TRANSIENT = [
     Case(
