@@ -123,11 +123,12 @@ case "${1:-}" in
             "$DESTDIR/usr/lib/udev/rules.d/60-lumiloop.rules" "$DESTDIR/usr/lib/systemd/catalog/lumiloop.catalog" \
             "$DESTDIR/usr/lib/sysusers.d/lumiloop.conf"
         if [ "${PURGE:-0}" = 1 ]; then
-            rm -rf "$DESTDIR/etc/lumiloop" "$DESTDIR/var/lib/private/lumiloop" "$DESTDIR/var/cache/private/lumiloop"
-            rm -f "$DESTDIR/var/lib/lumiloop" "$DESTDIR/var/cache/lumiloop"
+            rm -rf "$DESTDIR/etc/lumiloop" "$DESTDIR/var/cache/private/lumiloop"
+            rm -rf "$DESTDIR/var/lib/private/lumiloop" "$DESTDIR/var/lib/private/lumiloop-record"
+            rm -f "$DESTDIR/var/lib/lumiloop" "$DESTDIR/var/lib/lumiloop-record" "$DESTDIR/var/cache/lumiloop"
         fi
         tell_system uninstall
-        say "removed; configuration and maps stay (PURGE=1 removes them too)"
+        say "removed; configuration, maps and recordings stay (PURGE=1 removes them too)"
         ;;
     *) fail "usage: $0 install | uninstall" ;;
 esac

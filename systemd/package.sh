@@ -65,8 +65,8 @@ cat > "$TREE/DEBIAN/postrm" << 'EOF'
 #!/bin/sh
 set -e
 if [ "$1" = purge ]; then
-    rm -rf /var/lib/private/lumiloop /var/cache/private/lumiloop /etc/lumiloop
-    rm -f /var/lib/lumiloop /var/cache/lumiloop
+    rm -rf /var/lib/private/lumiloop /var/lib/private/lumiloop-record /var/cache/private/lumiloop /etc/lumiloop
+    rm -f /var/lib/lumiloop /var/lib/lumiloop-record /var/cache/lumiloop
 fi
 if [ -d /run/systemd/system ]; then systemctl daemon-reload; fi
 EOF

@@ -231,6 +231,28 @@ def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
     assert sorted(stopped.replace("TAPS", taps).split()) == UNITS
 
 
+def test_a_purge_leaves_nothing_that_a_unit_has_written(tmp_path: Path) -> None:
+    """The recordings of a day are 17 GB, which nobody would look for once the program is gone."""
+    kinds = {"StateDirectory": "var/lib", "CacheDirectory": "var/cache"}
+    units = [pair for name in UNITS for pair in settings(SYSTEMD / name)]
+    places = {f"{kinds[key]}/private/{value}" for key, value in units if key in kinds}
+    assert len(places) >= 3
+    for place in places:
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place.replace("/private", "")).symlink_to(f"private/{Path(place).name}")
+    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
+    subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
+    assert all((tmp_path / place).is_dir() for place in places)
+    subprocess.run(
+        [SYSTEMD / "install.sh", "uninstall"], env=environment | {"PURGE": "1"}, check=True, capture_output=True
+    )
+    assert [path for path in tmp_path.rglob("*lumiloop*") if "doc" not in path.parts] == []
+    package = (SYSTEMD / "package.sh").read_text()
+    for place in places:
+        assert re.search(rf"rm -rf .*/{place}( |$)", package, re.MULTILINE), place
+        assert re.search(rf"rm -f .*/{place.replace('/private', '')}( |$)", package, re.MULTILINE), place
+
+
 def test_it_is_started_again_for_ever_but_not_with_a_configuration_that_is_wrong() -> None:
     told = dict(settings(UNIT))
     assert (told["StartLimitIntervalSec"], told["Restart"]) == ("0", "always")
