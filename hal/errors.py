@@ -12,6 +12,11 @@ error                     example                  what the daemon does
 
 from __future__ import annotations
 
+from typing import Final
+
+KEPT_AWAY: Final = "not permitted", "the service's unit allows no such device: systemctl edit it, DeviceAllow="
+"""Problem and remedy of EPERM: rights to the file are there (else EACCES), and something above them says no."""
+
 
 class HalError(Exception):
     """Base of all device errors.

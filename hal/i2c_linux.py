@@ -25,7 +25,7 @@ from typing import Final, cast
 
 from smbus2 import I2cFunc, SMBus, i2c_msg
 
-from hal.errors import DeviceMissing, DeviceRefused, HalError
+from hal.errors import KEPT_AWAY, DeviceMissing, DeviceRefused, HalError
 from hal.i2c import Message, Transferred, check
 
 I2C_TIMEOUT: Final = 0x0702
@@ -169,7 +169,9 @@ def explain_open_error(name: str, path: Path, error: OSError) -> HalError:
         there = buses()
         remedy = f"there are: {', '.join(there)}" if there else ENABLE
         return DeviceMissing(name, "no such bus" if number == errno.ENOENT else os.strerror(number), remedy)
-    if number in (errno.EACCES, errno.EPERM):
+    if number == errno.EPERM:
+        return DeviceRefused(name, *KEPT_AWAY)
+    if number == errno.EACCES:
         return DeviceRefused(name, "permission denied", f"add the user to group {_group_of(path)} and log in again")
     if number in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(name, "in use by another program", f"find it with: fuser -v {path}")

@@ -20,7 +20,7 @@ import serial
 
 from hal.beside import beside
 from hal.clock import Clock, SystemClock
-from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
+from hal.errors import KEPT_AWAY, DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.port import OnData, OnLost
 
 _READ_SIZE = 65536  # a tty hands out at most 4095 bytes at once
@@ -175,7 +175,9 @@ def explain_open_error(device: str, baud: int, error: BaseException, style: str 
         return DeviceMissing(device, "no such device", "plug the sensor in, or look for it with: lumiloop probe")
     if number in _GONE:
         return DeviceMissing(device, os.strerror(number), "plug the sensor in; it is opened by itself once it is there")
-    if number in (errno.EACCES, errno.EPERM):
+    if number == errno.EPERM:
+        return DeviceRefused(device, *KEPT_AWAY)
+    if number == errno.EACCES:
         return DeviceRefused(device, "permission denied", f"add the user to group {_group_of(path)} and log in again")
     if number in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(device, "in use by another program", f"find it with: fuser -v {device}")

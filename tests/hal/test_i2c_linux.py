@@ -167,6 +167,7 @@ def test_a_closed_bus(monkeypatch: pytest.MonkeyPatch) -> None:
         (errno.ENXIO, DeviceMissing, "No such device or address"),
         (errno.ENODEV, DeviceMissing, "No such device"),
         (errno.EACCES, DeviceRefused, r"permission denied .add the user to group i2c and log in again"),
+        (errno.EPERM, DeviceRefused, r"not permitted .*DeviceAllow="),
         (errno.EBUSY, DeviceRefused, r"in use by another program .find it with: fuser -v /dev/i2c-1"),
         (errno.EISDIR, DeviceRefused, r"not an I2C bus .*such as /dev/i2c-1"),
         (errno.EMFILE, DeviceRefused, r"cannot be opened: Too many open files .*dmesg"),

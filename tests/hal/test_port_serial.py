@@ -150,6 +150,7 @@ def test_impossible_rate_is_refused(pty: Pty) -> None:
     ("number", "kind", "words"),
     [
         (errno.EACCES, DeviceRefused, "group dialout"),
+        (errno.EPERM, DeviceRefused, "not permitted (the service's unit allows no such device"),
         (errno.EBUSY, DeviceRefused, "in use by another program"),
         (errno.EAGAIN, DeviceRefused, "in use by another program"),
         (errno.ENODEV, DeviceMissing, "plug the sensor in"),

@@ -259,6 +259,16 @@ def test_it_is_started_again_for_ever_but_not_with_a_configuration_that_is_wrong
     assert told["RestartPreventExitStatus"] == str(USAGE)
 
 
+def test_the_page_names_the_devices_that_the_service_may_open() -> None:
+    """Also those of a Raspberry Pi's own pins: a lidar by RS-232, a PLC by Modbus RTU."""
+    allowed = [value for key, value in settings(UNIT) if key == "DeviceAllow"]
+    assert "char-ttyAMA rw" in allowed
+    page = (SYSTEMD.parent / "docs" / "installation.md").read_text()
+    told = page[page.index("The devices that it may open") : page.index("needs a drop-in with `DeviceAllow=`")]
+    names = re.findall(r"`(?:/dev/)?(\w+)-?\*`", told)
+    assert [f"char-{name} rw" for name in names] == allowed
+
+
 def test_devices_are_named_by_what_they_are() -> None:
     rules = (SYSTEMD / "60-lumiloop.rules").read_text()
     assert 'ATTRS{idVendor}=="15d1"' in rules
