@@ -209,8 +209,8 @@ async def _start(cell: Cell, house: House, out: Outcome) -> None:
     await asyncio.sleep(FAULT_S)
     house.faults.clear()
     await _recover(house, out)
-    _take(house, out)
     await _end(house, out)
+    _take(house, out)
 
 
 async def _run(cell: Cell, house: House, out: Outcome) -> None:
@@ -220,8 +220,8 @@ async def _run(cell: Cell, house: House, out: Outcome) -> None:
     await asyncio.sleep(FAULT_S)
     house.faults.clear()
     await _recover(house, out)
-    _take(house, out)
     await _end(house, out)
+    _take(house, out)
 
 
 async def _stop(cell: Cell, house: House, out: Outcome) -> None:
@@ -229,16 +229,15 @@ async def _stop(cell: Cell, house: House, out: Outcome) -> None:
     house.order(cell.toml)
     out.t_on = house.loop.time()
     await asyncio.sleep(STOP_AFTER_S)
-    await _end(house, out)
+    await _end(house, out, reached=cell.device != "lidar" or cell.word not in ("off", "garbage"))
     await asyncio.sleep(0.5)
     out.t_again = house.loop.time()
-    out.laser = house.lidar.laser and cell.word not in ("off", "garbage") and cell.device == "lidar"
     house.start()
     await asyncio.sleep(1.0)
     house.faults.clear()
     await _recover(house, out)
-    _take(house, out)
     await _end(house, out)
+    _take(house, out)
 
 
 async def _calm(house: House) -> None:
@@ -263,10 +262,12 @@ async def _recover(house: House, out: Outcome) -> None:
     await house.until(so, PATIENCE_S)
 
 
-async def _end(house: House, out: Outcome) -> None:
+async def _end(house: House, out: Outcome, reached: bool = True) -> None:
+    """Stop it; ``reached``: the lidar hears what it is told."""
     out.ended = out.ended or house.ended
     if not house.ended:
         out.stop_s.append(await house.stop())
+        out.laser = out.laser or (reached and house.lidar.laser)
 
 
 def _take(house: House, out: Outcome) -> None:

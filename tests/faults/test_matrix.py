@@ -6,11 +6,14 @@ A third of the cells runs with the system tests, another third with every commit
 from __future__ import annotations
 
 import dataclasses
+import logging
 import tomllib
 from pathlib import Path
 
 import pytest
 
+from hal.fake.hokuyo import FakeHokuyo
+from tests.faults.house import House
 from tests.faults.matrix import DEVICES, TIMES, WORDS, Cell, cells, objections, play
 from tests.rotation import share
 
@@ -54,14 +57,28 @@ def test_no_fault_passes_in_silence() -> None:
 @pytest.mark.system
 @pytest.mark.jit
 @pytest.mark.timeout(600)
-def test_a_cell_that_is_not_survived_is_told() -> None:
-    """The judge is no friend: a fault that goes unnamed, a lost pose and a strange code are all objected to."""
+def test_a_cell_that_is_not_survived_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The judge is no friend: a fault that goes unnamed, a lost pose and a strange code are all objected to.
+
+    So are, in every cell, a laser that is on after a stop, and a warning at the very end.
+    """
+    stop = House.stop
+
+    async def grudging(house: House) -> float:
+        logging.getLogger("daemon.main").warning("lidar does not stop")
+        return await stop(house)
+
     cell = next(cell for cell in CELLS if (cell.device, cell.word, cell.time) == ("odometry", "off", "run"))
     fine = dataclasses.replace(cell, word="ok", codes=(), silent=0.0, states=("TRACKING",), back=0.0, gone=0.0)
     assert objections(fine, play(fine)) == []
+    monkeypatch.setattr(House, "stop", grudging)
+    monkeypatch.setattr(FakeHokuyo, "laser", True)
     out = play(dataclasses.replace(cell, defect=""))
     told = objections(dataclasses.replace(cell, codes=(153,), silent=0.1, states=("TRACKING",), back=0.0), out)
-    for words in ("fault 153 was never named", "strange faults", "silence was shown", "said DEGRADED"):
+    for words in (
+        *("fault 153 was never named", "strange faults", "silence was shown", "said DEGRADED"),
+        *("the laser was left on", "lidar does not stop"),
+    ):
         assert any(words in one for one in told), told
 
 
