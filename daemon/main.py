@@ -64,6 +64,9 @@ QUIET_S: Final = 2.0
 """Seconds a part may take to stop: the lidar has to be told to switch its laser off."""
 EXTEND_US: Final = 30_000_000
 """Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
+STARTING_S: Final = 900.0
+"""For so long it is asked: a start that hangs for good (at a disk, or behind a process that compiles and does not end)
+is begun anew after that, and finds the kernels that it has compiled."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
 """States in which there is a pose to speak of."""
 
@@ -78,6 +81,7 @@ class Daemon:
     def __init__(self, settings: Config, world: World, recorder: Recorder | None = None) -> None:
         self.supervisor = Supervisor()
         self._world = world
+        self._begun = world.clock.now()
         self._recorder = recorder
         lights = world.lights or load_lights(settings)
         opener = world.opener if recorder is None else recorder.tap(world.opener)
@@ -294,7 +298,8 @@ class Daemon:
         line_up()
         if self.cycle.cycles == 0:
             self.cycle.announce()
-            notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
+            if self._world.clock.now() - self._begun < STARTING_S:
+                notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
         failed = self.supervisor.failed | (set() if self._recorder is None else self._recorder.failing)
         if self.keeper.error:
             failed.add("map")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import socket
@@ -13,7 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from daemon import cli, run
+from daemon import cli, main, run
+from daemon.main import Daemon, World
+from hal.clock import LoopClock, run_virtual
+from hal.fake.transport import FakeOpener
+from tests.daemon.driven import during
+from tests.daemon.test_daemon import SETTINGS
 
 ROOT = Path(__file__).parents[2]
 
@@ -62,3 +68,23 @@ def test_a_stop_ends_the_wait(tmp_path: Path, manager: socket.socket) -> None:
     finally:
         process.kill()
         process.wait()
+
+
+def test_a_start_that_hangs_is_not_excused_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service manager is asked for more time while the estimator is loaded; then it may begin anew."""
+    asked: list[float] = []
+
+    async def go() -> None:
+        loop = asyncio.get_running_loop()
+        clock = LoopClock(loop, utc_at_zero=1.7e9)
+
+        def notified(*words: str) -> None:
+            asked.extend(clock.now() for word in words if word.startswith("EXTEND_TIMEOUT_USEC="))
+
+        monkeypatch.setattr(main, "notify", notified)
+        world = World(clock, opener=FakeOpener(clock), warm_up=asyncio.Event().wait)
+        await during(Daemon(SETTINGS, world), asyncio.sleep(main.STARTING_S + 60.0))
+
+    run_virtual(go())
+    assert len(asked) == pytest.approx(main.STARTING_S, abs=2)
+    assert asked[-1] - asked[0] < main.STARTING_S
