@@ -36,19 +36,22 @@ class Supervisor:
     async def keep(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
         """Run a part for ever. Returns if it ends by itself (a log's end); a cancelled one is not restarted.
 
-        A device's error is one line; anything else is a defect and logged in full, and the part is restarted all the
-        same: one broken publisher must not take the pose away from the others.
+        A device's error is one line; anything else is a defect and logged in full, once until it works again or fails
+        in another way, and the part is restarted all the same: one broken publisher must not take the pose away from
+        the others.
         """
         loop = asyncio.get_running_loop()
-        pause = FIRST_S
+        pause, said = FIRST_S, ""
         while True:
             begun = loop.time()
             try:
                 await self._run(name, run, begun)
             except HalError as error:
                 self._lost(name, f"{name}: {error}")
-            except Exception:
-                log.exception("%s has failed; it is restarted", name)
+            except Exception as error:
+                if name not in self.failed or repr(error) != said:
+                    log.exception("%s has failed; it is restarted until it works", name)
+                said = repr(error)
                 self._lost(name, "")
             else:
                 self.failed.discard(name)
