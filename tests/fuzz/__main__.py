@@ -92,7 +92,7 @@ def one(name: str, share: float, seed: int) -> int:
     good = outcome.worst_s < storm.STALL_S and outcome.growth < storm.GROWTH
     say(
         f"{name}: {outcome.fed / 1e6:.2f} MB in {outcome.inputs} inputs, {took:.0f} s, longest"
-        f" {1e3 * outcome.worst_s:.0f} ms, {outcome.growth / 1e3:+.1f} kB kept, {len(kept)} in the corpus,"
+        f" {1e3 * outcome.worst_s:.0f} ms, {outcome.growth / 1e3:+.1f} kB kept of all, {len(kept)} in the corpus,"
         f" {100.0 * reached / lines:.1f} % of {lines} lines{'' if good else ': FAILED'}"
     )
     return int(not good)

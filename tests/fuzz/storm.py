@@ -44,7 +44,12 @@ WORDS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a storm has shown: inputs and bytes fed, the longest processor time of one input in s, bytes kept."""
+    """What a storm has shown.
+
+    Attributes:
+        inputs, fed: their number, and bytes. worst_s: the longest processor time of one input.
+        growth: bytes that the parser would keep of the whole storm, kept as of its last part.
+    """
 
     inputs: int
     fed: int
@@ -108,7 +113,7 @@ class Storm:
 
 
 def run(feed: Callable[[bytes], None], storm: Storm, size: int) -> Outcome:
-    """Feed so many bytes; over the last of them memory is counted.
+    """Feed so many bytes; over the last of them memory is counted, a leak as if it had leaked so all the while.
 
     Raises:
         AssertionError: the parser has raised or broken a promise; names the input's bytes.
@@ -122,7 +127,7 @@ def run(feed: Callable[[bytes], None], storm: Storm, size: int) -> Outcome:
         before = tracemalloc.get_traced_memory()[0]
         last = _feed(feed, storm, round(size * TRACED / 2))
         gc.collect()
-        growth = tracemalloc.get_traced_memory()[0] - before
+        growth = round((tracemalloc.get_traced_memory()[0] - before) * size / max(last[1], 1))
     finally:
         tracemalloc.stop()
     return Outcome(inputs + warm[0] + last[0], fed + warm[1] + last[1], worst, growth)
