@@ -172,7 +172,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
-        "read the log, which names it: is the port, or the stream's socket, taken by another program or daemon?",
+        "read the log, which names it: is the port, or the stream's socket, taken by another program or daemon? can "
+        "all of `pose.receivers` be reached (the network's cable, a name)?",
     ),
     Fault.RECORDER_FAILED: ("the recording cannot be written", "free disk space, or name another directory"),
     Fault.MAP_NOT_SAVED: (

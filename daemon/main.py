@@ -300,7 +300,8 @@ class Daemon:
             self.cycle.announce()
             if self._world.clock.now() - self._begun < STARTING_S:
                 notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
-        failed = self.supervisor.failed | (set() if self._recorder is None else self._recorder.failing)
+        failed = self.supervisor.failed | self.network.failing
+        failed |= set() if self._recorder is None else self._recorder.failing
         if self.keeper.error:
             failed.add("map")
         if self.last_pose is not None and self.last_pose.error:

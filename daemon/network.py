@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from daemon.orders import Told
     from daemon.publish.modbus import ModbusPublisher
     from daemon.publish.stream import StreamServer
+    from daemon.publish.udp import PoseSender
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ class Network:
     """Everything that listens or sends.
 
     Attributes:
-        sinks: take every snapshot. parts: by name, for the supervisor. stream: the local one, None: there is none.
+        sinks: take every snapshot. parts: by name, for the supervisor. modbus, pose, stream: None: there is none.
     """
 
     def __init__(self, settings: Config, clock: Clock, feeds: Feeds, stream: Path | None = None) -> None:
@@ -90,6 +91,7 @@ class Network:
         self._access = Access(settings.allow, settings.bind)
         self._odometry = OneSender(feeds.on_odometry)
         self.modbus: ModbusPublisher | None = None
+        self.pose: PoseSender | None = None
         if settings.modbus.port or settings.modbus.line is not None:
             self._add_modbus(settings.modbus)
         if settings.pose.receivers:
@@ -99,6 +101,11 @@ class Network:
         self.stream: StreamServer | None = None
         if stream is not None:
             self._add_stream(stream)
+
+    @property
+    def failing(self) -> set[str]:
+        """Parts that run and cannot do their work at the moment."""
+        return {"pose"} if self.pose is not None and self.pose.failing else set()
 
     def _add_modbus(self, settings: ModbusConfig) -> None:
         from daemon.orders import Orders
@@ -131,7 +138,7 @@ class Network:
             subscriptions = Subscriptions(settings.bind, port, self._access)
             self.parts["pose subscriptions"] = lambda: _open(subscriptions.start, subscriptions.close)
         fixed = [receiver for receiver in settings.pose.receivers if parse_endpoint(receiver)[0] != ANYBODY]
-        sender = PoseSender(fixed, interface_of(settings.bind), subscriptions)
+        self.pose = sender = PoseSender(fixed, interface_of(settings.bind), subscriptions)
         self.sinks.append(sender.publish)
         self.parts["pose"] = lambda: _open(sender.start, sender.close)
 

@@ -73,6 +73,11 @@ class PoseSender:
             else:
                 self._lookups.append(asyncio.create_task(self._look_up(receiver)))
 
+    @property
+    def failing(self) -> bool:
+        """Whether a configured receiver cannot be sent to: the network is gone, or its name is not known."""
+        return not all(receiver.reachable for receiver in self.receivers)
+
     def publish(self, snapshot: Snapshot) -> None:
         """Send to all; never waits, never raises for the network."""
         subscribed = self._subscriptions is not None and len(self._subscriptions.leases) > 0
@@ -129,9 +134,10 @@ class PoseSender:
         return sock
 
     def _lost(self, receiver: Receiver, problem: str) -> None:
+        """Say it once; the warning is the heartbeat's, with the fault's number."""
         if receiver.reachable:
             receiver.reachable = False
-            log.warning("pose receiver %s: %s; datagrams to it are dropped until it is back", receiver.name, problem)
+            log.info("pose receiver %s: %s; datagrams to it are dropped until it is back", receiver.name, problem)
 
     async def _look_up(self, receiver: Receiver) -> None:
         while True:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import socket
 import struct
@@ -14,7 +15,8 @@ from typing import TypeVar
 import pytest
 
 from daemon.budget import FixedBudget
-from daemon.config import Config, LidarConfig, ModbusConfig, OdometryConfig, PoseConfig
+from daemon.config import Config, LidarConfig, MapConfig, ModbusConfig, OdometryConfig, PoseConfig
+from daemon.faults import Fault
 from daemon.main import Daemon, World
 from daemon.network import Feeds, Network
 from daemon.publish import registers, subscribe
@@ -27,6 +29,7 @@ from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX_UG01
 from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
+from hal.inet import numeric
 from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, encode
 
 T = TypeVar("T")
@@ -186,6 +189,30 @@ def test_datagrams_of_odometry_and_gyro_reach_the_cycle_and_poses_go_out() -> No
             await bench.end()
 
     run_virtual(go())
+
+
+def test_a_receiver_that_cannot_be_sent_to_is_a_fault_until_it_can_be(caplog: pytest.LogCaptureFixture) -> None:
+    """As with the network's cable pulled: named by its number, one warning, and one line when it is over."""
+    caplog.set_level(logging.INFO)
+
+    async def go() -> tuple[tuple[Fault, ...], ...]:
+        pose = PoseConfig(receivers=("255.255.255.255:5600",))  # nothing may be sent there: Permission denied
+        bench = Bench(settings(pose=pose, modbus=ModbusConfig(port=0), map=MapConfig(folder="none")))
+        await asyncio.sleep(6.0)
+        before, sender = bench.daemon.heartbeat.faults, bench.daemon.network.pose
+        assert sender is not None
+        (sender.receivers[0].address,) = numeric("127.0.0.1", free_port())
+        await asyncio.sleep(6.0)
+        after = bench.daemon.heartbeat.faults
+        await bench.end()
+        return before, after
+
+    assert run_virtual(go()) == ((Fault.PUBLISHER_FAILED,), ())
+    warned = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(warned) == 1
+    assert "fault 401: " in warned[0]
+    assert "pose receiver 255.255.255.255:5600: Permission denied" in caplog.text
+    assert "over: fault 401: " in caplog.text
 
 
 def test_without_any_socket_the_daemon_runs_for_its_sinks() -> None:
