@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+import re
+from typing import Final
+
+from daemon.faults import Fault
 from tests.faults.matrix import cells
 from tests.faults.report import PAGE, kept, page
+
+OF_DEFECTS: Final = {Fault.WORKER_FAILED, Fault.FLIGHT_RECORDER_FAILED}
+"""What no cable, process or disk brings about alone."""
 
 
 def test_the_page_is_what_was_measured() -> None:
     assert PAGE.read_text() == page(kept()), "python -m tests.faults --render"
+
+
+def test_every_fault_of_the_computer_has_a_row_that_names_its_test() -> None:
+    part = PAGE.read_text().partition("## The computer")[2].partition("\n## ")[0]
+    rows = [line.split(" | ") for line in part.splitlines() if line.startswith("| ")][2:]
+    told = {int(code) for row in rows for code in re.findall(r"\b[1-4]\d\d\b", row[1])}
+    assert {int(fault) for fault in Fault if fault > Fault.LOOP_STALLED} - told == OF_DEFECTS
+    for row in rows:
+        tests = re.findall(r"`(tests/\S+)`", row[-1])
+        assert tests, row
+        assert all((PAGE.parents[1] / path).is_file() for path in tests), row
 
 
 def test_every_cell_was_measured_and_survived_unless_it_is_a_known_defect() -> None:
