@@ -1,8 +1,8 @@
 """The emulated computer's disk: Debian with its kernel, the package as it is shipped, and the bench's own few files.
 
 Two steps, each kept: the base (Debian, the kernel module, the initial RAM disk; some minutes, once) and the image (the
-base with the package of these sources and its kernels compiled for any processor). No loop device, no mount: the file
-system is made from a folder.
+base with the package of these sources and its kernels compiled for any processor). No loop device, and no mount that
+others see: the file system is made from a folder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tools.bench.vm.places import CannotBench, cache, missing, workspace
+from tools.bench.vm.places import LEASH, CannotBench, cache, missing, workspace
 
 ROOT = Path(__file__).parents[3]
 GUEST = Path(__file__).parent / "guest"
@@ -50,6 +50,9 @@ WARM = {"NUMBA_CPU_NAME": "generic", "NUMBA_ENABLE_AVX": "0", "PYTHONPATH": str(
 DISK_BYTES = 3_000_000_000
 ROOM = 5_000_000_000
 BUILD_S = 1800.0
+APART = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--")
+"""Before the words of a step that starts others and mounts: all that ends with the step. mmdebstrap binds /dev/shm into
+what it makes, and what it has made is removed when a run is broken off."""
 XZ, ELF = b"\xfd7zXZ\x00", b"\x7fELF"
 Say = Callable[[str], None]
 
@@ -135,15 +138,33 @@ def image(say: Say) -> Image:
     return made
 
 
-def _do(words: list[str], what: str, environment: dict[str, str] | None = None) -> str:
-    """Run a step; what it wrote."""
-    done = subprocess.run(
-        words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        timeout=BUILD_S, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive", **(environment or {})},
-    )  # fmt: skip
-    if done.returncode:
-        raise CannotBench(f"{what} failed with {done.returncode}:\n{done.stdout[-4000:]}")
-    return done.stdout
+_running: set[subprocess.Popen[str]] = set()
+"""Steps, of all threads."""
+
+
+def _do(words: list[str], what: str, environment: dict[str, str] | None = None, apart: bool = False) -> str:
+    """Run a step, which ends when this does, however that ends; what it wrote. ``apart``: see :data:`APART`."""
+    with subprocess.Popen(
+        [*LEASH, *(APART if apart and _may_be_apart() else ()), *words],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "DEBIAN_FRONTEND": "noninteractive", **(environment or {})},
+    ) as step:  # fmt: skip
+        _running.add(step)
+        try:
+            said = step.communicate(timeout=BUILD_S)[0]
+        except subprocess.TimeoutExpired as error:
+            raise CannotBench(f"{what} has not ended within {BUILD_S:.0f} s") from error
+        finally:
+            _running.discard(step)
+            step.kill()
+    if step.returncode:
+        raise CannotBench(f"{what} failed with {step.returncode}:\n{said[-4000:]}")
+    return said
+
+
+def _may_be_apart() -> bool:
+    """Where this is not allowed, nothing can be mounted either."""
+    return subprocess.run([*APART, "true"], capture_output=True).returncode == 0
 
 
 def base(say: Say) -> Path:
@@ -161,7 +182,7 @@ def base(say: Say) -> Path:
             *(f"--customize-hook={hook}" for hook in hooks), SUITE, str(part),
         ]  # fmt: skip
         try:
-            _do(command, "making the base system", {"TMPDIR": str(folder)})
+            _do(command, "making the base system", {"TMPDIR": str(folder)}, apart=True)
             part.replace(tar)
         finally:
             part.unlink(missing_ok=True)
@@ -196,8 +217,15 @@ def _make_image(folder: Path, made: Image, say: Say) -> None:
     root = folder / "root"
     with ThreadPoolExecutor(1) as beside:  # the one takes a processor, the other mostly the network and the disk
         kernels = beside.submit(_compile, say)
-        _install(folder, root, say)
-        plant(root, kernels.result())
+        try:
+            _install(folder, root, say)
+            plant(root, kernels.result())
+        except BaseException:
+            while not kernels.done():
+                for step in tuple(_running):
+                    step.kill()
+                time.sleep(0.02)
+            raise
     part = made.folder.with_name(f"part-{os.getpid()}")
     try:
         part.mkdir(parents=True)
@@ -218,9 +246,8 @@ def _install(folder: Path, root: Path, say: Say) -> None:
     """Debian with the package and the bench's own files, below ``root``."""
     tar = base(say)
     say("packing the daemon")
-    said = _do(
-        [str(ROOT / "systemd/package.sh"), str(folder / "package")], "making the package", {"TMPDIR": str(folder)}
-    )
+    pack = [str(ROOT / "systemd/package.sh"), str(folder / "package")]
+    said = _do(pack, "making the package", {"TMPDIR": str(folder)}, apart=True)
     package = said.split()[-1]
     root.mkdir()
     _do(["tar", "-C", str(root), "-xf", str(tar)], "unpacking the base system")

@@ -18,8 +18,9 @@ TOOLS = {
     "dpkg-deb": "dpkg",
     "chroot": "coreutils",
     "setpriv": "util-linux",
+    "unshare": "util-linux",
 }
-BUILDING = frozenset({"qemu-img", "mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot"})
+BUILDING = frozenset({"qemu-img", "mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot", "unshare"})
 """Those that only making an image takes; running one takes QEMU alone."""
 
 
