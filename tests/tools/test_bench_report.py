@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from daemon.versions import versions
 from tools.bench.plots import Plot, Series, histogram, svg
 from tools.bench.report import About, CannotCompare, Figure, Result, facts, junit, page, read, regressions, write
 
@@ -104,6 +105,11 @@ def test_facts_say_which_software_on_which_computer() -> None:
     assert told["image"] == "x"
     assert "numpy" in told["software"]
     assert "processors" in told["computer"]
+
+
+def test_a_computer_without_git_does_not_lose_the_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert facts()["version"] == versions()["lumiloop"]
 
 
 def test_pictures_are_well_formed_whatever_is_drawn() -> None:

@@ -6,6 +6,7 @@ world (tools/bench/world).
 
 from __future__ import annotations
 
+import contextlib
 import html
 import json
 import math
@@ -108,14 +109,21 @@ class About:
 
 def facts(**more: str) -> dict[str, str]:
     """Which software, on which computer, how busy; and ``more``."""
-    said = subprocess.run(["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True)
     return {
-        "version": said.stdout.strip() or versions()["lumiloop"],
+        "version": _described() or versions()["lumiloop"],
         "software": ", ".join(f"{name} {number}" for name, number in versions().items()),
         "computer": f"{platform.machine()}, {platform.release()}, {os.cpu_count()} processors",
         "load": f"{os.getloadavg()[1]:.1f}",
         **more,
     }
+
+
+def _described() -> str:
+    """Of a git tree, its commit; empty where it is none, or git is not there."""
+    words = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    with contextlib.suppress(OSError):
+        return subprocess.run(words, capture_output=True, text=True).stdout.strip()
+    return ""
 
 
 def junit(results: list[Result], name: str = "bench") -> str:
