@@ -22,6 +22,7 @@ import pytest
 from hal.errors import DeviceMissing
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.world import Room
+from tests.hil.programs import served_receiver
 from tools.bench.report import Seen
 from tools.bench.world import agreement, room
 from tools.bench.world.__main__ import main, twins
@@ -29,6 +30,7 @@ from tools.bench.world.judge import Played, Read, errors_of, judged, pictures
 from tools.bench.world.local import robot
 from tools.bench.world.scenario import BUILT_IN, Expectation, Scenario, ScenarioError, find, load
 from tools.bench.world.serialend import SerialEnd
+from tools.sim.scene_light import SceneLight
 
 ROOT = Path(__file__).parents[2]
 Floats = np.ndarray
@@ -103,6 +105,24 @@ def test_what_cannot_be_played_is_said_with_the_remedy(tmp_path: Path, capsys: p
     assert "results.json" in capsys.readouterr().out
 
 
+def test_a_dac_that_is_not_there_is_named_and_not_the_robot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the bench's own bus nobody acknowledges its address; else all that is said is that no lamp was received."""
+    file = tmp_path / "short.toml"
+    file.write_text('[world]\nlamps = true\nbuilding = "paper_room"\n[drive]\nsettle = 20.0\n' + LEAST)
+    monkeypatch.setattr(SceneLight, "prepare", lambda light: None)
+    monkeypatch.setattr(SceneLight, "sample", lambda light, t: np.zeros(len(t)))
+    with served_receiver(tmp_path) as served:
+        dac = f"dac:{served.partition('@')[0]}@0x60"
+        line = ["--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}", "--light", dac]
+        assert main([str(file), *line]) == 2
+    said = capsys.readouterr().out
+    assert "nobody answers" not in said
+    assert "MCP4725" in said
+    assert "0x60" in said
+
+
 def test_a_robot_computer_that_does_not_answer_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "short.toml"
     file.write_text("[drive]\nsettle = 0.2\n" + LEAST)
@@ -175,6 +195,7 @@ def test_a_pose_is_compared_with_the_truth_where_the_robot_said_it_was() -> None
         (Expectation("state", ("TRACKING",), from_=2.0, within=1.0), {"answered": False}, False),
         (Expectation("never", ("TRACKING",)), {}, False),
         (Expectation("never", ("LOST",)), {}, True),
+        (Expectation("never", ("LOST",)), {"answered": False, "state": ""}, False),
         (Expectation("share", ("TRACKING",), at_least=0.9), {}, True),
         (Expectation("share", ("TRACKING",), at_least=0.9), {"state": "DEGRADED"}, False),
         (Expectation("fault", (104,), within=1.0), {"fault": 104}, True),
@@ -268,6 +289,10 @@ def test_two_runs_are_compared_until_one_closes_a_loop() -> None:
     whole = replace(SCENARIO, faults=())
     early = replace(moved, scenario=whole, reads=[replace(one, loops=int(one.t > 0.5)) for one in moved.reads])
     assert "could be compared" in twins(whole, early).said
+    at_once = replace(moved, reads=[replace(one, loops=int(one.t > 0.05)) for one in moved.reads])
+    way, _, largest = agreement.figures(agreement.trace(at_once), agreement.trace(moved), "x")[0]
+    assert way.value == 0.0
+    assert not largest.value <= 10.0, "what could not be compared does not agree"
 
 
 def test_the_benchs_room_and_lidar_stand_beside_the_others() -> None:

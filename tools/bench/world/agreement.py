@@ -109,11 +109,12 @@ def lateness(tried: Array, traced: Callable[[float], Trace], other: Trace) -> fl
 
 
 def figures(one: Trace, other: Trace, names: str) -> tuple[tuple[Figure, ...], tuple[Plot, ...]]:
-    """For a report; the largest is the last figure."""
+    """For a report; the largest is the last figure. Where no way is in both, there is none to be compared."""
     at, gap = differences(one, other)
+    way, middle, largest = (np.ptp(at), np.median(gap), gap.max()) if len(at) else (0.0, math.nan, math.nan)
     told = (
-        Figure(f"{names}: way compared", float(np.ptp(at)), "m", "less", 0.25),
-        Figure(f"{names}: apart, median", 1e3 * float(np.median(gap)), "mm", "more", 0.5, 2.0),
-        Figure(f"{names}: apart, largest", 1e3 * float(gap.max()), "mm", "more", 0.5, 5.0),
+        Figure(f"{names}: way compared", float(way), "m", "less", 0.25),
+        Figure(f"{names}: apart, median", 1e3 * float(middle), "mm", "more", 0.5, 2.0),
+        Figure(f"{names}: apart, largest", 1e3 * float(largest), "mm", "more", 0.5, 5.0),
     )
     return told, (Plot(f"{names}: apart", "m driven", "mm", (Series("", at.tolist(), (1e3 * gap).tolist()),)),)

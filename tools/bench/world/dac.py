@@ -114,12 +114,12 @@ class Player:
 
 
 class DacThread:
-    """Plays until it is closed; what ends it before that is kept as ``error``."""
+    """Plays until it is closed; what ends it before that is kept as ``lost``."""
 
     def __init__(self, name: str, address: int, source: SampleSource) -> None:
         self._bus = blocking_opener(name)(name)
         self.player = Player(self._bus, address, source)
-        self.error: HalError | None = None
+        self.lost: HalError | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._play, name="dac", daemon=True)
         self._thread.start()
@@ -129,7 +129,7 @@ class DacThread:
             try:
                 self.player.block()
             except OSError as error:
-                self.error = explain(error, self._bus.name, "MCP4725", self.player._address)
+                self.lost = explain(error, self._bus.name, "MCP4725", self.player._address)
                 return
 
     def close(self) -> None:

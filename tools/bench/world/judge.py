@@ -181,8 +181,11 @@ def _clear(expected: Expectation, played: Played, window: list[Read]) -> Verdict
 
 
 def _never(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
-    wrong = [f"{one.state} at {one.t:.1f} s" for one in window if one.state in expected.is_]
-    return not wrong, Seen("; ".join(wrong[:TOLD]) or f"never in {len(window)} reads")
+    heard = [one for one in window if one.answered]
+    if not heard:
+        return False, Seen("nobody answered in that time")
+    wrong = [f"{one.state} at {one.t:.1f} s" for one in heard if one.state in expected.is_]
+    return not wrong, Seen("; ".join(wrong[:TOLD]) or f"never in {len(heard)} reads")
 
 
 def _share(expected: Expectation, played: Played, window: list[Read]) -> Verdict:

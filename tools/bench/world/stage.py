@@ -12,12 +12,12 @@ from collections.abc import Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from hal.clock import SystemClock
-from hal.errors import DeviceRefused
+from hal.errors import DeviceRefused, HalError
 from hal.fake.adc import FakeBuses
 from hal.fake.faults import read_fault
 from hal.fake.hokuyo import FakeHokuyo
@@ -67,6 +67,12 @@ class Ends:
     odometry: str = ""
     light: str = ""
     anyone: bool = False
+
+
+class Port(Protocol):
+    """A port of this computer that may fail while it is played: ``lost`` says how."""
+
+    lost: HalError | None
 
 
 class ForeignSender(UdpSender):
@@ -139,27 +145,34 @@ async def play(scenario: Scenario, ends: Ends, say: Callable[[str], None]) -> Pl
     async with AsyncExitStack() as stack:
         stack.callback(device.close)
         targets: dict[str, Target] = {"lidar": device, "robot": Hands(scene, time.monotonic)}
-        if scene.light is not None:
-            await _light(scene, ends, targets, stack)
+        ports = [] if scene.light is None else await _light(scene, ends, targets, stack)
         schedule = FaultSchedule(targets)
         stack.callback(schedule.close)
         faults = [read_fault(one, f"fault[{k}]", schedule.vocabularies) for k, one in enumerate(scenario.faults)]
-        line = await _connect(device, ends.lidar, stack)
+        ports += await _connect(device, ends.lidar, stack)
         if ends.odometry and scenario.world.odometry:
             await _roll(scene, ends.odometry, stack)
         ears = Ears(*ends.modbus, lamps=scene.light is not None)
         stack.callback(ears.close)
-        standing = await _settled(scenario, ends, ears, say)
+        standing = await _settled(scenario, ends, ears, ports, say)
         scene.release()
         t_go = await _set_off(scene)
         for fault in faults:
             schedule.order(fault)
         say(f"it drives for {scenario.drive.seconds:g} s")
-        await asyncio.sleep(scenario.drive.seconds)
-        if isinstance(line, SerialEnd) and line.lost is not None:
-            raise line.lost
+        until = time.monotonic() + scenario.drive.seconds
+        while (left := until - time.monotonic()) > 0.0:
+            await asyncio.sleep(min(left, WAIT_S))
+            _all_there(ports)
         reads = [_since(one, t_go) for one in ears.reads if one.t >= t_go]
     return _played(scenario, scene, reads, standing, t_go)
+
+
+def _all_there(ports: list[Port]) -> None:
+    """Raise what has become of the first that failed: what is read without it says nothing of the robot computer."""
+    for port in ports:
+        if port.lost is not None:
+            raise port.lost
 
 
 async def _set_off(scene: SimulatedScene) -> float:
@@ -191,7 +204,7 @@ def _played(scenario: Scenario, scene: SimulatedScene, reads: list[Read], standi
     return Played(scenario, reads, lambda t: scene.truth(t + t_go), standing, frozenset(names), strongest)
 
 
-async def _light(scene: SimulatedScene, ends: Ends, targets: dict[str, Target], stack: AsyncExitStack) -> None:
+async def _light(scene: SimulatedScene, ends: Ends, targets: dict[str, Target], stack: AsyncExitStack) -> list[Port]:
     """The lamps' light: as a voltage, or as a converter on a bus that is served."""
     light = scene.light
     assert light is not None
@@ -204,7 +217,7 @@ async def _light(scene: SimulatedScene, ends: Ends, targets: dict[str, Target], 
     if ends.light.startswith("dac:"):
         thread = await asyncio.to_thread(DacThread, bus, int(address, 16), light.sample)
         stack.callback(thread.close)
-        return
+        return [thread]
     device = converter(light, SystemClock())
     targets["adc"] = device
     buses = FakeBuses(SystemClock())
@@ -212,9 +225,10 @@ async def _light(scene: SimulatedScene, ends: Ends, targets: dict[str, Target], 
     server = BusServer(buses, BUS, SystemClock(), anyone=ends.anyone)
     stack.push_async_callback(server.close)
     await server.listen(ends.light)
+    return []
 
 
-async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> object:
+async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> list[Port]:
     """Offer the lidar."""
     if where.startswith("tcp://"):
         host, _, port = where.removeprefix("tcp://").rpartition(":")
@@ -225,11 +239,11 @@ async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> obj
         server = TcpServer(device)
         stack.push_async_callback(server.close)
         await server.listen(host, int(port))
-        return server
+        return []
     if where.startswith("pty:"):
         pty = PtyServer(device, Path(where.removeprefix("pty:")))
         stack.callback(pty.close)
-        return pty
+        return []
     path, _, baud = where.partition("@")
     if not path.startswith("/") or (baud and not baud.isdigit()):
         raise DeviceRefused(
@@ -237,7 +251,7 @@ async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> obj
         )
     line = SerialEnd(device, path, int(baud or 115200))
     stack.callback(line.close)
-    return line
+    return [line]
 
 
 async def _roll(scene: SimulatedScene, where: str, stack: AsyncExitStack) -> None:
@@ -252,12 +266,15 @@ async def _roll(scene: SimulatedScene, where: str, stack: AsyncExitStack) -> Non
     stack.push_async_callback(end)
 
 
-async def _settled(scenario: Scenario, ends: Ends, ears: Ears, say: Callable[[str], None]) -> list[Pose]:
+async def _settled(
+    scenario: Scenario, ends: Ends, ears: Ears, ports: list[Port], say: Callable[[str], None]
+) -> list[Pose]:
     """Wait until the standing robot has a place, and hear for a while where it says that is."""
     host, port = ends.modbus
     say(f"{scenario.title}: waiting for a pose from {host} port {port}")
     begun, since = time.monotonic(), math.inf
     while time.monotonic() - max(since, begun) < STANDING_S or since == math.inf:
+        _all_there(ports)
         last = ears.reads[-1] if ears.reads else Read(0.0, answered=False)
         if last.pose is None or last.state not in PLACED:
             since = math.inf
