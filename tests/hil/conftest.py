@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import time
 from collections.abc import Generator
 from dataclasses import dataclass, field
@@ -131,8 +132,18 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """See early that the run to compare with can be read."""
+    """See early that the run to compare with can be read, and the report be written."""
     config.stash[RESULTS] = {}
+    folder = config.getoption("--hil-report")
+    if folder:
+        try:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise pytest.UsageError(f"--hil-report {folder}: {error.strerror}; name a folder to write into") from error
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise pytest.UsageError(f"--hil-report {folder}: this user may not write into it; name another folder")
+    elif config.getoption("--against"):
+        raise pytest.UsageError("--against compares with the report of this run: say with --hil-report where it goes")
     if config.getoption("--against"):
         try:
             read(Path(config.getoption("--against")))

@@ -20,10 +20,13 @@ from typing import Any, Final
 import pytest
 
 from tests.hil.ends import Operator, SocketOperator
+from tools.bench.vm.places import LEASH
 from tools.clients.read_modbus import Reader
 
 ROOT: Final = Path(__file__).parents[2]
 START_S: Final = 60.0
+TOLD_TO_END: Final = ("setpriv", "--pdeathsig", "TERM")
+"""Before the words of the program under test: when the suite is killed it ends as it should, the laser off."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ def program(named: str) -> list[str]:
 @contextmanager
 def process(command: list[str], ready: Callable[[str], bool]) -> Generator[subprocess.Popen[bytes]]:
     """A program of ours that says on stdout when it is ready; ended with the block."""
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
+    words = [*LEASH, *command]
+    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
         try:
             assert child.stdout is not None
             said, end = "", time.monotonic() + START_S
@@ -129,7 +133,7 @@ def daemon(words: list[str], served: Served, *more: str) -> Generator[Daemon]:
     """`lumiloop run` on a lidar, with its Modbus port on loopback; ended with the block."""
     port = free_port()
     log = served.folder / "daemon.log"
-    command = [*words, "run", "--lidar", served.device, "--set", f"modbus.port={port}", *more]
+    command = [*TOLD_TO_END, *words, "run", "--lidar", served.device, "--set", f"modbus.port={port}", *more]
     with log.open("wb") as said, subprocess.Popen(command, cwd=ROOT, stderr=said) as child:
         try:
             yield Daemon(child, port, log)

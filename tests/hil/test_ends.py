@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -166,6 +167,51 @@ def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Pat
     assert "swing of the signal" in (tmp_path / "report" / "report.html").read_text()
     code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / "none.json"))
     assert (code, "name the results.json" in said) == (4, True)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--against", "old.json"], "say with --hil-report where it goes"),
+        (["--hil-report", "/proc/here"], "--hil-report /proc/here: No such file or directory; name a folder"),
+        (["--hil-report", "/dev/null"], "--hil-report /dev/null: File exists"),
+    ],
+)
+def test_a_report_that_cannot_be_is_refused_before_anything_is_tried(options: list[str], says: str) -> None:
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/hil", "-k", "light_levels"]
+    done = subprocess.run([*words, *options], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, says in done.stderr) == (4, True), done.stderr
+
+
+STARTS = """
+import sys, time
+from pathlib import Path
+from tests.hil.programs import Served, daemon, process
+folder = Path(sys.argv[1])
+waits = "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(open(sys.argv.pop(), 'w').close()))"
+words = [sys.executable, "-c", waits + "; print('on', file=sys.stderr, flush=True); time.sleep(60)"]
+with process([*words, str(folder / "fake")], lambda said: "on" in said) as one:
+    with daemon(words, Served("line", None, folder), str(folder / "ended")) as other:
+        time.sleep(1.0)
+        print(one.pid, other.child.pid, flush=True)
+        time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_suite_that_is_killed_leaves_no_program_behind(number: int, tmp_path: Path) -> None:
+    """What it has started for itself ends; the program under test is told to end, so that the laser is switched off."""
+    with subprocess.Popen([sys.executable, "-c", STARTS, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE) as suite:
+        assert suite.stdout is not None
+        started = [Path("/proc", word) for word in suite.stdout.readline().decode().split()]
+        assert len(started) == 2
+        suite.send_signal(number)
+        suite.wait(10.0)
+    end = time.monotonic() + 10.0
+    while any(one.exists() and "Z" not in (one / "stat").read_text().rpartition(")")[2] for one in started):
+        assert time.monotonic() < end, "they go on"
+        time.sleep(0.05)
+    assert (tmp_path / "ended").exists()
 
 
 @pytest.mark.parametrize("name", ["/dev/i2c-1", "@0x4d", "/dev/i2c-1@4d,", "/dev/i2c-1@"])
