@@ -11,6 +11,14 @@ from typing import Final
 
 SERVICE: Final = Path("/run/lumiloop")
 """The service manager's RuntimeDirectory."""
+SERVICE_STATE: Final = Path("/var/lib/lumiloop")
+"""The service manager's StateDirectory."""
+
+
+def recordings_folder(name: str) -> Path:
+    """Where a folder of that name is in which the flight recorder writes: below our state, else below the service's."""
+    own, service = state_folder() / name, SERVICE_STATE / name
+    return service if _there(service) and not _there(own) else own
 
 
 def state_folder(environment: Mapping[str, str] = os.environ) -> Path:

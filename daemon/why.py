@@ -21,7 +21,7 @@ from daemon import cli, warmup, whyplot, whysaid
 from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.extras import how_to_install
-from daemon.folders import state_folder
+from daemon.folders import SERVICE_STATE, recordings_folder
 from daemon.replay import NOTHING_GIVEN, config_for, lights_for, start_for
 from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused
@@ -31,9 +31,10 @@ from daemon.whysaid import Moment
 from hal.errors import DataInvalid, HalError
 from hal.replay.recording import SUFFIX, open_recording
 from hal.replay.report import LogReport
+from hal.replay.text import unreadable
 
 FLIGHT: Final = "flight"
-"""Folder below the state directory in which recordings are looked for where none is named."""
+"""Folder below the state directory, ours or else the service's, where recordings are looked for if none is named."""
 BEFORE_S, AFTER_S = 20.0, 5.0
 """How much around the moment is looked at."""
 EVER_S: Final = 1e11
@@ -63,10 +64,11 @@ class Span:
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; ``args``: the ``time`` as it was typed, ``log`` or None, where to draw (``out``) or None."""
-    folder = args.log or state_folder() / FLIGHT
-    if args.log is None and not folder.is_dir():
-        return cli.fail(f"nothing is recorded in {folder}; name a recording, or run with --record {folder} --last 10")
+    folder = args.log or recordings_folder(FLIGHT)
     try:
+        if args.log is None and not _is_folder(folder):
+            looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
+            return cli.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
         span, utc = find(spans(folder), args.time, folder)
         told, rerun = moments(span, utc)
         second = whole_second(args.time)
@@ -97,7 +99,10 @@ def spans(folder: Path) -> list[Span]:
     Raises:
         HalError: it cannot be read, or there is none.
     """
-    inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    try:
+        inside = sorted(path for path in folder.iterdir() if path.is_dir()) if _is_folder(folder) else []
+    except OSError as error:
+        raise unreadable(folder, error) from error
     runs = [path for path in inside if any(path.glob(f"*{SUFFIX}"))] or [folder]
     found = []
     for path in runs:
@@ -108,6 +113,14 @@ def spans(folder: Path) -> list[Span]:
                 raise
             cli.say(f"{error}: passed over")
     return found
+
+
+def _is_folder(path: Path) -> bool:
+    """Raises `HalError` where that may not be known: what the service records lies in a folder of its own."""
+    try:
+        return path.is_dir()
+    except OSError as error:
+        raise unreadable(path, error) from error
 
 
 def _span(path: Path) -> Span:
@@ -181,7 +194,7 @@ def meant(words: str, span: Span) -> list[float]:
             midnight = first.replace(hour=0, minute=0, second=0, microsecond=0)
             return [(midnight + timedelta(days=day) + at).timestamp() for day in range(days)]
         return [datetime.fromisoformat(text).astimezone().timestamp()]  # without a zone: local time
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise NoMoment(
             f"{words}: not a time; write 21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning"
         ) from error
@@ -189,9 +202,10 @@ def meant(words: str, span: Span) -> list[float]:
 
 def _time_of(text: str) -> timedelta:
     hours, minutes, *seconds = text.split(":")
-    if int(hours) > 23 or int(minutes) > 59:
+    at = timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds[0]) if seconds else 0.0)
+    if int(hours) > 23 or int(minutes) > 59 or at >= timedelta(hours=int(hours), minutes=int(minutes) + 1):
         raise ValueError(text)
-    return timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds[0]) if seconds else 0.0)
+    return at
 
 
 def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:

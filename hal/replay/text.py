@@ -31,7 +31,7 @@ def unreadable(path: Path, error: OSError) -> HalError:
     if error.errno == errno.EISDIR:
         return DeviceRefused(str(path), "is a folder", "name the log file inside it")
     if error.errno in (errno.EACCES, errno.EPERM):
-        return DeviceRefused(str(path), "may not be read by this user", f"chmod a+r {path}")
+        return DeviceRefused(str(path), "may not be read by this user", f"run it with sudo, or: chmod a+rX {path}")
     return DeviceRefused(str(path), f"cannot be read: {error.strerror or error}", "check the disk and the path")
 
 

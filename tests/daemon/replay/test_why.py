@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import blackbox, cli, disk, whyplot
+from daemon import blackbox, cli, disk, folders, whyplot
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
 from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
@@ -66,10 +69,58 @@ def test_without_a_zone_it_is_local_time() -> None:
     assert find([SPAN], f"{local:%Y-%m-%dT%H:%M:%S}", Path())[1] - AT == 5.0
 
 
-@pytest.mark.parametrize("words", ["yesterday", "25:00:00", "21:61", "", "nan", "-5", "2023-13-01T00:00:00Z"])
+@pytest.mark.parametrize(
+    "words", ["yesterday", "25:00:00", "21:61", "", "nan", "-5", "2023-13-01T00:00:00Z", "21:14:60", "0001-01-01T00:00"]
+)
 def test_what_is_no_time_is_refused_with_the_ways_to_write_one(words: str) -> None:
     with pytest.raises(NoMoment, match="write 21:14:07"):
         meant(words, SPAN)
+
+
+def test_a_time_beyond_all_calendars_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as there:
+        there.setenv("TZ", "EST5")
+        time.tzset()
+        with pytest.raises(NoMoment, match="write 21:14:07"):
+            meant("9999-12-31T23:59", SPAN)
+    time.tzset()
+
+
+def test_what_the_service_records_is_looked_for_where_we_have_recorded_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "ours"))
+    monkeypatch.setattr(folders, "SERVICE_STATE", tmp_path / "service")
+    assert cli.main(["why", "3"]) == 1
+    said = capsys.readouterr().err
+    assert f"nothing is recorded in {tmp_path}/ours/flight, nor in " in said
+    assert f"--record {tmp_path}/ours/flight --last 10" in said
+    (tmp_path / "service" / "flight").mkdir(parents=True)
+    assert cli.main(["why", "3"]) == 1
+    assert f"{tmp_path}/service/flight: holds no recording" in capsys.readouterr().err
+    (tmp_path / "ours" / "flight").mkdir(parents=True)
+    assert cli.main(["why", "3"]) == 1
+    assert f"{tmp_path}/ours/flight: holds no recording" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_recording_that_is_not_open_to_this_user_is_said_to_be_so(
+    named: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service's folder is its own; tests may run as root, to whom all is open, so the system's answer is played."""
+    service = tmp_path / "service"
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "ours"))
+    monkeypatch.setattr(folders, "SERVICE_STATE", service)
+    stat = Path.stat
+
+    def closed(path: Path, **how: bool) -> os.stat_result:
+        if service in path.parents:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat(path, **how)
+
+    monkeypatch.setattr(Path, "stat", closed)
+    assert cli.main(["why", "3", *([str(service / "flight")] if named else [])]) == 1
+    assert f"{service}/flight: may not be read by this user (run it with sudo" in capsys.readouterr().err
 
 
 def test_of_two_recordings_the_one_with_more_before_it_is_taken() -> None:
