@@ -1,6 +1,7 @@
 """``python -m tests.logs [NAME ...]``: replay every log and hold it against its golden poses.
 
-Ends with 1 where one has moved. What is meant is blessed: ``python -m tests.logs.bless --reason TEXT [NAME ...]``.
+Ends with 1 where one has moved, or is not the log that was blessed. What is meant is blessed:
+``python -m tests.logs.bless --reason TEXT [NAME ...]``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from tests.logs import golden
 from tests.logs.bless import NO_DATA
-from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, replayed
+from tests.logs.catalog import BY_NAME, ENTRIES, Entry, OtherLog, ledger_of, replayed
 
 
 def checked(entry: Entry, root: Path | None) -> golden.Verdict:
@@ -33,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
     data = os.environ.get("LUMILOOP_DATA")
-    moved = []
+    moved, missing = [], []
     for entry in ENTRIES:
         if args.name and entry.name not in args.name:
             continue
@@ -41,7 +42,12 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.write(f"{entry.name:<6} not replayed: {NO_DATA}\n")
             continue
         begun = time.monotonic()
-        verdict = checked(entry, Path(data) if data else None)
+        try:
+            verdict = checked(entry, Path(data) if data else None)
+        except OtherLog as error:
+            missing.append(entry.name)
+            sys.stdout.write(f"{entry.name:<6} not replayed: {error}\n")
+            continue
         moved += [] if verdict.same else [entry.name]
         said = (
             f"{entry.name:<6} {'same ' if verdict.same else 'MOVED'} {time.monotonic() - begun:5.1f} s  {verdict.said}"
@@ -50,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.flush()
     if moved:
         sys.stdout.write(f"look at the change; if it is meant: {golden.REMEDY} {' '.join(moved)}\n")
-    return int(bool(moved))
+    return int(bool(moved or missing))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from tests.logs import golden
-from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, origin, replayed
+from tests.logs.catalog import BY_NAME, ENTRIES, Entry, OtherLog, ledger_of, origin, replayed
 
 NO_DATA = "LUMILOOP_DATA does not name the folder of real logs"
 
@@ -47,14 +47,19 @@ def main() -> int:
     if unknown:
         parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
     data = os.environ.get("LUMILOOP_DATA")
+    left = []
     for entry in ENTRIES:
         if args.name and entry.name not in args.name:
             continue
         if entry.source and not data:
             sys.stdout.write(f"{entry.name}: left as it is, {NO_DATA}\n")
             continue
-        sys.stdout.write(bless(entry, Path(data) if data else None, args.reason) + "\n")
-    return 0
+        try:
+            sys.stdout.write(bless(entry, Path(data) if data else None, args.reason) + "\n")
+        except OtherLog as error:
+            sys.stdout.write(f"{entry.name}: left as it is, {error}\n")
+            left.append(entry.name)
+    return int(bool(left))
 
 
 if __name__ == "__main__":

@@ -57,11 +57,15 @@ ENTRIES: Final = (
 BY_NAME: Final = {entry.name: entry for entry in ENTRIES}
 
 
+class OtherLog(AssertionError):
+    """The source is not there, or is not the log that was blessed; the text says which."""
+
+
 def prepared(entry: Entry, root: Path | None, folder: Path) -> Path:
     """The log as replay reads it; converted or made in ``folder`` where it has to be.
 
     Raises:
-        AssertionError: the source is not the log that was blessed.
+        OtherLog: the source is not the log that was blessed.
     """
     if entry.name in made.MADE:
         return made.unpacked(entry.name, folder)
@@ -69,8 +73,12 @@ def prepared(entry: Entry, root: Path | None, folder: Path) -> Path:
         return carmen(folder / "room.log", drive())
     assert root is not None
     source = root / entry.source
-    digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    assert digest == entry.sha256, f"{source} is another log than the one that was blessed: {digest}"
+    try:
+        digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    except OSError as error:
+        raise OtherLog(f"{source}: {error.strerror}; LUMILOOP_DATA names the folder of real logs") from error
+    if digest != entry.sha256:
+        raise OtherLog(f"{source} is another log than the one that was blessed: its SHA-256 is {digest}")
     if source.suffix == ".npz" or ".dat" in source.name:
         log = folder / f"{entry.name}.log"
         assert convert.main([str(source), str(log)]) == 0

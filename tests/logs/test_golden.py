@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daemon.results import Trajectory
 from estimator.result import Loop
-from tests.logs import golden, made
+from tests.logs import bless, golden, made
 from tests.logs.__main__ import main
 from tests.logs.catalog import ENTRIES, Entry, ledger_of, origin
 from tests.logs.conftest import Replayed
@@ -59,6 +60,24 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
     monkeypatch.setattr(golden, "load", lambda name: near)
     assert main(["room"]) == 0
     assert "another processor, or other versions: 0.0009" in capsys.readouterr().out
+
+
+def test_a_log_that_is_not_there_or_another_one_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LUMILOOP_DATA", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["bless", "--reason", "only a trial of it", "scip"])
+    before = (golden.FOLDER / "scip.txt").read_bytes()
+    log = tmp_path / "scip" / "example_urg_04lx.logr"
+    for said in ("No such file or directory; LUMILOOP_DATA names", "is another log than the one that was blessed"):
+        assert main(["scip"]) == 1
+        assert f"not replayed: {log}" in (told := capsys.readouterr().out)
+        assert said in told
+        assert bless.main() == 1
+        assert f"scip: left as it is, {log}" in capsys.readouterr().out
+        log.parent.mkdir(exist_ok=True)
+        log.write_bytes(b"another log")
+    assert (golden.FOLDER / "scip.txt").read_bytes() == before
 
 
 def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
