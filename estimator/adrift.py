@@ -136,7 +136,6 @@ def keyframe_laid(state: State, frame: Keyframe) -> None:
     around = windows(state, frame)
     if around is None and light_is_coming(state):
         return
-    atlas.seek.lit = frame.key, len(around or ())
     look_for(state, frame, around)
 
 
@@ -147,8 +146,12 @@ def look_for(state: State, frame: Keyframe, around: tuple[Around, ...] | None) -
     if not pieces or told is None:
         return
     seek, asked = atlas.seek, atlas.seek.alive
+    seek.lit = frame.key
+    due = seek.due(frame) or seek.elsewhere(around or ())
+    if due:
+        seek.around = around or ()
     guesses = tuple(se2.compose(one.T_map_odom, frame.T_odom_keyframe) for one in asked)
-    query = Query(frame, pieces, seek.terrain, guesses, seek.past, seek.due(frame), around)
+    query = Query(frame, pieces, seek.terrain, guesses, seek.past, due, around, outvoted=around is not None)
     then = partial(take_look, state, seek, frame, asked)
     seek.job = atlas.ask(LOOK, partial(look, query, told), then)
 
@@ -175,12 +178,12 @@ def step_done(state: State) -> None:
     allowed = windows(state, frame)
     if allowed is None and not (seek.looks == 0 and state.fused.t_mono - seek.t_begin > PATIENCE_S):
         return
-    asked = frame.key, len(allowed or ())
-    stale = asked == seek.lit and seek.looks and not seek.alive and state.since_keyframe > STALE
+    asked = seek.lit == frame.key and not seek.elsewhere(allowed or ())
+    stale = asked and seek.looks and not seek.alive and state.since_keyframe > STALE
     if stale or (allowed and state.failures >= UNFIT):
         afresh(state)  # it stands and was not found, or was just put down: what was kept says nothing of where it is
-    elif asked != seek.lit:
-        seek.lit, seek.searched = asked, None
+    elif not asked:
+        seek.searched = None
         look_for(state, frame, allowed)
 
 

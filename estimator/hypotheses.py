@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
+from estimator.globalsearch import Around
 from estimator.keyframe import Keyframe
 from estimator.leap import Leap
 from estimator.records import Array
@@ -36,7 +37,7 @@ MOST: Final = 32
 """Hypotheses carried at most."""
 
 BEHIND: Final = 0.15
-"""Share of the beams by which a place that was never held must fit worse than the one that was, to be no rival."""
+"""By how much the worth of a place that was never held must be less than that of the one that was, to be no rival."""
 
 NEARLY, NEARLY_M, NEARLY_RAD = 0.75, 0.1, 0.03
 """Share of the beams, and deviations, of a place that another witness may confirm though no look has held it."""
@@ -83,6 +84,10 @@ class Hypothesis:
         held = (*self.held[:1], *self.held[1:][-HELD:], (frame, fit))
         return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share, (frame, fit), self.holds + 1)
 
+    def worth(self) -> float:
+        """The share of the beams that fit, less that of the evidence which spoke against it at the latest look."""
+        return self.share - (0.0 if self.latest is None else self.latest[1].against)
+
     def apart(self) -> float:
         """Metres between the places it was held from."""
         at = np.array([frame.T_odom_keyframe[:2] for frame, _ in self.held]).reshape(-1, 2)
@@ -97,7 +102,8 @@ class Seek:
         alive: places left. past: some earlier keyframes that were looked for. complete: the latest search was; then
             nothing but ``alive`` is left. searched: where that was (odom frame). terrain: of the latest look.
         job: ID of the look under way. looks: so far. hint: T_map_odom by a person who has said where the robot is, and
-            how many looks have not found it there. lit: keyframe and number of light's windows of the latest look.
+            how many looks have not found it there. lit: keyframe of the latest look. around: light's windows where it
+            was searched.
         t_begin: instant of the first keyframe. way_begin: way driven when light was first good.
         remembered: T_map_odom if the robot has not been moved since the run before; None: nobody knows.
     """
@@ -110,7 +116,8 @@ class Seek:
     job: int = 0
     looks: int = 0
     hint: tuple[Array, int] | None = field(default=None)
-    lit: tuple[int, int] = (0, 0)
+    lit: int = 0
+    around: tuple[Around, ...] = ()
     t_begin: float = math.inf
     way_begin: float = math.inf
     remembered: Array | None = None
@@ -123,6 +130,12 @@ class Seek:
         part = 1.0 if self.alive and self.complete else SOONER
         return math.hypot(x, y) > part * AGAIN_M or abs(yaw) > part * AGAIN_RAD
 
+    def elsewhere(self, around: tuple[Around, ...]) -> bool:
+        """Whether light's windows are others than those that were searched."""
+        if len(around) != len(self.around):
+            return True
+        return not all(any(within(one, other) for other in self.around) for one in around)
+
     def take(self, frame: Keyframe, asked: tuple[Hypothesis, ...], looked: Looked) -> None:
         """Take in a look at ``frame``, which was asked for the hypotheses ``asked``."""
         fits = zip(asked, looked.guesses, strict=True)
@@ -130,7 +143,7 @@ class Seek:
         for fit, earlier in looked.fresh:
             found = Hypothesis(carried(frame, fit))
             for before, past in zip(self.past, earlier, strict=True):
-                found = found.after(before, past)
+                found = found if past.verdict is Verdict.NO else found.after(before, past)
             alive.append(replace(found, T_map_odom=carried(frame, fit)).after(frame, fit))
         alive = distinct([one for one in alive if one.idle < IDLE], frame)
         self.alive, self.terrain, self.looks = tuple(alive[:MOST]), looked.terrain, self.looks + 1
@@ -146,11 +159,11 @@ class Seek:
         held = [one for one in held if not outdone(one, held)]
         if len(held) > 1 or not self.alive:
             return None
-        best = held[0] if held else max(self.alive, key=lambda one: one.share)
-        behind = [one.share < best.share - BEHIND for one in self.alive if one is not best]
+        best = held[0] if held else max(self.alive, key=Hypothesis.worth)
+        behind = [one.worth() < best.worth() - BEHIND for one in self.alive if one is not best]
         if not all(behind):
             return None
-        return best if held else nearly(best)
+        return best if held and not best.idle else nearly(best)
 
     def sure(self, one: Hypothesis, witnessed: bool) -> bool:
         """Whether a place is the robot's; ``witnessed``: something else than the laser says so.
@@ -173,6 +186,12 @@ class Seek:
             return None
         rivals = [one for one in self.alive if one is not here[0]]
         return None if any(one.held or one.share >= here[0].share for one in rivals) else here[0]
+
+
+def within(one: Around, other: Around) -> bool:
+    """Whether the middle of a window lies in another one."""
+    x, y, _ = (one.T_map_lidar - other.T_map_lidar).tolist()
+    return math.hypot(x, y) < other.reach_m
 
 
 def near(remembered: Array, T_map_odom: Array) -> bool:

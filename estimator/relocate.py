@@ -107,8 +107,10 @@ class Query:
     Attributes:
         frame: keyframe to look for. pieces: where. before: terrain of an earlier look.
         guesses: where it should be by what was found earlier: T_map_keyframe each.
-        past: earlier keyframes, of which a new place has to be true as well.
+        past: earlier keyframes, of which a new place has to be true as well unless something else says so (`outvoted`):
+            they may have been taken in somebody's hands.
         search: whether new places are searched for. windows: where; everywhere if None. nodes: most that are opened.
+        outvoted: whether something else says that the robot is in the windows, or at the guesses; see `fit`.
     """
 
     frame: Keyframe
@@ -119,6 +121,7 @@ class Query:
     search: bool = True
     windows: tuple[Around, ...] | None = None
     nodes: int = NODES
+    outvoted: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,8 +145,7 @@ def look(query: Query, told: LoopSettings) -> Looked:
     """Look for a keyframe in the whole map."""
     terrain = terrain_of(query.pieces, query.before)
     view = view_of(query.frame, told)
-    outvoted = query.windows is not None
-    guesses = tuple(fit(view, terrain, T, told, outvoted) for T in query.guesses)
+    guesses = tuple(fit(view, terrain, T, told, query.outvoted) for T in query.guesses)
     if view is None or not query.search:
         return Looked(terrain, guesses, (), None, 0)
     hits, complete, nodes = searched(query, terrain, view)
@@ -153,15 +155,15 @@ def look(query: Query, told: LoopSettings) -> Looked:
     for T in hits:
         if any(same(T, other) for other in known):
             continue
-        one = fit(view, terrain, T, told, outvoted)
+        one = fit(view, terrain, T, told, query.outvoted)
         if one.verdict is Verdict.NO or any(same(one.T_map_keyframe, other) for other in known):
             continue
         known.append(one.T_map_keyframe)
         earlier = []
         for frame, seen in past:
             T_back = se2.between(query.frame.T_odom_keyframe, frame.T_odom_keyframe)
-            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), told, outvoted))
-        if all(other.verdict is not Verdict.NO for other in earlier):
+            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), told, query.outvoted))
+        if query.outvoted or all(other.verdict is not Verdict.NO for other in earlier):
             fresh.append((one, tuple(earlier)))
     return Looked(terrain, guesses, tuple(fresh), complete, nodes)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from estimator import adrift
+from estimator import adrift, se2
 from estimator.atlas import LOOK
 from estimator.hypotheses import Watch
 from estimator.keyframe import Keyframe
@@ -32,8 +32,18 @@ def keyframe_laid(state: State, frame: Keyframe) -> None:
     older = [one for one in atlas.settled() if one.key < watch.first]
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
     if pieces:
-        query = Query(frame, pieces, watch.terrain, (frame.T_map_keyframe,), (), search=False)
+        guess = (frame.T_map_keyframe,)
+        query = Query(frame, pieces, watch.terrain, guess, (), search=False, outvoted=lit(state))
         watch.job = atlas.ask(LOOK, partial(look, query, told), partial(take, state, watch))
+
+
+def lit(state: State) -> bool:
+    """Whether light has the robot here too: then one witness of the map does not rule the place out."""
+    if state.light is None:
+        return False
+    from estimator.relocate_light import witness
+
+    return witness(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
 
 
 def take(state: State, watch: Watch, payload: object) -> None:

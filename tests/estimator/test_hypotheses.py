@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from estimator import se2
+from estimator.globalsearch import Around
 from estimator.hypotheses import HELD, Hypothesis, Seek
 from estimator.keyframe import Keyframe, keep
 from estimator.relocate import Fit, Looked, Terrain, Verdict
@@ -35,6 +36,14 @@ def looked_at(verdicts: list[Verdict]) -> tuple[Seek, Hypothesis | None]:
         frame = frame_at(1.0 + 0.5 * k)
         seek.take(frame, seek.alive, Looked(TERRAIN, tuple(fit(frame, verdict) for _ in seek.alive), (), True, 0))
     return seek, seek.alive[0] if seek.alive else None
+
+
+def test_an_earlier_keyframe_that_speaks_against_a_place_that_was_offered_all_the_same_is_no_look_at_it() -> None:
+    seek, frame = Seek(past=(frame_at(0.0), frame_at(0.7))), frame_at(1.4)
+    earlier = tuple(fit(before, verdict) for before, verdict in zip(seek.past, (NO, HOLDS), strict=True))
+    seek.take(frame, (), Looked(TERRAIN, (), ((fit(frame, HOLDS), earlier),), True, 0))
+    (one,) = seek.alive
+    assert (one.looks, one.holds) == (2, 2)
 
 
 HOLDS, OPEN, NO = Verdict.HOLDS, Verdict.OPEN, Verdict.NO
@@ -101,3 +110,35 @@ def test_a_place_that_looks_have_lost_while_they_held_another_is_no_rival(lost: 
         seek.take(frame, seek.alive, Looked(TERRAIN, (fit(frame, HOLDS), there), (), True, 0))
     assert len(seek.alive) == 2
     assert (seek.favourite() is not None) is decided
+
+
+def test_a_place_that_was_held_and_then_nearly_is_as_good_as_one_that_never_was() -> None:
+    """Somebody has come by: light is believed of it at once, and not only when it is held again."""
+    for verdicts in ([HOLDS, OPEN, OPEN], [OPEN, OPEN, OPEN]):
+        seek, one = looked_at(verdicts)
+        assert one is not None
+        best = seek.favourite()
+        assert best is not None
+        assert seek.sure(best, True)
+        assert not seek.sure(best, False)
+
+
+@pytest.mark.parametrize(("share", "against", "decided"), [(0.85, 0.0, False), (0.85, 0.14, True), (0.7, 0.0, True)])
+def test_what_speaks_against_a_place_counts_beside_what_fits(share: float, against: float, decided: bool) -> None:
+    """Turned round in a corridor nearly all beams fit, and the few that do not speak against it."""
+    far = np.array((9.0, 0.0, np.pi))
+    seek, frame = Seek(alive=(Hypothesis(se2.identity()), Hypothesis(far))), frame_at(1.0)
+    there = replace(fit(frame, OPEN), T_map_keyframe=se2.compose(far, frame.T_odom_keyframe), share=share)
+    seek.take(frame, seek.alive, Looked(TERRAIN, (fit(frame, HOLDS), replace(there, against=against)), (), True, 0))
+    assert (seek.favourite() is not None) is decided
+
+
+def test_light_that_has_come_to_have_the_robot_elsewhere_is_looked_for_there() -> None:
+    def window(x: float) -> Around:
+        return Around(np.array((x, 2.0, 0.0)), 0.8, np.pi)
+
+    seek = Seek(around=(window(1.0), window(9.0)))
+    assert not seek.elsewhere((window(1.5), window(9.4)))
+    assert seek.elsewhere((window(1.0),))
+    assert seek.elsewhere((window(1.0), window(3.0)))
+    assert not Seek().elsewhere(())

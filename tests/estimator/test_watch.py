@@ -12,6 +12,7 @@ from estimator.atlas import Atlas
 from estimator.closing import take_answer
 from estimator.hypotheses import Watch
 from estimator.keyframe import Keyframe, Submap
+from estimator.light import Light, LightsSetup
 from estimator.livemap import LiveMap, go_on
 from estimator.loop import LoopSettings
 from estimator.mapimage import image_of
@@ -75,6 +76,21 @@ def test_a_keyframe_is_held_against_the_older_map_alone_and_one_look_at_a_time()
     }
     assert len(found.guesses) == 1
     assert found.fresh == ()
+
+
+@pytest.mark.parametrize("witness", [True, False])
+def test_one_witness_of_the_map_against_a_place_where_light_has_the_robot_does_not_count(
+    witness: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A door that stood open then is shut now."""
+    state, _, frame = watched()
+    state.light = Light(LightsSetup())
+    monkeypatch.setattr("estimator.relocate_light.witness", lambda *_: witness)
+    monkeypatch.setattr(watch, "look", lambda query, _: query.outvoted)
+    state.atlas.take_jobs()
+    watch.keyframe_laid(state, frame)
+    (job,) = state.atlas.take_jobs()
+    assert job.run() is witness
 
 
 def test_after_its_way_the_watch_is_over() -> None:

@@ -1,0 +1,45 @@
+"""Where in the whole map a keyframe fits: what may rule a new place out."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from estimator import se2
+from estimator.globalsearch import Around
+from estimator.keyframe import Keyframe, keep
+from estimator.loop import LoopSettings
+from estimator.records import Array
+from estimator.relocate import Piece, Query, look, same
+from tests.estimator.adrift import BEAMS, furnished, mapped
+from tests.estimator.world import scan_in
+
+pytestmark = pytest.mark.jit
+
+TOUR = ((1.0, 6.0), (10.8, 6.0), (1.85, 6.0), (1.85, 1.5), (1.85, 6.0), (5.85, 6.0), (5.85, 1.5))
+HERE, EARLIER = np.array((1.85, 3.0, -1.5)), np.array((5.85, 3.0, -1.2))
+
+
+@cache
+def pieces() -> tuple[Piece, ...]:
+    return tuple(Piece(key, T, settled) for key, (T, settled) in enumerate(mapped(furnished(), TOUR), 1))
+
+
+def seen_from(key: int, T: Array, T_odom: Array) -> Keyframe:
+    rng = np.random.default_rng(key)
+    return keep(key, T_odom, T_odom, scan_in(furnished(), T, BEAMS, rng), 0.0)
+
+
+@pytest.mark.parametrize(("carried", "outvoted", "found"), [(0, 0, 1), (1, 0, 0), (1, 1, 1)])
+def test_what_was_seen_before_rules_a_new_place_out_unless_light_or_a_person_has_the_robot_there(
+    carried: bool, outvoted: bool, found: bool
+) -> None:
+    """A keyframe taken in somebody's hands is off by what the wheels have not counted."""
+    frame = seen_from(2, HERE, np.zeros(3))
+    before = seen_from(1, EARLIER, np.zeros(3) if carried else se2.between(HERE, EARLIER))
+    window = Around(np.array((*HERE[:2], 0.0)), 0.9, np.pi)
+    query = Query(frame, pieces(), None, (), (before,), windows=(window,), outvoted=outvoted)
+    places = [one.T_map_keyframe for one, _ in look(query, LoopSettings()).fresh]
+    assert any(same(HERE, T) for T in places) == found
