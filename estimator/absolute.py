@@ -82,7 +82,8 @@ class Absolute:
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None: either is unknown.
         odd_since: since when they have disagreed. doubted_at: when that was last no reason to follow light.
         elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
-            itself has had the robot elsewhere.
+            itself has had the robot elsewhere. unheard: the laser has found the place while the `lights` filter held
+            another one, and the two have not agreed since.
         way, way_young: driven so far, and when light last began to find the place. way_start: of the `lights` filter,
             the start that has led to the place on which the two last agreed.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
@@ -104,6 +105,7 @@ class Absolute:
     doubted_at: float = -math.inf
     elsewhere_since: float | None = None
     aside_since: float | None = None
+    unheard: bool = False
     way: float = 0.0
     way_young: float = 0.0
     way_start: float = -math.inf

@@ -119,8 +119,14 @@ def disown(state: State, first: int, since: int) -> None:
 
 def places(state: State) -> int | None:
     """How many places fit, None where the place is known (see `StepResult.places`); light alone may know it too."""
-    lit = state.absolute is not None and state.absolute.placed and absolute.blind(state)
-    return None if state.atlas.adrift is None or lit else len(state.atlas.seek.alive)
+    if state.atlas.adrift is None:
+        return None
+    lit = absolute.tells(state) and absolute.blind(state)
+    if lit:
+        from estimator.relocate_light import disputed  # costs nothing where there is no photodiode
+
+        lit = not disputed(state)
+    return None if lit else len(state.atlas.seek.alive)
 
 
 def hinted(state: State) -> None:
@@ -213,15 +219,19 @@ def doubt(state: State) -> None:
     The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here. Where
     light once proved the place, it must also receive a lamp that cannot be received here, or, where scans do not fit or
     did not, epochs read by themselves must have the robot elsewhere: the filter itself can be led astray by wheels, and
-    a robot that the laser holds is not set adrift for that.
+    a robot that the laser holds is not set adrift for that. A place that was found before the filter agreed is no such
+    proof: it may have been found in somebody's hands.
     """
     from estimator import relocate_light
 
-    tie = state.absolute
+    tie, light = state.absolute, state.light
     assert tie is not None
+    assert light is not None
     if not relocate_light.disputed(state):
-        tie.elsewhere_since = tie.aside_since = None
+        tie.elsewhere_since, tie.aside_since, tie.unheard = None, None, False
         return
+    if tie.gap is not None and tie.gap <= SURPRISE and not relocate_light.contradicted(light.filter):
+        tie.unheard = False  # the filter is at a new place already, and that is here
     now = state.fused.t_mono
     tie.elsewhere_since = now if tie.elsewhere_since is None else tie.elsewhere_since
     here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
@@ -229,7 +239,8 @@ def doubt(state: State) -> None:
     aside = (unfit or tie.broken) and relocate_light.glimpsed_elsewhere(state, here)
     tie.aside_since = (now if tie.aside_since is None else tie.aside_since) if aside else None
     aside = tie.aside_since is not None and (unfit or now - tie.aside_since >= ASIDE_S)
-    if tie.proved and not aside and not relocate_light.out_of_place(state, here):
+    held = tie.proved and not (tie.unheard and unfit)
+    if held and not aside and not relocate_light.out_of_place(state, here):
         return
     sure = now - tie.elsewhere_since >= ELSEWHERE_S and relocate_light.elsewhere(state, here)
     if (sure or unfit or aside) and afresh(state):
@@ -280,8 +291,17 @@ def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis
     if seek.hint is not None and not seek.alive:
         T_map_odom, looks = seek.hint
         seek.hint = (T_map_odom, looks + 1) if looks + 1 < HINT_LOOKS else None
-    seek.alive = tuple(one for one in seek.alive if said(state, one) is not False)
+    seek.alive = tuple(one for one in seek.alive if not ruled_out(state, one))
     decide(state)
+
+
+def ruled_out(state: State, one: Hypothesis) -> bool:
+    """Whether light has no hypothesis there; for good, which one epoch by itself cannot say."""
+    if state.light is None or said(state, one) is not False:
+        return False
+    from estimator.relocate_light import contradicted
+
+    return not contradicted(state.light.filter)
 
 
 def decide(state: State) -> None:
@@ -371,7 +391,7 @@ def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> 
     tie = state.absolute
     if tie is None:
         return
-    from estimator.relocate_light import told
+    from estimator.relocate_light import disputed, told
 
     if atlas.foreign:  # map and robot are one again: light takes both into the survey's frame, as after a first start
         tie.placed, tie.proved, tie.since, atlas.foreign = False, False, 0, False
@@ -383,3 +403,4 @@ def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> 
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start
+        tie.unheard, tie.t_match = disputed(state), state.fused.t_mono  # the laser has just told the place

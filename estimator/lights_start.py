@@ -47,12 +47,15 @@ class Place:
     of: int
 
 
-def places(lights: Lights, epoch: LightEpoch) -> list[Place]:
-    """All places at which an epoch's direct links fit, best first; none when too few links are direct or fit."""
+def places(lights: Lights, epoch: LightEpoch, rival: float = RIVAL) -> list[Place]:
+    """All places at which an epoch's direct links fit, best first; none when too few links are direct or fit.
+
+    ``rival``: one whose cost is larger than the best one's by as much is none.
+    """
     found: list[Place] = []
     tried: set[tuple[int, ...]] = set()
     for seed in seeds(lights, epoch):
-        used = direct(lights, epoch, seed)
+        used = direct(lights, epoch, seed.x, seed.y)
         key = tuple(sorted(sight.lamp.lamp_id for sight in used if sight.lamp is not None))
         if len(used) < LEAST or key in tried:
             continue
@@ -62,7 +65,7 @@ def places(lights: Lights, epoch: LightEpoch) -> list[Place]:
     kept: list[Place] = []
     for place in good:
         apart = all(math.hypot(place.x - k.x, place.y - k.y) > APART_M for k in kept)
-        if apart and place.cost < good[0].cost + RIVAL and len(kept) < PLACES:
+        if apart and place.cost < good[0].cost + rival and len(kept) < PLACES:
             kept.append(place)
     return kept
 
@@ -80,16 +83,19 @@ def seeds(lights: Lights, epoch: LightEpoch) -> list[Lamp]:
     return list(out.values())
 
 
-def direct(lights: Lights, epoch: LightEpoch, seed: Lamp) -> list[Sight]:
-    """The links that have come straight, each from the lamp it comes from if the receiver is near ``seed``."""
-    used = []
-    for sight in sights(lights, epoch, seed.x, seed.y):
-        if sight.lamp is None or sight.state is not ACCEPTED:
-            continue
-        gain = float(remembered(lights, sight.lamp)[0][0])
-        if sight.amplitude > DIFFUSE * math.exp(gain) * lights.catalogue.rims[sight.lamp.lamp_id]:
-            used.append(sight)
-    return used
+def direct(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
+    """The links that have come straight, each from the lamp it comes from if the receiver is near a place."""
+    return [
+        sight
+        for sight in sights(lights, epoch, x, y)
+        if sight.lamp is not None and sight.state is ACCEPTED and straight(lights, sight.lamp, sight.amplitude)
+    ]
+
+
+def straight(lights: Lights, lamp: Lamp, amplitude: float) -> bool:
+    """Whether so much of a lamp's light has come straight: what is hidden from it gets less, wherever it is."""
+    gain = float(remembered(lights, lamp)[0][0])
+    return amplitude > DIFFUSE * math.exp(gain) * lights.catalogue.rims[lamp.lamp_id]
 
 
 def minima(lights: Lights, used: list[Sight]) -> list[Place]:

@@ -17,15 +17,16 @@ import numpy as np
 
 from estimator import se2
 from estimator.absolute import SILENT_S
-from estimator.cdma_epoch import UNUSABLE
+from estimator.cdma_epoch import UNUSABLE, LightEpoch
+from estimator.ekf_start import CAP
 from estimator.lamps import Lamp
 from estimator.light import Light
 from estimator.lights_links import remembered, sights
-from estimator.lights_start import Place, places, probabilities
+from estimator.lights_start import RIVAL, Place, direct, places, probabilities, straight
 from estimator.lights_state import Lights, Track
 from estimator.linear3 import invert3
 from estimator.records import Array
-from estimator.result import SURPRISE, Fix, LinkState
+from estimator.result import SURPRISE, Fix, Link, LinkState
 from estimator.row import ACROSS_M, ROW_M, spread
 from estimator.state import State
 
@@ -98,12 +99,18 @@ def windows(state: State, T_base_frame: Array | None = None) -> tuple[Window, ..
 
 
 def glimpsed(light: Light) -> tuple[Place, ...]:
-    """Places at which the latest epoch fits, whatever was known before; read once."""
-    epoch = light.epoch
+    """Places at which the latest epoch fits, whatever was known before; read once.
+
+    One link more that does not fit rules no place out unless its lamp is too strong there: what a wall reflects counts
+    as direct in one epoch and not in the next, and the place where it does may be the right one.
+    """
+    lights, epoch = light.filter, light.epoch
     if epoch is None or epoch.block & UNUSABLE or len(epoch.ids) == 0:
         return ()
     if light.glimpse is None or light.glimpse[0] is not epoch:
-        light.glimpse = epoch, tuple(places(light.filter, epoch))
+        found = places(lights, epoch, RIVAL + CAP)
+        near = [one.cost < found[0].cost + RIVAL or not any(strong_at(lights, epoch, one.x, one.y)) for one in found]
+        light.glimpse = epoch, tuple(one for one, it in zip(found, near, strict=True) if it)
     return light.glimpse[1]
 
 
@@ -118,8 +125,8 @@ def disputed(state: State) -> bool:
 
 
 def elsewhere(state: State, T_map_base: Array) -> bool:
-    """Whether light has the robot in one place, and that is not here."""
-    return len(windows(state)) == 1 and compatible(state, T_map_base) is False
+    """Whether light has the robot under one set of lamps, and not here."""
+    return compatible(state, T_map_base) is False and under_the_same_lamps(state)
 
 
 def out_of_place(state: State, T_map_base: Array) -> bool:
@@ -132,7 +139,7 @@ def out_of_place(state: State, T_map_base: Array) -> bool:
 
 
 def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:
-    """Whether the latest epoch, read by itself, has the robot in one place, and that is farther away than `NEARER_M`.
+    """Whether the latest epoch, read by itself, has the robot nowhere within `NEARER_M`, but somewhere.
 
     Wheels that turn more than they say lead the filter astray, and not one epoch; it says more than that the lamps of
     the place are received, which they are a few metres beside it too.
@@ -140,10 +147,8 @@ def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:
     if state.light is None or not received(state, T_map_base):
         return False
     rx, found = state.light.filter.survey.receiver, glimpsed(state.light)
-    if len(found) != 1:
-        return False
     (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
-    return math.hypot(found[0].x - x, found[0].y - y) > NEARER_M
+    return len(found) > 0 and all(math.hypot(one.x - x, one.y - y) > NEARER_M for one in found)
 
 
 def in_place(state: State, T_map_base: Array) -> bool:
@@ -161,6 +166,11 @@ def received(state: State, T_map_base: Array) -> list[bool]:
         return []
     rx = lights.survey.receiver
     (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
+    return strong_at(lights, epoch, x, y)
+
+
+def strong_at(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[bool]:
+    """Of each lamp of an epoch, whether it is stronger than it can be about a place of the receiver."""
     return [
         too_strong(lights, sight.lamp, sight.amplitude, x, y)
         for sight in sights(lights, epoch, x, y)
@@ -255,18 +265,38 @@ def fits(track: Track, T_map_base: Array) -> bool:
 def witness(state: State, T_map_base: Array) -> bool:
     """Whether light counts as the second witness of a pose that the laser has found.
 
-    It does where lamps are used and few are against it, and where it allows no other place: a second window means that
-    codes repeat, or that the lamps in view are too few to tell.
+    It does where lamps are used and few are against it, and where the same lamps allow no other part of the building:
+    where codes repeat there are several. On which side of a row of lamps it stands the laser tells.
     """
-    if compatible(state, T_map_base) is not True or len(windows(state)) != 1:
+    if compatible(state, T_map_base) is not True or not under_the_same_lamps(state):
         return False
     assert state.light is not None
     lights = state.light.filter
     if contradicted(lights):
-        (place,) = glimpsed(state.light)
+        x, y, _ = T_map_base.tolist()
+        place = min(glimpsed(state.light), key=lambda one: math.hypot(one.x - x, one.y - y))
         return place.of - place.fits <= AGAINST * place.of
     if lights.result is None:
         return False
     links = lights.result.links
-    used, against = sum(link.state is LinkState.ACCEPTED for link in links), sum(link.against for link in links)
+    used = sum(link.state is LinkState.ACCEPTED for link in links)
+    against = sum(link.against and not hidden(lights, link) for link in links)
     return used >= LEAST and against <= AGAINST * (used + against)
+
+
+def under_the_same_lamps(state: State) -> bool:
+    """Whether what is received comes from the same lamps at all places that light allows."""
+    around = windows(state)
+    if len(around) < 2:
+        return True
+    assert state.light is not None
+    lights, epoch = state.light.filter, state.light.epoch
+    assert epoch is not None
+    seen = {frozenset(s.lamp.lamp_id for s in direct(lights, epoch, one.x, one.y) if s.lamp) for one in around}
+    return len(seen) == 1
+
+
+def hidden(lights: Lights, link: Link) -> bool:
+    """Whether a lamp is received so weakly that a wall stands before it, of which the survey knows nothing."""
+    lamp = None if link.lamp_id is None else lights.catalogue.by_id.get(link.lamp_id)
+    return lamp is not None and not straight(lights, lamp, link.amplitude)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimator import se2
-from estimator.absolute import Absolute, on_lights
+from estimator.absolute import Absolute, blind, on_lights
 from estimator.adrift import begin, local_map_lost, resettle
 from estimator.atlas import OWN, SETTLE
 from estimator.light import LightsSetup
@@ -98,6 +98,17 @@ def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_whe
     assert np.trace(tie.P[:2, :2]) == pytest.approx(0.05 + way**2 * 0.02, rel=0.01), (
         "a map that is askew swings by that"
     )
+
+
+def test_a_robot_that_was_found_is_held_by_the_laser_though_no_scan_had_fitted_for_long() -> None:
+    """Light that is just beginning would be followed away from a place that the whole map has told."""
+    state, _ = driven(laps=0.6)
+    state.next_key, state.fused.t_mono = 1000, 100.0
+    state.absolute = Absolute(placed=True, t_match=98.0)
+    assert begin(state)
+    assert blind(state)
+    resettle(state, next(reversed(state.keyframes.values())), 1e-6 * np.eye(3), None)
+    assert not blind(state)
 
 
 def test_what_is_adrift_leaves_the_older_map_as_it_is() -> None:

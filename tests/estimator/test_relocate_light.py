@@ -10,24 +10,27 @@ import numpy as np
 import pytest
 
 from estimator import adrift, se2
+from estimator.hypotheses import Hypothesis
 from estimator.keyframe import Submap
 from estimator.light import LightsSetup
 from estimator.lights_start import rule_out
 from estimator.pipeline import new_state, step
 from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
 from estimator.relocate_light import (
+    AGAINST,
     HEADED_M,
     Window,
     compatible,
     disputed,
     elsewhere,
+    glimpsed,
     in_place,
     out_of_place,
     told,
     windows,
     witness,
 )
-from estimator.result import Fix
+from estimator.result import Fix, LinkState
 from estimator.state import State
 from estimator.submap import Settled
 from tools.experiments.relocate_world import Site, Stroll, lit_house
@@ -36,6 +39,7 @@ from tools.sim.ceiling import Effects
 pytestmark = pytest.mark.jit
 
 HERE = np.array((4.0, 10.9, 0.7))
+CORRIDOR = np.array((15.0, 7.6, 0.3))
 MILD = Effects(gain_spread=0.02, bounces=0, obstacles=False, people=False, sway=False)
 
 
@@ -45,15 +49,21 @@ def site(reused: bool = False) -> Site:
 
 
 @cache
-def light(at: tuple[float, float, float], reused: bool = False) -> tuple[LightEpoch, ...]:
+def walled() -> Site:
+    """Where walls hide the lamps of other rooms."""
+    return Site(lit_house(), Effects(gain_spread=0.02), 1)
+
+
+@cache
+def light(at: tuple[float, float, float], reused: bool = False, walls: bool = False) -> tuple[LightEpoch, ...]:
     """Epochs of a robot at rest, without what lamps say of themselves."""
-    way = Stroll(np.array(at), 0.0, 0.0)
-    return tuple(replace(one, lamps=(None,) * len(one.ids)) for one in site(reused).light(way.at, (0.0, 0.6), 1))
+    way, place = Stroll(np.array(at), 0.0, 0.0), walled() if walls else site(reused)
+    return tuple(replace(one, lamps=(None,) * len(one.ids)) for one in place.light(way.at, (0.0, 0.6), 1))
 
 
-def robot(reused: bool = False, surveyed: bool = True) -> State:
+def robot(reused: bool = False, surveyed: bool = True, walls: bool = False) -> State:
     """Switched on with a map whose frame is the survey's."""
-    state = new_state(lights=LightsSetup(site(reused).survey, clock_ppm=0.0))
+    state = new_state(lights=LightsSetup((walled() if walls else site(reused)).survey, clock_ppm=0.0))
     settled = Settled(np.zeros((0, 8), np.float32), None, 0.01)  # type: ignore[arg-type]  # nobody looks at it here
     placed = (np.zeros(3), np.eye(3)) if surveyed else None
     state.atlas.submaps[1] = Submap(1, 1, np.zeros(3), np.zeros(3), settled=settled, light=placed)
@@ -61,9 +71,10 @@ def robot(reused: bool = False, surveyed: bool = True) -> State:
     return state
 
 
-def shown(state: State, at: Array = HERE, reused: bool = False) -> State:
+def shown(state: State, at: Array = HERE, reused: bool = False, walls: bool = False, begin: float = 0.0) -> State:
     x, y, yaw = at.tolist()
-    for epoch in light((x, y, yaw), reused):
+    for one in light((x, y, yaw), reused, walls):
+        epoch = replace(one, t_begin=begin + one.t_begin, t_end=begin + one.t_end)
         step(state, [Odometry(epoch.t_begin, epoch.t_end, np.zeros(3)), epoch], UNLIMITED)
     return state
 
@@ -135,6 +146,94 @@ def test_a_robot_carried_off_is_looked_for_where_the_latest_light_came_from() ->
     assert compatible(state, HERE) is True
     assert witness(state, HERE)
     assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
+
+
+def test_on_which_side_of_a_row_of_lamps_a_robot_stands_is_left_to_the_laser() -> None:
+    """In a corridor an epoch by itself fits on both sides; where the lamps are the same it is one part of the house."""
+    state, at = shown(robot(walls=True), HERE, walls=True), np.array((5.96, 7.25, 0.3))
+    state.light.filter.tracks = state.light.filter.tracks[:1]  # type: ignore[union-attr]  # as after some way
+    shown(state, at, walls=True, begin=0.6)
+    assert len(windows(state)) > 1
+    assert any(inside(window, at) for window in windows(state))
+    assert witness(state, at)
+    assert not witness(state, at + np.array((3.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(("rims", "kept"), [(0.7, True), (4.8, False)])
+def test_one_link_more_that_does_not_fit_rules_no_place_out_unless_its_lamp_is_too_strong_there(
+    rims: float, kept: bool
+) -> None:
+    """What a wall reflects is as strong as what comes straight at times: in one epoch, and not in the next."""
+    at = np.array((2.2, 3.0, 0.4))
+    state = shown(robot(reused=True), at, reused=True)
+    light = state.light
+    assert light is not None
+    assert light.epoch is not None
+    assert len(glimpsed(light)) == 2
+    code = 12  # of a lamp beside each of the two rooms; the one beside the other room was learned as far brighter
+    beside, bright = sorted(light.filter.catalogue.candidates(code), key=lambda lamp: lamp.x)
+    light.filter.gains[bright.lamp_id] = np.array((math.log(20.0), 0.0, 0.0)), np.full(3, 0.01)
+    more = replace(
+        light.epoch,
+        ids=np.append(light.epoch.ids, code),
+        amplitude=np.append(light.epoch.amplitude, rims * light.filter.catalogue.rims[beside.lamp_id]),
+        variance=np.append(light.epoch.variance, light.epoch.variance[0]),
+        flags=np.append(light.epoch.flags, 0),
+        lamps=(*light.epoch.lamps, None),
+    )
+    light.epoch = more
+    assert any(math.hypot(*(np.array((one.x, one.y)) - at[:2])) < 1.0 for one in glimpsed(light)) == kept
+
+
+def test_one_epoch_by_itself_rules_no_place_out_for_good() -> None:
+    """Of two rooms it may have the one of which it lacks a lamp less."""
+    for contradiction in (math.inf, 0.5):
+        state = shown(robot())
+        lights = state.light.filter  # type: ignore[union-attr]
+        lights.tracks, lights.t_odd = lights.tracks[:1], contradiction
+        there = Hypothesis(HERE + np.array((5.0, 0.0, 0.0)))
+        assert compatible(state, there.T_map_odom) is False
+        assert adrift.ruled_out(state, there) == math.isinf(contradiction)
+        assert not adrift.ruled_out(state, Hypothesis(HERE))
+
+
+def test_lamps_behind_walls_are_no_witness_against_a_place() -> None:
+    """Of the walls the survey knows nothing: at rest in a corridor nothing would ever be sure."""
+    state, at = shown(robot(walls=True), CORRIDOR, walls=True), CORRIDOR
+    links = state.light.result.links  # type: ignore[union-attr]
+    used, against = sum(link.state is LinkState.ACCEPTED for link in links), sum(link.against for link in links)
+    assert against > AGAINST * (used + against)
+    assert witness(state, at)
+
+
+def test_a_robot_found_in_somebody_s_hands_is_looked_for_again_when_it_is_put_down() -> None:
+    """It was carried on for a moment, by less than a lamp's light would tell; the filter is still at its old place."""
+    for unheard in (True, False):
+        state = shown(robot())
+        state.atlas.adrift, state.atlas.since, state.failures = None, 0, adrift.UNFIT
+        state.T_map_odom = se2.compose(HERE + np.array((0.2, 0.0, 0.0)), se2.inverse(state.fused.T_odom_base))
+        tie, lights = state.absolute, state.light.filter  # type: ignore[union-attr]
+        tie.placed, tie.proved, tie.unheard, lights.lost = True, True, unheard, True  # type: ignore[union-attr]
+        tie.gap = None  # type: ignore[union-attr]
+        adrift.doubt(state)
+        assert (state.atlas.adrift is not None) == unheard
+    state.atlas.adrift = None
+    for lost, gap, agree in ((False, None, True), (True, 1.0, True), (True, 1e3, False), (True, None, False)):
+        lights.lost, tie.gap, tie.unheard, state.failures = lost, gap, True, 0  # type: ignore[union-attr]
+        adrift.doubt(state)
+        assert tie.unheard != agree  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("since_s", "lost", "known"), [(0.0, False, True), (1.0, False, False), (0.0, True, False)])
+def test_light_alone_knows_the_place_only_while_it_tells(since_s: float, lost: bool, known: bool) -> None:
+    """A robot that was just put down is where the filter last had it for nobody but the filter."""
+    state = shown(robot())
+    assert state.absolute is not None
+    assert state.light is not None
+    state.absolute.placed, state.light.filter.lost = True, lost
+    state.absolute.t_match = state.fused.t_mono - 5.0
+    state.light.filter.t_used = state.fused.t_mono - since_s
+    assert (adrift.places(state) is None) == known
 
 
 def test_a_robot_that_light_has_elsewhere_is_adrift_after_a_while_and_at_once_when_scans_do_not_fit() -> None:
