@@ -134,7 +134,10 @@ def run(quick: bool, work: Work) -> Report:
         found = kept | {one.seed: one for one in fresh}
         outcomes[name] = [found[seed] for seed in seeds]
     rows = [row for name, found in outcomes.items() for row in rows_of(name, found)]
-    return Report(tuple(figures_of(outcomes)), (Table("Where am I?", HEAD, tuple(rows)),), (), (SEED,), NOTES)
+    late = [late_row(name, one) for name, found in outcomes.items() for one in found if is_late(name, one)]
+    tables = [Table("Where am I?", HEAD, tuple(rows))]
+    tables += [Table("Under lamps, one by one: those that were late or wrong", LATE_HEAD, tuple(late))] if late else []
+    return Report(tuple(figures_of(outcomes)), tuple(tables), (), (SEED,), NOTES)
 
 
 HEAD: Final = (
@@ -167,6 +170,26 @@ def key_of(name: str, one: Outcome) -> str:
     """The line that an outcome belongs to."""
     how = "carried" if one.carried else "switched on"
     return f"{name}, {how}" + ("" if one.unique or not SETTINGS[name].lit else ", codes not unique")
+
+
+def is_late(name: str, one: Outcome) -> bool:
+    """Whether a trial under lamps is one that the bounds do not allow."""
+    if not SETTINGS[name].lit:
+        return False
+    least = 1.0 if one.unique else FRAME_S + 1.0
+    late = one.right_s is None or one.right_s > least
+    return late or one.far_s > allowed(name) or one.astray_s > allowed(name)
+
+
+LATE_HEAD: Final = ("", "seed", "moving", "lamps", "right after, s", "at the end", "off, m", "off > 1 m or 15 deg, s")
+
+
+def late_row(name: str, one: Outcome) -> tuple[Cell, ...]:
+    """A trial of its own, by whose seed it can be made again."""
+    right = math.nan if one.right_s is None else one.right_s
+    return (
+        key_of(name, one), one.seed, "yes" if one.moving else "no", one.lamps, right, one.end, one.off_m, one.far_s,
+    )  # fmt: skip
 
 
 def row_of(title: str, found: list[Outcome], name: str) -> tuple[Cell, ...]:
