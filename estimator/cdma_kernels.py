@@ -66,10 +66,19 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
     return bounds
 
 
+@kernel("UniTuple(i8, 2)(i8[:,::1], UniTuple(i8, 4))", inner=True)
+def within(extent: I8, rows: tuple[int, int, int, int]) -> tuple[int, int]:
+    """First sample at which one of four rows may not be zero, and the one behind the last."""
+    a, b, c, d = rows
+    low, high = extent[0], extent[1]
+    return min(min(low[a], low[b]), min(low[c], low[d])), max(max(high[a], high[b]), max(high[c], high[d]))
+
+
 @kernel("void(f8[:,::1], i8[:,::1], i8, f8[:,::1])", inner=True)
 def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
-    """Inner products of all M rows with the first ``free`` rows, in tiles of 2 x 4; ``out`` is (M, free).
+    """Inner products of all M rows with the first ``free`` rows, in tiles of 4 x 4; ``out`` is (M, free).
 
+    Smaller tiles wait for their loads: 2 x 4 has six for eight products, this one eight for sixteen.
     Not left to BLAS: its threads would fight with the daemon's for two cores and can take 50 times as long.
 
     Args:
@@ -79,18 +88,20 @@ def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
         out: (M, free).
     """
     last = rows.shape[0] - 1
-    low, high = extent[0], extent[1]
-    for i in range(0, last + 1, 2):
-        i1 = min(i + 1, last)
-        for j in range(0, min(i1 + 1, free), 4):
+    for i in range(0, last + 1, 4):
+        i1, i2, i3 = min(i + 1, last), min(i + 2, last), min(i + 3, last)
+        from_i, to_i = within(extent, (i, i1, i2, i3))
+        for j in range(0, min(i3 + 1, free), 4):
             j1, j2, j3 = min(j + 1, last), min(j + 2, last), min(j + 3, last)
-            begin = max(min(low[i], low[i1]), min(min(low[j], low[j1]), min(low[j2], low[j3])))
-            end = min(max(high[i], high[i1]), max(max(high[j], high[j1]), max(high[j2], high[j3])))
-            end = max(begin, end)
-            a0, a1 = rows[i, begin:end], rows[i1, begin:end]
+            from_j, to_j = within(extent, (j, j1, j2, j3))
+            begin = max(from_i, from_j)
+            end = max(begin, min(to_i, to_j))
+            a0, a1, a2, a3 = rows[i, begin:end], rows[i1, begin:end], rows[i2, begin:end], rows[i3, begin:end]
             b0, b1, b2, b3 = rows[j, begin:end], rows[j1, begin:end], rows[j2, begin:end], rows[j3, begin:end]
             s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
             t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+            u0, u1, u2, u3 = 0.0, 0.0, 0.0, 0.0
+            v0, v1, v2, v3 = 0.0, 0.0, 0.0, 0.0
             for n in range(a0.shape[0]):
                 s0 += a0[n] * b0[n]
                 s1 += a0[n] * b1[n]
@@ -100,13 +111,21 @@ def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
                 t1 += a1[n] * b1[n]
                 t2 += a1[n] * b2[n]
                 t3 += a1[n] * b3[n]
-            out[i, j], out[i1, j] = s0, t0
+                u0 += a2[n] * b0[n]
+                u1 += a2[n] * b1[n]
+                u2 += a2[n] * b2[n]
+                u3 += a2[n] * b3[n]
+                v0 += a3[n] * b0[n]
+                v1 += a3[n] * b1[n]
+                v2 += a3[n] * b2[n]
+                v3 += a3[n] * b3[n]
+            out[i, j], out[i1, j], out[i2, j], out[i3, j] = s0, t0, u0, v0
             if j1 < free:
-                out[i, j1], out[i1, j1] = s1, t1
+                out[i, j1], out[i1, j1], out[i2, j1], out[i3, j1] = s1, t1, u1, v1
             if j2 < free:
-                out[i, j2], out[i1, j2] = s2, t2
+                out[i, j2], out[i1, j2], out[i2, j2], out[i3, j2] = s2, t2, u2, v2
             if j3 < free:
-                out[i, j3], out[i1, j3] = s3, t3
+                out[i, j3], out[i1, j3], out[i2, j3], out[i3, j3] = s3, t3, u3, v3
     for i in range(free):
         for j in range(i):
             out[j, i] = out[i, j]
