@@ -34,32 +34,32 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
     """
     length, steps = chips.shape[1], table.shape[0] - 1
     n_lamps, n_samples = out.shape[1], out.shape[2]
-    x, weight = samples[0], samples[1]
-    bounds = np.full((n_lamps, signs.shape[1] + 1), n_samples)
+    bounds, sent = np.full((n_lamps, signs.shape[1] + 1), n_samples), np.empty(length + 1)
     for i in range(n_lamps):
-        code, value, slope = chips[i], out[0, i], out[1, i]
         phase, rate = lamps[0, i], lamps[1, i]
         before = signs[i, 0]
-        n, period = 0, 0
-        while n < n_samples:
-            bounds[i, period] = n
-            sign = signs[i, period]
-            limit = (length - phase) / rate
-            while n < n_samples and x[n] < limit:
+        begin, period = 0, 0
+        while begin < n_samples:
+            bounds[i, period] = begin
+            sign, end = signs[i, period], begin + np.searchsorted(samples[0, begin:], (length - phase) / rate)
+            sent[0] = chips[i, length - 1] * before
+            for c in range(length):
+                sent[c + 1] = chips[i, c] * sign
+            x, weight = samples[0, begin:end], samples[1, begin:end]
+            value, slope = out[0, i, begin:end], out[1, i, begin:end]
+            lit = x.shape[0] if sign != 0.0 or before != 0.0 else 0
+            value[lit:] = 0.0
+            slope[lit:] = 0.0
+            for n in range(lit):
                 u = max(phase + rate * x[n], 0.0)
-                k = min(np.uint64(u), np.uint64(length - 1))  # unsigned: no test for indices from the end
-                if sign == 0.0 and (k > 0 or before == 0.0):
-                    value[n] = slope[n] = 0.0
-                    n += 1
-                    continue
+                k = np.uint64(min(np.int32(u), np.int32(length - 1)))  # unsigned: no test for indices from the end
                 at = (u - k) * steps
-                j = np.uint64(at + 0.5)
-                own = code[k] * sign
-                last = code[k - np.uint64(1)] * sign if k > 0 else code[length - 1] * before
+                j = np.uint64(np.int32(at + 0.5))
+                last, own = sent[k], sent[k + np.uint64(1)]
                 ramp = own * table[j, 2] + last * table[j, 3]
                 value[n] = (own * table[j, 0] + last * table[j, 1] + (at - j) / steps * ramp) * weight[n]
                 slope[n] = ramp * weight[n]
-                n += 1
+            begin = end
             phase -= length
             before = sign
             period += 1
