@@ -239,8 +239,8 @@ def _nearly(lights: light.LightsResult) -> bool:
 
 
 def _axes(known: Array) -> tuple[bool, bool, bool]:
-    x, y, yaw = (bool(axis) for axis in known)
-    return x, y, yaw
+    x, y, yaw = known.tolist()
+    return bool(x), bool(y), bool(yaw)
 
 
 def _contradicts(lights: light.LightsResult) -> bool:
@@ -260,12 +260,12 @@ def _places(result: StepResult | None) -> int | None:
 
 def _growth(P: Array, before: Array) -> tuple[float, float]:
     """One-sigma of what a 3x3 covariance has gained: larger axis in m, heading in rad."""
-    grown = P - before
-    mean, half = 0.5 * (grown[0, 0] + grown[1, 1]), 0.5 * (grown[0, 0] - grown[1, 1])
-    largest = mean + math.hypot(half, grown[0, 1])
-    return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, float(grown[2, 2])))
+    (xx, xy, _), (_, yy, _), (_, _, tt) = (P - before).tolist()
+    largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+    return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, tt))
 
 
 def good(match: MatchResult) -> bool:
     """Whether a match is a result that enough of the scan took part in."""
-    return match.ok and match.inliers >= ENOUGH_INLIERS * match.queries and bool(np.isfinite(match.T_odom_base).all())
+    finite = all(map(math.isfinite, match.T_odom_base.tolist()))
+    return match.ok and match.inliers >= ENOUGH_INLIERS * match.queries and finite

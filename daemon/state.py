@@ -45,6 +45,9 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
     lost = state is State.LOST or (memory.lost and state in (State.RELOCATING, State.AMBIGUOUS, State.NO_LIDAR))
     doubt = lost or evidence.places is not None or (memory.doubt and state is not State.TRACKING)
     recalled = memory.recalled and state is not State.TRACKING  # it has served
+    said = (state, reason, lost, doubt, recalled)
+    if said == (memory.state, memory.reason, memory.lost, memory.doubt, memory.recalled):
+        return memory  # making a new one costs more than looking whether it is one
     return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt, recalled=recalled)
 
 

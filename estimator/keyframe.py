@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING
 from weakref import WeakSet
 
@@ -149,7 +150,13 @@ def unturned(bearing_rad: Array, turned_rad: float) -> Array:
     n = len(bearing_rad)
     if turned_rad == 0.0 or n < 2:
         return bearing_rad
-    return np.asarray(bearing_rad - turned_rad * (1.0 - np.arange(n) / (n - 1)))
+    return np.asarray(bearing_rad - turned_rad * _to_come(n))
+
+
+@lru_cache(maxsize=4)
+def _to_come(n: int) -> Array:
+    """Share of a scan that is still to come at each of its ``n`` beams."""
+    return np.asarray(1.0 - np.arange(n) / (n - 1))
 
 
 def hanging(frames: Iterable[Keyframe]) -> list[tuple[Submap, list[Keyframe]]]:

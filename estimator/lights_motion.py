@@ -61,7 +61,8 @@ def on_odometry(lights: Lights, record: Odometry, velocity: Array | None = None)
         delta = np.array((delta[0], delta[1], turned[0] * dt / turned[1]))
     if velocity is None:
         velocity = se2.log(delta) / dt if 1e-3 < dt < CARRY_S else course.velocity
-    course.velocity = velocity.copy() if (np.abs(velocity) <= AT_MOST).all() else course.velocity
+    if all(abs(part) <= most for part, most in zip(velocity.tolist(), AT_MOST, strict=True)):
+        course.velocity = velocity.copy()
     if abs(record.t_begin - course.t_odometry) < 1e-6 and dt < CARRY_S:
         ahead = se2.exp(course.velocity * min(max(course.t_mono - record.t_end, 0.0), CARRY_S))
         if later[1] > 0.0:
