@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 
 SILENT_S: Final = 1.0
 """Another sender of odometry is listened to once the present one has been silent for this long."""
+CALM_S: Final = 60.0
+"""That one is ignored is said again when it has not happened for so long."""
 
 Run = Callable[[], Awaitable[None]]
 OnOdometry = Callable[[RawOdometry], None]
@@ -60,6 +63,7 @@ class OneSender:
 
     def __init__(self, on_odometry: OnOdometry) -> None:
         self.refused = 0
+        self._refused_at = -math.inf
         self._on_odometry = on_odometry
         self._sender = ""
         self._heard = 0.0
@@ -68,8 +72,9 @@ class OneSender:
         """Pass a reading on if its sender has the floor."""
         if sender != self._sender and self._sender and reading.t_rx - self._heard <= SILENT_S:
             self.refused += 1
-            if self.refused == 1:
+            if reading.t_rx - self._refused_at > CALM_S:
                 log.warning("odometry from %s is ignored while %s sends it too", sender, self._sender)
+            self._refused_at = reading.t_rx
             return
         self._sender, self._heard = sender, reading.t_rx
         self._on_odometry(reading)

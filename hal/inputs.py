@@ -7,6 +7,7 @@ counted; none of them makes the pose that is delivered jump. The bytes are in :m
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import socket
 from collections.abc import Callable
@@ -23,8 +24,12 @@ from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagr
 from hal.odometry import RawOdometry
 from hal.share import Reader, Share
 
+log = logging.getLogger(__name__)
+
 SESSION_TIMEOUT_S: Final = 1.0  # another sender is taken when the present one has been silent for this long
 MAX_LEAD_S: Final = 0.001  # a reading cannot be from the future
+CALM_S: Final = 60.0
+"""What is wrong with datagrams is said once, and again when there has been nothing of it for so long."""
 _PER_TURN: Final = 16
 _BUFFER: Final = 256
 
@@ -105,6 +110,25 @@ class Sequence:
         return True
 
 
+@dataclass(slots=True)
+class _Trouble:
+    """Something wrong with datagrams that is worth a line of the log when it lasts."""
+
+    begun: float = -math.inf
+    latest: float = -math.inf
+    said: bool = False
+
+    def lasts(self, t: float) -> bool:
+        """Once more at ``t``: is it to be said now? One damaged datagram, or a sender's quick restart, is not."""
+        if t - self.latest > CALM_S:
+            self.begun, self.said = t, False
+        self.latest = t
+        if self.said or t - self.begun <= SESSION_TIMEOUT_S:
+            return False
+        self.said = True
+        return True
+
+
 OnOdometry = Callable[[RawOdometry], None]
 OnImu = Callable[[RawImu], None]
 Allowed = Callable[[str], bool]
@@ -140,6 +164,7 @@ class InputPort:
         self._on_imu: OnImu | None = None
         self._kinds = {ODOMETRY_MAGIC: Sequence(), IMU_MAGIC: Sequence()}
         self.invalid = 0
+        self._damage, self._rivals = _Trouble(), {ODOMETRY_MAGIC: _Trouble(), IMU_MAGIC: _Trouble()}
         self.odometry = UdpOdometry(self)
         self.imu = UdpImu(self)
 
@@ -198,18 +223,23 @@ class InputPort:
             except OSError:  # nothing more
                 return
             if self._allowed is None or self._allowed(peer[0]):
-                self.take(data, self._clock.now() - kernel_age(ancillary))
+                self.take(data, self._clock.now() - kernel_age(ancillary), str(peer[0]))
 
-    def take(self, data: bytes, t_rx: float) -> None:
-        """One datagram and its time of arrival (also for replay)."""
+    def take(self, data: bytes, t_rx: float, peer: str = "a sender") -> None:
+        """One datagram, its time of arrival, and whose it is (also for replay)."""
         try:
             datagram = decode(data)
-        except DataInvalid:
+        except DataInvalid as error:
             self.invalid += 1
+            if self._damage.lasts(t_rx):
+                log.info("port %d: what %s sends is no reading: %s", self.port, peer, error)
             return
         kind = self._kinds[datagram.magic]
-        lost = kind.counts.lost
+        lost, foreign = kind.counts.lost, kind.counts.foreign
         if not kind.accept(datagram.session, datagram.seq, t_rx):
+            if kind.counts.foreign > foreign and self._rivals[datagram.magic].lasts(t_rx):
+                said = "port %d: readings of %s are ignored while another sender is heard there (end one of them)"
+                log.warning(said, self.port, peer)
             return
         t_mono = _reading_time(datagram, t_rx)
         if datagram.magic == IMU_MAGIC:

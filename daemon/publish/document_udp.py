@@ -53,12 +53,13 @@ CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
 
 * Odometry is cumulative, so a lost datagram loses nothing; one that was overtaken is dropped, and so is a repeated one.
 * A sender that restarts draws a new `session` (or is silent for {inputs.SESSION_TIMEOUT_S:g} s) and may begin again
-  at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored
-  and counted.
+  at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored;
+  where that lasts for more than a second the log says whose.
 * The time of a reading is the kernel's time of arrival. A sender on the same computer does better: it sets bit 0 of
   `flags` and puts CLOCK_MONOTONIC into `time`; a time in the future or more than {MAX_AGE_S:g} s old is not
   believed.
-* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped and counted.
+* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped; the
+  log says what is wrong, and whose it is, where that lasts.
 """
 
 

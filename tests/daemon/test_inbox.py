@@ -104,6 +104,10 @@ def test_one_sender_of_odometry_at_a_time(caplog: pytest.LogCaptureFixture) -> N
     gate.take("Modbus", RawOdometry(2.5, 2.5, 2.0, 0, 0))
     assert passed[-1] == 2.0
     assert len([r for r in caplog.records if "is ignored" in r.message]) == 1
+    for t in (103.0, 103.1):  # on another day it is news
+        gate.take("UDP", RawOdometry(t, t, 1.0, 0, 0))
+        gate.take("Modbus", RawOdometry(t, t, 2.0, 0, 0))
+    assert len([r for r in caplog.records if "is ignored" in r.message]) == 2
 
 
 def test_without_scans_blocks_set_the_pace_until_there_is_one() -> None:

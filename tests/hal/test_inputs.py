@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import socket
 import struct
 import time
 import zlib
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 from hypothesis import given
@@ -19,7 +20,7 @@ from hal.clock import SystemClock
 from hal.errors import DataInvalid, DeviceRefused
 from hal.imu import RawImu
 from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, decode, encode
-from hal.inputs import MAX_AGE_S, SESSION_TIMEOUT_S, Continuity, InputPort
+from hal.inputs import CALM_S, MAX_AGE_S, SESSION_TIMEOUT_S, Continuity, InputPort
 from hal.odometry import RawOdometry
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -178,6 +179,29 @@ def test_a_second_sender_is_ignored_while_the_first_is_heard() -> None:
     assert all(o.y == 0.0 for o in listening.odometry)
     assert listening.port.counts["odometry"].foreign == 29
     assert listening.port.counts["odometry"].restarts == 0
+
+
+def test_a_second_sender_and_what_is_no_reading_are_said_once_while_they_last(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    listening = Listening()
+
+    def both(seconds: float, wrong: bytes) -> list[str]:
+        caplog.clear()
+        for _ in range(round(seconds / 0.1)):
+            listening.take(datagram(next(numbers)))
+            listening.take(wrong)
+        return [record.message for record in caplog.records]
+
+    numbers = count(1)
+    rival, damaged = datagram(1, session=2), datagram(1)[:-1]
+    assert both(0.8, rival) == both(0.8, damaged) == [], "a quick restart, some damage: no line of the log"
+    assert both(3.0, rival) == [
+        "port 0: readings of a sender are ignored while another sender is heard there (end one of them)"
+    ]
+    assert both(3.0, damaged) == ["port 0: what a sender sends is no reading: input datagram: says 60 bytes and has 59"]
+    assert both(3.0, rival) == both(3.0, damaged) == []
+    listening.t += CALM_S
+    assert len(both(3.0, rival)) == len(both(3.0, damaged)) == 1, "on another day it is news"
 
 
 @given(st.lists(st.tuples(near, near, near), min_size=2, max_size=6))
