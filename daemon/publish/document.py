@@ -271,7 +271,7 @@ def _limits() -> str:
         ("TCP without a request", f"{modbus.IDLE_S:g} s", "closed"),
         ("TCP request not completed", f"{modbus.PARTIAL_S:g} s", "closed"),
         ("TCP answers not read", f"{modbus.STUCK_S:g} s", "closed"),
-        ("what is not Modbus", "", "UDP: ignored and counted; TCP: closed"),
+        ("what is not Modbus", "", "UDP: ignored; TCP: closed; the log names who sends it, once a minute"),
     ]  # fmt: skip
     return table(("what", "limit", "beyond it"), rows)
 

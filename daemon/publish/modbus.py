@@ -15,12 +15,14 @@ import asyncio
 import contextlib
 import logging
 import socket
+import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
+from daemon.logs import Sparing
 from daemon.publish import registers
 from daemon.publish.holding import Holding, Outcome, Request, WrittenOdometry
 from daemon.publish.requests import BLOCKS, MAX_FRAME, Responder, frame_size
@@ -40,6 +42,8 @@ IDLE_S: Final = 60.0  # without a whole request
 PARTIAL_S: Final = 5.0  # a request that is not completed
 STUCK_S: Final = 10.0  # answers that are not read
 EVICT_S: Final = 5.0  # a full house drops the longest idle of those idle for longer
+STRANGE: Final = "sends what is no Modbus request; it is dropped, and a connection closed"
+CROWDED: Final = f"is not served: {MAX_CONNECTIONS} connections are open and in use, close one"
 _SWEEP_S: Final = 1.0
 _WRITE_HIGH: Final = 16 * 1024
 _READ_HIGH: Final = 16 * 1024
@@ -57,7 +61,7 @@ def everyone(_: str) -> bool:
 
 @dataclass(slots=True)
 class Counts:
-    """What the server has seen, for the health report."""
+    """What the server has seen; of whom it does not serve the log has a line a minute."""
 
     requests: int = 0
     malformed: int = 0
@@ -65,6 +69,11 @@ class Counts:
     connections: int = 0
     refused: int = 0
     dropped: int = 0
+    lines: dict[str, Sparing] = field(default_factory=dict)
+
+    def tell(self, peer: str, what: str) -> None:
+        """Say of a client what becomes of it."""
+        self.lines.setdefault(what, Sparing(log, 1, 60.0)).say(time.monotonic(), logging.INFO, f"Modbus: {peer} {what}")
 
 
 class UdpEndpoint:
@@ -122,6 +131,7 @@ class UdpEndpoint:
                 continue
             if not frame or frame_size(frame) != len(frame):
                 self._counts.malformed += 1
+                self._counts.tell(peer[0], STRANGE)
                 continue
             self._counts.requests += 1
             answer = self._responder.answer(frame)
@@ -144,6 +154,7 @@ class Connection(asyncio.Protocol):
         self._ended = False
         self.last_request = self._loop.time()
         self.waiting = False
+        self.peer = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """asyncio: a client has connected."""
@@ -151,6 +162,7 @@ class Connection(asyncio.Protocol):
         self._transport = transport
         transport.set_write_buffer_limits(high=_WRITE_HIGH)
         peer = transport.get_extra_info("peername")
+        self.peer = "" if peer is None else str(peer[0])
         if peer is not None and not self._server.allowed(peer[0]):
             transport.abort()
             return
@@ -213,7 +225,9 @@ class Connection(asyncio.Protocol):
         size = frame_size(self._buffer)
         more = 0 < size <= len(self._buffer)
         if size < 0 or (self._ended and not more):
-            self._server.counts.malformed += size < 0
+            if size < 0:
+                self._server.counts.malformed += 1
+                self._server.counts.tell(self.peer, STRANGE)
             transport.close()
         elif len(self._buffer) <= _READ_HIGH and not transport.is_reading():
             transport.resume_reading()
@@ -271,6 +285,7 @@ class TcpEndpoint:
             oldest = min(self._connections, key=lambda c: c.last_request)
             if self._loop.time() - oldest.last_request <= EVICT_S:
                 self.counts.refused += 1
+                self.counts.tell(connection.peer, CROWDED)
                 connection.abort()
                 return
             self.counts.dropped += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
 import socket
 import struct
 from collections.abc import Callable, Coroutine
@@ -37,7 +38,9 @@ MALFORMED = [
 ]
 
 
-def test_a_malformed_datagram_disturbs_nobody() -> None:
+def test_a_malformed_datagram_disturbs_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
     async def run() -> None:
         async with publishing() as publisher, udp_client(publisher.port) as (good, datagrams):
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bad:
@@ -51,10 +54,13 @@ def test_a_malformed_datagram_disturbs_nobody() -> None:
             assert publisher.counts.malformed == len(MALFORMED) * 5
 
     asyncio.run(run())
+    assert [record.message for record in caplog.records] == [f"Modbus: 127.0.0.1 {modbus.STRANGE}"], "a line a minute"
 
 
 @pytest.mark.parametrize("rubbish", [b"\x00\x01\x00\x07\x00\x06\x01\x04", b"GET / HTTP/1.1\r\n\r\n", bytes(300)])
-def test_a_tcp_client_that_does_not_speak_modbus_is_closed(rubbish: bytes) -> None:
+def test_a_tcp_client_that_does_not_speak_modbus_is_closed(rubbish: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
     async def run() -> None:
         async with publishing() as publisher, tcp_client(publisher.port) as (other, writer):
             async with tcp_client(publisher.port) as (reader, bad):
@@ -65,6 +71,7 @@ def test_a_tcp_client_that_does_not_speak_modbus_is_closed(rubbish: bytes) -> No
             assert publisher.counts.malformed == 1
 
     asyncio.run(run())
+    assert f"Modbus: 127.0.0.1 {modbus.STRANGE}" in caplog.text
 
 
 def test_clients_that_vanish_leave_nothing_behind() -> None:
@@ -287,7 +294,9 @@ def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> Non
     in_virtual_time(body)
 
 
-def test_a_full_house_drops_the_longest_idle_or_refuses() -> None:
+def test_a_full_house_drops_the_longest_idle_or_refuses(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
     async def body(endpoint: modbus.TcpEndpoint) -> None:
         house = [plugged(endpoint) for _ in range(modbus.MAX_CONNECTIONS)]
         _, refused = plugged(endpoint)
@@ -302,3 +311,4 @@ def test_a_full_house_drops_the_longest_idle_or_refuses() -> None:
         assert endpoint.counts.connections == modbus.MAX_CONNECTIONS
 
     in_virtual_time(body)
+    assert [record.message.partition(" is ")[2] for record in caplog.records] == [modbus.CROWDED.removeprefix("is ")]
