@@ -26,6 +26,9 @@ from hal.port import OnData, OnLost
 _READ_SIZE = 65536  # a tty hands out at most 4095 bytes at once
 _GONE = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ETIMEDOUT})
 NOT_SERIAL = "not a serial port"
+_DRIVERS = Path("/sys/bus/usb/drivers")
+_MODULES = {"ttyACM": ("cdc_acm",), "ttyUSB": ("ftdi_sio", "cp210x", "ch341", "pl2303")}
+"""Kernel modules that make device files of such names; they come with the device, where the system has them."""
 _UNPLUGGED = "plug it in again, or check its cable and power; it is reopened by itself"
 
 
@@ -172,7 +175,8 @@ def explain_open_error(device: str, baud: int, error: BaseException, style: str 
     number = _errno_of(error)
     path = Path(device)
     if number == errno.ENOENT:
-        return DeviceMissing(device, "no such device", "plug the sensor in, or look for it with: lumiloop probe")
+        remedy = f"plug the sensor in, or look for it with: lumiloop probe{_not_loaded(path)}"
+        return DeviceMissing(device, "no such device", remedy)
     if number in _GONE:
         return DeviceMissing(device, os.strerror(number), "plug the sensor in; it is opened by itself once it is there")
     if number == errno.EPERM:
@@ -189,6 +193,14 @@ def explain_open_error(device: str, baud: int, error: BaseException, style: str 
     if isinstance(error, ValueError):
         return DeviceRefused(device, f"cannot do {baud} bit/s", "choose another line rate")
     return DeviceRefused(device, f"cannot be opened: {error}", "look into the kernel log: dmesg | tail")
+
+
+def _not_loaded(path: Path) -> str:
+    """Which kernel module there is not; empty where it is there, or the name does not tell."""
+    for kind, modules in _MODULES.items():
+        if path.name.startswith(kind) and not any((_DRIVERS / module).exists() for module in modules):
+            return f"; its kernel module is not loaded: modprobe {' or '.join(modules)}"
+    return ""
 
 
 def _group_of(path: Path) -> str:

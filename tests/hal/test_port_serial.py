@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import serial
 
+from hal import serial_port
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.opening import open_port
 from hal.serial_port import SerialPort, explain_open_error
@@ -132,6 +133,26 @@ def test_open_errors_name_thing_and_remedy(tmp_path: Path) -> None:
                 await open_port(path, 115200)
 
     asyncio.run(body())
+
+
+@pytest.mark.parametrize(
+    ("name", "loaded", "says"),
+    [
+        ("ttyACM7", "", "; its kernel module is not loaded: modprobe cdc_acm)"),
+        ("ttyACM7", "cdc_acm", "look for it with: lumiloop probe)"),
+        ("ttyUSB7", "cdc_acm", "; its kernel module is not loaded: modprobe ftdi_sio or cp210x or ch341 or pl2303)"),
+        ("ttyUSB7", "ch341", "look for it with: lumiloop probe)"),
+        ("lidar", "", "look for it with: lumiloop probe)"),
+    ],
+)
+def test_a_device_file_that_no_loaded_module_makes_is_said_to_lack_it(
+    name: str, loaded: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "_DRIVERS", tmp_path)
+    if loaded:
+        (tmp_path / loaded).mkdir()
+    missing = explain_open_error(str(tmp_path / name), 115200, FileNotFoundError(errno.ENOENT, "No such file"))
+    assert str(missing).endswith(says)
 
 
 def test_impossible_rate_is_refused(pty: Pty) -> None:
