@@ -21,6 +21,7 @@ import pytest
 from daemon.publish import registers
 from tools.bench.modbus import example
 from tools.bench.otherclock import OtherClock
+from tools.bench.vm import __main__ as command
 from tools.bench.vm import bench, image, places, reference, world
 from tools.bench.vm.__main__ import chosen
 from tools.bench.vm.guest import agent
@@ -68,11 +69,27 @@ def test_a_machine_without_qemu_is_told_so_and_nothing_is_left(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_may_not_be_read_or_written_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["vm", "--out", "/dev/null/out"])
+    assert command.main() == 2
+    assert "nothing can be written to /dev/null/out; name another folder with --out" in capsys.readouterr().out
+
+    def closed(say: object) -> None:
+        raise PermissionError(13, "Permission denied", "/root/.cache/lumiloop/vm")
+
+    monkeypatch.setattr("sys.argv", ["vm", "--out", str(tmp_path)])
+    monkeypatch.setattr(command, "image", closed)
+    assert command.main() == 2
+    assert "/root/.cache/lumiloop/vm: Permission denied; what is kept there is of" in capsys.readouterr().out
+
+
 def test_a_folder_left_by_a_killed_process_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(places, "MEMORY", tmp_path)
     left, running = tmp_path / "some-999999999", tmp_path / f"some-{os.getppid()}"
-    left.mkdir()
-    running.mkdir()
+    for one in (left, running, tmp_path / f"some-{os.getpid()}"):  # numbers of processes come again
+        one.mkdir()
     with places.workspace("some", 1000) as folder:
         assert folder == tmp_path / f"some-{os.getpid()}"
         (folder / "file").touch()

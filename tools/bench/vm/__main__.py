@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+from daemon.folders import can_be_made
 from tools.bench.report import About, CannotCompare, Result, facts, read, write
 from tools.bench.vm.booted import Booted, booted
 from tools.bench.vm.common import Scenario
@@ -69,6 +70,8 @@ def main() -> int:
     try:
         if options.against is not None:
             read(options.against)  # what is wrong with it is told now, not in eight minutes
+        if not can_be_made(options.out):
+            raise CannotBench(f"nothing can be written to {options.out}; name another folder with --out")
         shares = chosen(options.scenario)
         made = booted(image(say), say)
         outside()
@@ -77,6 +80,10 @@ def main() -> int:
         whole, results = run(made, shares, options.out)
     except (CannotBench, CannotCompare) as reason:
         say(f"the virtual bench cannot run: {reason}")
+        return CANNOT
+    except OSError as error:
+        owner = "; what is kept there is of the user who made it" if isinstance(error, PermissionError) else ""
+        say(f"the virtual bench cannot run: {error.filename or 'this computer'}: {error.strerror}{owner}")
         return CANNOT
     except KeyboardInterrupt:
         say("ended before it began; nothing of it is left running")

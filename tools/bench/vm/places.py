@@ -57,14 +57,14 @@ def cache() -> Path:
 def workspace(name: str, room: int) -> Iterator[Path]:
     """A folder of this process that is gone afterwards, in memory where there is twice the room of ``room`` bytes.
 
-    What a killed process of the same ``name`` could not remove is removed now.
+    What a killed process of the same ``name`` could not remove is removed now, also where its number is ours by now.
     """
     in_memory = MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > room and _memory_available() > 2 * room
     parent = MEMORY if in_memory else Path(tempfile.gettempdir())
-    for left in parent.glob(f"{name}-*"):
-        if not Path("/proc", left.name.removeprefix(f"{name}-")).exists():
-            shutil.rmtree(left, ignore_errors=True)
     folder = parent / f"{name}-{os.getpid()}"
+    for left in parent.glob(f"{name}-*"):
+        if left == folder or not Path("/proc", left.name.removeprefix(f"{name}-")).exists():
+            shutil.rmtree(left, ignore_errors=True)
     folder.mkdir(mode=0o755)
     try:
         yield folder
