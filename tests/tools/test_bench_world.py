@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import os
 import signal
@@ -23,13 +24,15 @@ from hal.errors import DeviceMissing
 from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.world import Room
 from tests.hil.programs import served_receiver
-from tools.bench.report import Seen
+from tools.bench.report import Result, Seen
+from tools.bench.world import __main__ as world
 from tools.bench.world import agreement, room
 from tools.bench.world.__main__ import main, twins
 from tools.bench.world.judge import Played, Read, errors_of, judged, pictures
 from tools.bench.world.local import robot
 from tools.bench.world.scenario import BUILT_IN, Expectation, Scenario, ScenarioError, find, load
 from tools.bench.world.serialend import SerialEnd
+from tools.bench.world.stage import CannotPlay, Ends
 from tools.sim.scene_light import SceneLight
 
 ROOT = Path(__file__).parents[2]
@@ -129,6 +132,36 @@ def test_a_robot_computer_that_does_not_answer_is_told_so(tmp_path: Path, capsys
     assert main([str(file), "--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}"]) == 2
     assert "nobody answers at 127.0.0.1 port 9" in capsys.readouterr().out
     assert not (tmp_path / "l").exists()
+
+
+@pytest.mark.parametrize(("raised", "says"), [(CannotPlay("no answer"), "no answer"), (KeyboardInterrupt(), "ended")])
+def test_what_was_played_before_the_end_is_reported(
+    raised: BaseException,
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The second of three cannot be played; it is told of, and the first one's results are not lost."""
+
+    def tried(scenario: Scenario, ends: Ends, twin: bool) -> list[Result]:
+        if scenario.name != "lap":
+            raise raised
+        return [Result("lap.1-error", "a lap", True, 17.0, "seen")]
+
+    monkeypatch.setattr(world, "tried", tried)
+    words = ["lap", "cable", "garbage", "--lidar", "pty:x", "--modbus", "127.0.0.1", "--out", str(tmp_path)]
+    assert main(words) == 2
+    said = capsys.readouterr().out
+    assert says in said
+    assert f"1 of 1 as expected; {tmp_path}/report.html" in said
+    kept = json.loads((tmp_path / "results.json").read_text())["results"]
+    assert [(one["name"], one["passed"]) for one in kept] == [
+        ("lap.1-error", True),
+        ("cable", False),
+        ("garbage", False),
+    ]
+    assert all(says in one["skipped"] for one in kept[1:])
 
 
 @pytest.mark.system

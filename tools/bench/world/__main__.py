@@ -125,20 +125,26 @@ def main(arguments: list[str] | None = None) -> int:
         for path in sorted(BUILT_IN.glob("*.toml")):
             say(f"{path.stem}: {load(path).title}")
         return 0
+    results: list[Result] = []
+    left: list[Scenario] = []
+    why = ""
     try:
         if options.against is not None:
             read(options.against)
-        scenarios = [load(find(name)) for name in options.scenario or ["lap"]]
-        results: list[Result] = []
-        for scenario in scenarios:
-            with opposite(options, scenario) as ends:
-                results += tried(scenario, ends, options.twin)
+        left = [load(find(name)) for name in options.scenario or ["lap"]]
+        while left:
+            with opposite(options, left[0]) as ends:
+                results += tried(left[0], ends, options.twin)
+            del left[0]
     except (ScenarioError, CannotPlay, CannotCompare, HalError, FaultError, ValueError, OSError) as reason:
-        say(f"cannot be played: {reason}")
-        return CANNOT
+        why = f"cannot be played: {reason}"
     except KeyboardInterrupt:
-        say("ended before its end")
-        return CANNOT
+        why = "ended before its end"
+    if why:
+        say(why)
+        if not results:
+            return CANNOT
+        results += [Result(one.name, one.title, False, 0.0, "", skipped=f"not played: {why}") for one in left]
     told = facts(
         robot="a process here" if options.local else options.modbus, lidar=options.lidar or "pty",
         light=options.light or "-", scenarios="\n".join(find(name).read_text() for name in options.scenario or ["lap"]),
@@ -149,7 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
     done = [one for one in results if not one.skipped]
     passed = sum(one.passed for one in done)
     say(f"{passed} of {len(done)} as expected; {options.out}/report.html")
-    return int(passed < len(done) or bool(worse))
+    return CANNOT if why else int(passed < len(done) or bool(worse))
 
 
 if __name__ == "__main__":
