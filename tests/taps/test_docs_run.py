@@ -171,6 +171,7 @@ def desk(warm_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Desk:
             with made.running(command):
                 until((made.folder / "run/lumiloop/lumiloop.stream").exists)
                 time.sleep(0.5)
+    shutil.rmtree(made.folder / "lumiloop" / "maps", ignore_errors=True)  # of one glance, and without lamps
     with made.running(with_light):
         until(lambda: (made.folder / "i2c").exists() and (made.folder / "lamps.toml").exists())
         plain, recording = (one for one in to_run("sessions") if one[2:4] == ["--config", "lumiloop.toml"])
