@@ -80,10 +80,9 @@ class Absolute:
         P, X: see above, both 3x3, odom-aligned axes. kept: T_map_base, and P in map axes, at the latest match, or
             when light or a person said where the map lies; what P has grown by since is of the way, not of the map.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None: either is unknown.
-        odd_since: since when they have disagreed. doubted_at: when that was last no reason to follow light.
-        elsewhere_since: since when what is received does not fit the place. aside_since: since when each epoch by
-            itself has had the robot elsewhere. unheard: the laser has found the place while the `lights` filter held
-            another one, and the two have not agreed since.
+        odd_since: since when they disagree. doubted_at: when that was last no reason to follow light. unheard: the
+            laser has found the place while the `lights` filter held another one, and they have not agreed since.
+        elsewhere_since: since when what is received does not fit the place. aside_since: nor each epoch alone.
         way, way_young: driven so far, and when light last began to find the place. way_start: of the `lights` filter,
             the start that has led to the place on which the two last agreed.
         fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.

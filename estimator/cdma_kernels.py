@@ -39,7 +39,7 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
         phase, rate = lamps[0, i], lamps[1, i]
         before = signs[i, 0]
         begin, period = 0, 0
-        while begin < n_samples:
+        while begin < n_samples and period < signs.shape[1]:
             bounds[i, period] = begin
             sign, end = signs[i, period], begin + np.searchsorted(samples[0, begin:], (length - phase) / rate)
             sent[0] = chips[i, length - 1] * before
@@ -51,7 +51,9 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
             value[lit:] = 0.0
             slope[lit:] = 0.0
             for n in range(lit):
-                u = max(phase + rate * x[n], 0.0)
+                u = phase + rate * x[n]
+                u = u if u > 0.0 else 0.0  # so that nothing, not even what is no number, points out of a table
+                u = u if u < length else float(length)
                 k = np.uint64(min(np.int32(u), np.int32(length - 1)))  # unsigned: no test for indices from the end
                 at = (u - k) * steps
                 j = np.uint64(np.int32(at + 0.5))
@@ -63,6 +65,7 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
             phase -= length
             before = sign
             period += 1
+        out[:, i, begin:] = 0.0
     return bounds
 
 
@@ -168,7 +171,7 @@ def mixed(weights: F8, rows: F8) -> F8:
     return out
 
 
-@kernel("void(f8[:,::1])", inner=True)
+@kernel("void(f8[:,::1])")
 def invert(a: F8) -> None:
     """Inverse of a symmetric positive definite matrix in its own place, by sweeping each pivot.
 

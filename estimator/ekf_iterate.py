@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
+from estimator.cdma_kernels import invert
 from estimator.ekf import COMMON, FIRST, OWN, YAW
 from estimator.ekf_links import OUT_COLUMNS, RESIDUAL, SLOT, WHITE, absorb, linearise
 from estimator.records import Array
@@ -76,14 +77,16 @@ class _Price:
         self.white = out[:, WHITE].copy()
         own = FIRST + OWN * links[self.used, SLOT].astype(np.int64)[:, None] + np.arange(OWN)
         self.at = np.concatenate((np.arange(3), np.arange(COMMON, FIRST), own.ravel()))
-        self.L = np.linalg.inv(P0[np.ix_(self.at, self.at)] + JITTER * np.eye(len(self.at)))
+        self.L = P0[np.ix_(self.at, self.at)] + JITTER * np.eye(len(self.at))
+        invert(self.L)
 
     def of(self, x: Array, out: Array) -> float:
         """``out``: what `linearise` says of the links at ``x``."""
         off = x - self.x0
         off[YAW] = se2.wrap(float(off[YAW]))
         off, r = off[self.at], out[self.used, RESIDUAL]
-        return float(off @ self.L @ off + np.sum(r * r / self.white[self.used]))
+        prior = np.sum(off[:, None] * self.L * off)  # not by a matrix product, which would wake BLAS threads
+        return float(prior + np.sum(r * r / self.white[self.used]))
 
 
 def _further(

@@ -45,6 +45,18 @@ def test_columns_follow_the_code_with_its_signs() -> None:
     assert got.bounds.tolist() == [[0, np.count_nonzero(63.7 + x < 127), 89, 89], [0, 41, 89, 89]]
 
 
+@pytest.mark.parametrize(
+    ("phase", "rate"),
+    [(np.nan, 1.0), (1.0, np.nan), (1.0, np.inf), (np.inf, 1.0), (-np.inf, 1.0), (1e15, 1.0), (1.0, -1.0), (1.0, 1e12)],
+)
+def test_phases_that_cannot_be_point_out_of_no_table(phase: float, rate: float) -> None:
+    """A kernel that reads beyond an array's end takes the whole process along."""
+    got = waves([phase], [rate], np.arange(-40.0, 40.0, 0.9), np.ones((1, 3)))
+    assert np.isfinite(got.value).all()
+    assert got.bounds.min() >= 0
+    assert got.bounds.max() <= got.value.shape[1]
+
+
 def test_slopes_are_the_derivatives() -> None:
     x, signs = np.arange(-30.0, 30.0, 0.83), np.ones((1, 3))
     ahead, behind = waves([63.7 + 5e-3], [1.0], x, signs), waves([63.7 - 5e-3], [1.0], x, signs)
