@@ -23,7 +23,7 @@ from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import MOST_ROBOTS, Roster
 from taps.stream import Stream
-from taps.zenohlink import BadEndpoint, config, joined
+from taps.zenohlink import config, joined
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 from tests.taps.serving import served
 
@@ -283,6 +283,12 @@ def test_a_router_that_takes_the_connection_and_says_nothing_is_said_and_holds_u
         assert time.monotonic() - begun < 3.0
 
 
+def in_a_loop_of_its_own(words: list[str]) -> int:
+    """The command, in a thread that cannot take signals."""
+    args = cli.parser().parse_args(words)
+    return int(args.body(args))
+
+
 def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def body(made: Router, words: list[str]) -> None:
         await asyncio.sleep(1.0)
@@ -379,76 +385,6 @@ def test_who_asks_once_does_not_wait_for_ever(
     told = capsys.readouterr()
     assert told.out == ""
     assert "no router answers at tcp/127.0.0.1:1 within 0.3 s: start one (`lumiloop fleet router`)" in told.err
-
-
-def in_a_loop_of_its_own(words: list[str]) -> int:
-    """The command, in a thread that cannot take signals."""
-    args = cli.parser().parse_args(words)
-    return int(args.body(args))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["fleet", "--router", "nohost"], "Expected `host:port`"),
-        (["fleet", "--router", "nothing/x"], "'nothing' is no protocol; there are tcp, tls"),
-        (["fleet", "--router", "tcp/127.0.0.1:1"], "waiting for it (Unable to connect"),
-        (["fleet", "join", "--router", "a b:1"], "Expected `host:port`"),
-        (["ros2", "--namespace", "agv-1"], "--namespace: Expected a namespace"),
-        (["fleet", "share"], "say what to share"),
-        (["fleet", "share", "--survey", "/none"], "/none: cannot be read: No such file"),
-        (["fleet", "router", "--zenoh", "/none"], "/none"),
-        (["fleet", "fetch", "--switch", "--set", "modbus.port=0"], "--switch: the configuration switches Modbus off"),
-    ],
-)
-def test_what_cannot_be_is_said(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if "tcp/127.0.0.1:1" in words:
-        monkeypatch.setattr("taps.zenohlink.RETRY_S", -1.0)
-        monkeypatch.setattr(asyncio, "sleep", interrupted)
-    try:
-        code = cli.main(words)
-    except KeyboardInterrupt:
-        code = cli.INTERRUPTED
-    assert code != cli.OK
-    assert said in capsys.readouterr().err
-
-
-def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["ros2", "--domain", "-1"])
-    assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
-
-
-def test_what_is_not_shared_cannot_be_fetched(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["fleet", "fetch", "maps"])
-    assert capsys.readouterr().err.endswith("maps: name survey, map, or none for both\n")
-    for words in ([], ["map"], ["survey", "map"]):
-        assert cli.parser().parse_args(["fleet", "fetch", *words]).what == words
-
-
-@pytest.mark.parametrize(
-    ("content", "said"), [(None, "cannot be read: No such file"), ("rubbish", "no certificate or")]
-)
-def test_a_certificate_that_is_none_is_said_and_not_waited_for(tmp_path: Path, content: str | None, said: str) -> None:
-    pem, file = tmp_path / "ca.pem", tmp_path / "zenoh.json5"
-    file.write_text(json.dumps({"transport": {"link": {"tls": {"root_ca_certificate": str(pem)}}}}))
-    if content is not None:
-        pem.write_text(content)
-    with pytest.raises(BadEndpoint, match=said):
-        config("client", "tls/localhost:1", file)
-
-
-async def interrupted(seconds: float) -> None:
-    raise KeyboardInterrupt
-
-
-def test_a_port_that_is_taken_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    with router() as made:
-        assert cli.main(["fleet", "router", "--listen", made.address]) == cli.FAILED
-    assert f"cannot listen on {made.address}" in capsys.readouterr().err
 
 
 def test_what_is_new_in_a_message_is_skipped() -> None:

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import re
 import socket
-import struct
 from collections.abc import Awaitable, Callable
 from importlib import resources
 from pathlib import Path
@@ -18,15 +17,12 @@ import pytest
 from aiohttp import WSServerHandshakeError
 
 from daemon.publish import stream as daemon_stream
-from daemon.publish.holding import CommandCode, Outcome, Request
 from daemon.publish.snapshot import State
 from taps.frames import Loop, MapTiles, Scan
-from taps.view import orders, server, viewers
+from taps.view import server, viewers
 from taps.view.guard import Guard
-from taps.view.orders import Orders
-from tests.daemon.publish.network import publishing
 from tests.daemon.publish.test_stream import raw_scan, until
-from tests.taps.view.house import TOKEN, House, Page, serving, snapshot
+from tests.taps.view.house import TOKEN, House, serving, snapshot
 
 
 def run(folder: Path, body: Callable[[House], Awaitable[None]], **options: Any) -> None:
@@ -315,169 +311,6 @@ def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Path) ->
         assert [one["topic"] for one in msgspec.msgpack.decode(message)] == ["loop"]
 
     asyncio.run(body())
-
-
-# orders
-
-
-async def order(page: Page, name: str, **other: object) -> None:
-    await page.socket.send_json({"order": name, **other})
-
-
-def ordering(tmp_path: Path, body: Callable[[House, list[Request], Any], Awaitable[None]], write: bool = True) -> None:
-    """Run a test beside a daemon's Modbus server."""
-
-    async def all_of_it() -> None:
-        asked: list[Request] = []
-        async with (
-            publishing(write=write, on_command=asked.append) as modbus,
-            serving(tmp_path, Guard("127.0.0.1", TOKEN, True), modbus=modbus.port) as house,
-        ):
-            await body(house, asked, modbus)
-
-    asyncio.run(all_of_it())
-
-
-def test_an_order_reaches_the_daemon_and_all_are_told(tmp_path: Path) -> None:
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        async with house.page(TOKEN) as page, house.page() as other:
-            told = await page.welcome()
-            assert set(told["orders"]) >= {"relocalise", "save_map", "set_pose", "dump_recorder"}
-            assert (await other.welcome())["orders"] == {}
-            await order(page, "set_pose", pose=[1.25, -2.5, 7.0])
-            running = await other.until("order")
-            assert (running["order"], running["outcome"], running["viewer"]) == ("set_pose", "running", told["you"])
-            assert asked[0].code is CommandCode.SET_POSE
-            assert asked[0].pose == pytest.approx((1.25, -2.5, 7.0 - 2 * np.pi), abs=1e-4)
-            modbus.acknowledge(asked[0].number, Outcome.DONE)
-            assert (await other.until("order"))["outcome"] == "done"
-            assert (await page.until("order", lambda one: one["outcome"] == "done"))["number"] == asked[0].number
-
-    ordering(tmp_path, body)
-
-
-def test_the_last_of_two_orders_wins_and_both_are_told(tmp_path: Path) -> None:
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        async with house.page(TOKEN) as page, house.page(TOKEN) as other:
-            await page.welcome()
-            second = (await other.welcome())["you"]
-            await order(page, "save_map")
-            await page.until("order")
-            await order(other, "relocalise")
-            replaced = await page.until("order", lambda one: one["outcome"] == "replaced")
-            assert (replaced["order"], replaced["by"]) == ("save_map", second)
-            await other.until("order", lambda one: one["outcome"] == "replaced")
-            modbus.acknowledge(asked[1].number, Outcome.REFUSED)
-            for one in (page, other):
-                assert (await one.until("order", lambda o: o["outcome"] == "refused"))["order"] == "relocalise"
-
-    ordering(tmp_path, body)
-
-
-def test_an_order_that_another_client_replaces(tmp_path: Path) -> None:
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        async with house.page(TOKEN) as page:
-            await page.welcome()
-            await order(page, "relocalise")
-            await page.until("order")
-            machine = Orders("127.0.0.1", modbus.port, lambda told: None)
-            try:
-                await machine.give(0, {"order": "save_map"})
-                assert "by" not in await page.until("order", lambda one: one["outcome"] == "replaced")
-            finally:
-                await machine.close()
-
-    ordering(tmp_path, body)
-
-
-def test_the_end_of_another_client_s_order_of_the_same_number_is_not_ours(tmp_path: Path) -> None:
-    """Two masters took the next number at the same moment: the later order is the one that is done."""
-
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        async with house.page(TOKEN) as page:
-            await page.welcome()
-            await order(page, "relocalise")
-            await page.until("order")
-            wire = await orders._wired("127.0.0.1", modbus.port)
-            try:
-                other = struct.pack(">HH", asked[0].number, CommandCode.SAVE_MAP)
-                await wire.ask(struct.pack(">BHHB", 16, orders.COMMAND_ADDRESS, 2, 4) + other)
-                modbus.acknowledge(asked[0].number, Outcome.DONE)
-                assert (await page.until("order", lambda one: one["outcome"] != "running"))["outcome"] == "replaced"
-                taken = {await wire.next_number() for _ in range(40)}
-                assert asked[0].number not in taken
-                assert len(taken) > 30
-                assert all(0 < number <= 0xFFFF for number in taken)
-            finally:
-                wire.close()
-
-    ordering(tmp_path, body)
-
-
-@pytest.mark.parametrize(("between", "said"), [(None, "done"), (0x78, "replaced")])
-def test_another_map_that_somebody_names_in_between_is_no_map_of_ours(
-    tmp_path: Path, between: int | None, said: str
-) -> None:
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        wire = await orders._wired("127.0.0.1", modbus.port)
-        switching = asyncio.create_task(orders.switch_map("agv", "127.0.0.1", modbus.port, 0x77))
-        try:
-            await until(lambda: bool(asked))
-            assert (asked[0].code, asked[0].map_id) == (CommandCode.SWITCH_MAP, 0x77)
-            if between is not None:
-                await wire.ask(struct.pack(">BHHBI", 16, orders.MAP_ADDRESS, 2, 4, between))
-            modbus.acknowledge(asked[0].number, Outcome.DONE)
-            assert await switching == said
-        finally:
-            wire.close()
-
-    ordering(tmp_path, body)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ({"order": "reset"}, "no order"),
-        ({"order": "set_pose"}, "wants a pose"),
-        ({"order": "set_pose", "pose": [1, 2, "3"]}, "wants a pose"),
-        ({"order": "set_pose", "pose": [1, 2, float("nan")]}, "wants a pose"),
-        ({"order": "set_pose", "pose": [1e9, 2, 0]}, "away"),
-        ({"order": "set_pose", "pose": [10**400, 2, 0]}, "wants a pose"),
-        ({"order": ["x"]}, "no order"),
-    ],
-)
-def test_orders_that_cannot_be_given(tmp_path: Path, words: dict[str, Any], said: str) -> None:
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        async with house.page(TOKEN) as page:
-            await page.welcome()
-            await page.socket.send_json(words)
-            assert said in (await page.until("order"))["outcome"]
-            assert asked == []
-
-    ordering(tmp_path, body)
-
-
-def test_a_daemon_that_takes_no_orders_says_so(tmp_path: Path) -> None:
-    async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        async with house.page(TOKEN) as page, house.page() as other:
-            for one in (page, other):
-                await one.welcome()
-                await order(one, "relocalise")
-            assert "modbus.write = true" in (await page.until("order"))["outcome"]
-            assert "--write" in (await other.until("order"))["outcome"]
-            assert asked == []
-
-    ordering(tmp_path, body, write=False)
-
-
-def test_a_daemon_without_modbus_takes_no_orders(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
-        async with house.page(TOKEN) as page:
-            await page.welcome()
-            await order(page, "save_map")
-            assert "modbus.port" in (await page.until("order"))["outcome"]
-
-    run(tmp_path, body, guard=Guard("127.0.0.1", TOKEN, True))
 
 
 def test_the_state_is_told_once_each(tmp_path: Path) -> None:
