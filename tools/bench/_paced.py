@@ -57,7 +57,8 @@ class Wanted:
     """What the parent asks for.
 
     ``turns``: pairs of a stretch alone and one loaded, each of ``stretch_s``, every other pair the other way round.
-    ``solve``: loaded with the graph, too. ``change_s``: from each change so many seconds do not count.
+    ``solve``: loaded with the graph, too. ``change_s``: from each change so many seconds do not count. ``quiet``: each
+    pair has a third stretch in which the computer has nothing else to do.
     """
 
     drive: str
@@ -69,16 +70,28 @@ class Wanted:
     stretch_s: float
     solve: bool = True
     change_s: float = 0.0
+    quiet: bool = False
+
+    @property
+    def stretches(self) -> tuple[str, ...]:
+        """Two turns of them."""
+        turn = ("quiet", "alone", "loaded") if self.quiet else ("alone", "loaded")
+        return turn + turn[::-1]
+
+
+def by_stretch() -> dict[str, list[Any]]:
+    """An empty list for each kind of stretch."""
+    return {"quiet": [], "alone": [], "loaded": []}
 
 
 @dataclass(slots=True)
 class Told:
     """What comes back: microseconds, by stretch; ``pair``: of each cycle, the number of its pair of stretches."""
 
-    late: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
-    cycle: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
-    share: dict[str, list[float]] = field(default_factory=lambda: {"alone": [], "loaded": []})
-    pair: dict[str, list[int]] = field(default_factory=lambda: {"alone": [], "loaded": []})
+    late: dict[str, list[float]] = field(default_factory=by_stretch)
+    cycle: dict[str, list[float]] = field(default_factory=by_stretch)
+    share: dict[str, list[float]] = field(default_factory=by_stretch)
+    pair: dict[str, list[int]] = field(default_factory=by_stretch)
     missed: int = 0
     scans: int = 0
     solved: int = 0
@@ -184,8 +197,8 @@ class Feeder:
         self._turn(self._stretch_now())
 
     def _stretch_now(self) -> str:
-        at = self._at()
-        return "" if at < 0.0 else ("alone", "loaded", "loaded", "alone")[int(at) % 4]
+        at, stretches = self._at(), self._wanted.stretches
+        return "" if at < 0.0 else stretches[int(at) % len(stretches)]
 
     def _at(self) -> float:
         """Stretches since the first one began."""
@@ -210,7 +223,7 @@ class Feeder:
         snapshot = run()
         counts = time.monotonic() - self._begun[0] >= self._wanted.change_s
         if self.stretch and counts and self.daemon is not None:
-            self.told.pair[self.stretch].append(int(self._at()) // 2)
+            self.told.pair[self.stretch].append(2 * int(self._at()) // len(self._wanted.stretches))
             self.told.late[self.stretch].append(1e6 * late)
             self.told.cycle[self.stretch].append(float(self.daemon.cycle.cycle_us or 0))
         return snapshot

@@ -1,13 +1,13 @@
 """How late cycles begin at 40 Hz while other programs keep both cores busy, against a bare loop in C in the same run.
 
 The daemon (a process of its own, whole but for the sensors' wires: `tools.bench._paced`) is fed 1081 beams, wheels and
-16 lamps by a kernel timer. Two burners walk through memory meanwhile. Stretches of ten seconds take turns (A B B A):
-*alone*, and *loaded* with 8 Modbus readers at 100 Hz each, a stream client that never reads, and the graph of 1000
-submaps solved without a pause. Before and after, the C program (`_timerloop.c`) waits for the same timer at the same
-priority.
+16 lamps by a kernel timer. Stretches of ten seconds take turns (A B C C B A): *quiet*, the computer to itself; *alone*,
+beside two burners that walk through memory; and *loaded*, beside them with 8 Modbus readers at 100 Hz each, a stream
+client that never reads, and the graph of 1000 submaps solved without a pause. Before and after, beside the burners, the
+C program (`_timerloop.c`) waits for the same timer at the same priority.
 
-``make bench ARGS=latency`` takes a minute with SCHED_FIFO and one without; for figures that are statistically firm
-``python -m tools.bench.latency --turns 30`` (11 minutes each).
+``make bench ARGS=latency`` takes 90 s with SCHED_FIFO and as many without; for figures that are statistically firm
+``python -m tools.bench.latency --turns 30`` (16 minutes each).
 """
 
 from __future__ import annotations
@@ -75,11 +75,16 @@ def bare(program: Path, fifo: bool, seconds: float = BARE_S) -> list[float]:
 
 
 @contextmanager
-def burning(program: Path) -> Iterator[None]:
-    """Both cores busy."""
+def burning(program: Path) -> Iterator[Callable[[bool], None]]:
+    """Both cores busy, or not for a while: what is yielded is called with which of the two."""
     burners = [subprocess.Popen([str(program), "burn"]) for _ in range(BURNERS)]
+
+    def turn(on: bool) -> None:
+        for burner in burners:
+            burner.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
+
     try:
-        yield
+        yield turn
     finally:
         for burner in burners:
             burner.kill()
@@ -126,7 +131,7 @@ class Load:
         return int(asked), int(answered)
 
 
-def paced(folder: Path, drive: Path, fifo: bool, turns: int) -> dict[str, Any]:
+def paced(folder: Path, drive: Path, fifo: bool, turns: int, burn: Callable[[bool], None]) -> dict[str, Any]:
     """One run of the daemon: what it told, with the readers' counts."""
     with ExitStack() as undo:
         sink = undo.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -138,6 +143,7 @@ def paced(folder: Path, drive: Path, fifo: bool, turns: int) -> dict[str, Any]:
         wanted = {
             "drive": str(drive), "stream": stream, "modbus": modbus, "fifo": fifo, "turns": turns,
             "receiver": f"127.0.0.1:{sink.getsockname()[1]}", "stretch_s": STRETCH_S,
+            "quiet": True,
         }  # fmt: skip
         command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -157,6 +163,7 @@ def paced(folder: Path, drive: Path, fifo: bool, turns: int) -> dict[str, Any]:
                 child.stdin.close()
             else:
                 load.turn(line.strip() == "loaded")
+                burn(line.strip() != "quiet")
     raise CannotRun("the daemon ended before its time; its log says why")
 
 
@@ -166,11 +173,11 @@ def measure(turns: int, fifos: tuple[bool, ...] = (True, False)) -> dict[str, di
     found = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        program, drive = compiled(folder), prepared(folder, SETTLE_S + 2 * turns * STRETCH_S)
+        program, drive = compiled(folder), prepared(folder, SETTLE_S + 3 * turns * STRETCH_S)
         for fifo in fifos:
-            with burning(program):
+            with burning(program) as burn:
                 before = bare(program, fifo)
-                told = paced(folder, drive, fifo, turns)
+                told = paced(folder, drive, fifo, turns, burn)
                 told["bare"] = before + bare(program, fifo)
             found["SCHED_FIFO" if fifo else "ordinary"] = told
     return found
@@ -181,11 +188,12 @@ def figures(found: dict[str, dict[str, Any]]) -> list[Figure]:
     rows = []
     for name, told in found.items():
         bound = name == "SCHED_FIFO"
-        late = {what: 1e-3 * np.array(told["late"][what]) for what in ("alone", "loaded")}
-        every = np.concatenate(list(late.values()))
+        late = {what: 1e-3 * np.array(told["late"][what]) for what in told["late"]}
+        every = np.concatenate([late["alone"], late["loaded"]])
         bare_ms = 1e-3 * np.array(told["bare"])
         bare_worst = float(np.percentile(bare_ms, 99.9))
         rows += _late(f"{name}: bare C loop", bare_ms)
+        rows += _late(f"{name}: cycles, quiet", late["quiet"])
         rows += _late(f"{name}: cycles, alone", late["alone"], 1.5 if bound else None)
         rows += _late(f"{name}: cycles, loaded", late["loaded"])
         worst = float(np.percentile(every, 99.9)) - bare_worst
@@ -214,13 +222,22 @@ def _late(name: str, ms: np.ndarray[Any, Any], bound: float | None = None) -> li
 
 
 def _costs(name: str, told: dict[str, Any]) -> list[Figure]:
-    cycle = 1e-3 * np.array(told["cycle"]["alone"])
-    share = 100.0 * float(np.mean(told["share"]["alone"]))
+    rows = []
+    for what in ("quiet", "alone", "loaded"):
+        cycle = 1e-3 * np.array(told["cycle"][what])
+        rows += [
+            Figure(f"{name}: a cycle, {what}, median", float(np.median(cycle)), "ms", command=COMMAND),
+            Figure(f"{name}: a cycle, {what}, p99.9", float(np.percentile(cycle, 99.9)), "ms", command=COMMAND),
+        ]
+    for what in ("quiet", "alone", "loaded"):
+        full, share = f"{name}: all threads, share of one core, {what}", 100.0 * float(np.mean(told["share"][what]))
+        rows.append(
+            bounded(full, share, "%", "<= 15", COMMAND)
+            if what == "quiet"
+            else Figure(full, share, "%", command=COMMAND)
+        )
     return [
-        Figure(f"{name}: a cycle, median", float(np.median(cycle)), "ms", command=COMMAND),
-        Figure(f"{name}: a cycle, p99.9", float(np.percentile(cycle, 99.9)), "ms", command=COMMAND),
-        bounded(f"{name}: all threads, share of one core, alone", share, "%", "<= 15", COMMAND),
-        Figure(f"{name}: the same, loaded", 100.0 * float(np.mean(told["share"]["loaded"])), "%", command=COMMAND),
+        *rows,
         Figure(f"{name}: graphs solved", float(told["solved"]), "", command=COMMAND),
         Figure(f"{name}: Modbus requests unanswered", float(told["asked"] - told["answered"]), "", command=COMMAND),
         Figure(f"{name}: stalls", float(told["stalls"]), "", command=COMMAND),
@@ -228,7 +245,7 @@ def _costs(name: str, told: dict[str, Any]) -> list[Figure]:
 
 
 def run(turns: int = 2) -> list[Figure]:
-    """Some 40 s of cycles with SCHED_FIFO, where it may be had, and as many without."""
+    """Some 60 s of cycles with SCHED_FIFO, where it may be had, and as many without."""
     fifos = (True, False) if os.geteuid() == 0 else (False,)
     return figures(measure(turns, fifos))
 
@@ -236,7 +253,7 @@ def run(turns: int = 2) -> list[Figure]:
 def long_form(name: str, prog: str, other: str, run: Callable[[int], list[Figure]]) -> None:
     """The command by itself, for figures that are firm; ``other``: what every second stretch is."""
     parser = argparse.ArgumentParser(prog=prog)
-    parser.add_argument("--turns", type=int, default=30, help=f"pairs of 10 s alone and 10 s {other}")
+    parser.add_argument("--turns", type=int, default=30, help=f"times 10 s alone and 10 s {other}")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # daemon, readers and burners must not outlive this one
