@@ -240,7 +240,13 @@ def main() -> None:
     options = parser.parse_args()
     command = f"{COMMAND} --hours {options.hours:g} --scans {options.scans:g}{' --dark' * options.dark}"
     wheels = 50.0 if options.scans > 10.0 else 10.0
-    log = drive(Course(options.hours, options.scans, not options.dark, options.seed, wheels), say=True)
+    course = Course(options.hours, options.scans, not options.dark, options.seed, wheels)
+    least = 2.0 * Robot(course).lap_s / 3600.0
+    if options.hours < least:
+        parser.error(
+            f"--hours {options.hours:g} is less than two laps: what grows after the first shows from {least:.2g} on"
+        )
+    log = drive(course, say=True)
     rows = figures(log, command)
     print(table(rows))
     draw(log, options.out / "day.png")
