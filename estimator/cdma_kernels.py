@@ -192,19 +192,30 @@ def invert(a: F8) -> None:
                     a[i, j] -= factor * a[k, j]
 
 
-@kernel("void(f4[:,::1], i8, f8, f4[::1], f8[:,::1])")
-def detect(correlation: F4, n_samples: int, period: float, sums: F4, out: F8) -> None:
+@kernel("void(f4[:,::1], f8[:,::1], f8, i8, f8, f4[::1], f8[:,::1])")
+def detect(correlation: F4, known: F8, guard: float, n_samples: int, period: float, sums: F4, out: F8) -> None:
     """Best code phase of each code, data signs unknown: the largest sum of |correlation| over the periods touched.
 
     Args:
         correlation: (K, F) correlation of the block with one period of each code that begins at sample ``lag``;
-            negative lags are kept at ``lag + F``.
+            negative lags are kept at ``lag + F``. Set to 0 where known lamps are.
+        known: (2, M) row of the correlation that is of a known lamp's code, -1 if none is, and the sample in
+            [0, period) at which a period of it begins.
+        guard: samples beside that in which nothing is looked for.
         n_samples: of the block.
         period: samples per code period.
         sums: (int(period) + 3,) scratch.
-        out: (K, 4) lag of the best phase in [0, period], the sum there and at the lags before and behind it.
+        out: (K, 5) lag of the best phase in [0, period], the sum there and at the lags before and behind it; and the
+            sum of the squares at those lags at which a whole period lies in the block.
     """
     size, lags = correlation.shape[1], sums.shape[0]
+    for i in range(known.shape[1]):
+        if known[0, i] >= 0.0:
+            row = correlation[np.int64(known[0, i])]
+            for p in range(-1, int(n_samples / period) + 1):
+                middle = known[1, i] + p * period
+                for at in range(math.floor(middle - guard + 0.5), math.floor(middle + guard + 0.5) + 1):
+                    row[at % size] = np.float32(0.0)
     for c in range(correlation.shape[0]):
         row = correlation[c]
         sums[:] = np.float32(0.0)
@@ -225,32 +236,50 @@ def detect(correlation: F4, n_samples: int, period: float, sums: F4, out: F8) ->
             if sums[k] > sums[best]:
                 best = k
         out[c, 0], out[c, 1], out[c, 2], out[c, 3] = best - 1, sums[best], sums[best - 1], sums[best + 1]
+        power, inside = np.float32(0.0), row[: max(n_samples - int(period), 1)]
+        for k in range(inside.shape[0]):
+            power += inside[k] * inside[k]
+        out[c, 4] = power
 
 
-@kernel("void(f4[:,::1], f8[:,::1], i8, f8, f8[::1])")
-def align(correlation: F4, lamps: F8, n_samples: int, period: float, score: F8) -> None:
+@kernel("void(f4[:,::1], f4[::1], f8[:,::1], f8, f8[::1])")
+def align(waves: F4, y: F4, lamps: F8, period: float, score: F8) -> None:
     """How well lamps together fit a common shift, in half samples from ``-(S // 2)``: sum of |correlation|.
 
+    For so few lags an FFT would be the longer way.
+
     Args:
-        correlation: (L, F) of the block with one period of each lamp's code, as for :func:`detect`.
+        waves: (L, W) one period of each lamp's code.
+        y: (N,) the block.
         lamps: (2, L) sample at which a code period of each lamp should begin, within [0, period); weight.
-        n_samples: of the block.
         period: samples per code period.
         score: (S,) for each shift towards earlier samples.
     """
-    size, middle = correlation.shape[1], score.shape[0] // 2
-    for s in range(score.shape[0]):
-        total = 0.0
-        for i in range(correlation.shape[0]):
-            where = lamps[0, i] - 0.5 * (s - middle)
-            where -= period * math.ceil(where / period)  # the last that begins before the block, or with it
-            while where < n_samples:
-                low = math.floor(where)
-                share, at = where - low, (low + size) % size
-                value = (1.0 - share) * correlation[i, at] + share * correlation[i, (at + 1) % size]
-                total += lamps[1, i] * abs(value)
-                where += period
-        score[s] = total
+    n_samples, width, middle = y.shape[0], waves.shape[1], score.shape[0] // 2
+    reach = middle // 2 + 1
+    found = np.empty(2 * reach + 2, np.float32)
+    score[:] = 0.0
+    for i in range(waves.shape[0]):
+        for p in range(-2, int(n_samples / period) + 2):
+            begin = lamps[0, i] + p * period
+            first = math.floor(begin) - reach
+            if first + found.shape[0] <= -period or first >= n_samples:
+                continue
+            for k in range(found.shape[0]):
+                low, high = max(0, -first - k), min(width, n_samples - first - k)
+                total = np.float32(0.0)
+                if high > low:
+                    there, wave = y[first + k + low : first + k + high], waves[i, low:high]
+                    for n in range(there.shape[0]):
+                        total += there[n] * wave[n]
+                found[k] = total
+            for s in range(score.shape[0]):
+                where = begin - 0.5 * (s - middle)
+                if -period < where < n_samples:
+                    low = math.floor(where)
+                    share = where - low
+                    value = (1.0 - share) * found[low - first] + share * found[low - first + 1]
+                    score[s] += lamps[1, i] * abs(value)
 
 
 @kernel("void(i8[::1], i8[::1], f8[:,::1], f8[:,::1], f8, f8[:,:,::1], i8[:,::1])")

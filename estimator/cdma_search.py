@@ -8,6 +8,7 @@ the rest wait for the next block, from which the strong ones will have been take
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cache
@@ -111,6 +112,7 @@ class Search:
         self._cache_clock: Array = np.empty(0)
         self._product: Spectrum = self._cache
         self._lags: npt.NDArray[np.float32] = np.empty((0, 0), np.float32)
+        self._waves, self._sums = self._lags, np.empty(0, np.float32)
         self._size = 0
         every = np.arange(len(self._codes))
         hangs = np.isin(every, list(hung)) if len(hung) else np.ones(len(every), np.bool_)
@@ -174,7 +176,7 @@ class Search:
         return self._profile.samples_per_chip / (1.0 + clock)
 
     def _prepare(self, codes: Index, clock: float) -> None:
-        """Bring the kept spectra of these codes up to this clock: one period of each, conjugated."""
+        """Bring what is kept of these codes up to this clock: one period of each, and its spectrum, conjugated."""
         stale = codes[np.abs(self._cache_clock[codes] - clock) > SAME_CLOCK]
         if not len(stale):
             return
@@ -183,7 +185,8 @@ class Search:
         samples, lamps = np.stack([np.arange(n) / spc, np.ones(n)]), np.stack([np.zeros(few), np.ones(few)])
         waves = np.empty((2, few, n))
         columns(self._codes[stale], lamps, samples, np.tile([1.0, 0.0], (few, 1)), self._table, waves)
-        self._cache[stale] = np.conj(np.fft.rfft(waves[0].astype(np.float32), self._size))
+        self._waves[stale, :n], self._waves[stale, n:] = waves[0], 0.0
+        self._cache[stale] = np.conj(np.fft.rfft(self._waves[stale], self._size))
         self._cache_clock[stale] = clock
 
     def warm(self, n: int, clock: float) -> None:
@@ -207,40 +210,39 @@ class Search:
             self._cache[some[0] : some[-1] + 1] if whole else self._cache[some], self._spectrum
         )
         middle, period = 0.5 * (n - 1), self._profile.length * spc
-        known = np.isin(job.codes, some)
-        begin = (middle - job.phases[known] * spc) % period
-        near = np.arange(-np.ceil(GUARD_CHIPS * spc), np.ceil(GUARD_CHIPS * spc) + 1)
-        centre = begin[:, None] + np.arange(-1, int(n / period) + 1) * period
-        at = np.round(centre[:, :, None] + near).astype(np.int64)
-        correlation[np.searchsorted(some, job.codes[known])[:, None, None], at % self._size] = 0.0
-        out = np.empty((len(some), 4))
-        detect(correlation, n, period, np.empty(int(period) + 3, np.float32), out)
-        inside = correlation[:, : max(n - int(period), 1)]  # the period lies inside the block
-        power = np.sort(np.einsum("ij,ij->i", inside, inside))  # its median; `np.median` takes ten times as long
-        noise = np.sqrt(0.5 * (power[(len(power) - 1) // 2] + power[len(power) // 2]) / (inside.shape[1] * period))
-        energy = self._energy * n
-        z = out[:, 1] / (np.sqrt(n) * max(float(noise), 1e-9))
-        amplitude = out[:, 1] / energy
-        bend = 2 * out[:, 1] - out[:, 2] - out[:, 3]
-        offset = 0.5 * (out[:, 3] - out[:, 2]) / np.maximum(bend, 1e-9)
-        phase = (middle - out[:, 0] - np.clip(offset, -0.5, 0.5)) / spc % self._profile.length
+        row = np.full(len(self._codes), -1)
+        row[some] = np.arange(len(some))
+        known = rows_of(row[job.codes], (middle - job.phases * spc) % period)
+        out = np.empty((len(some), 5))
+        detect(correlation, known, float(np.ceil(GUARD_CHIPS * spc)), n, period, self._sums[: int(period) + 3], out)
+        power = sorted(out[:, 4].tolist())
+        usual = 0.5 * (power[(len(power) - 1) // 2] + power[len(power) // 2])
+        noise = math.sqrt(usual / (max(n - int(period), 1) * period))  # of periods that lie inside the block
+        z = out[:, 1] / (math.sqrt(n) * max(noise, 1e-9))
+        amplitude = out[:, 1] / (self._energy * n)
         good = np.flatnonzero((z > self._limit) & (amplitude > job.floor))
-        return [Found(int(some[k]), float(phase[k]), float(amplitude[k]), float(z[k])) for k in good]
+        found = []
+        for k in good.tolist():
+            lag, there, before, behind, _ = out[k].tolist()
+            offset = 0.5 * (behind - before) / max(2 * there - before - behind, 1e-9)
+            phase = (middle - lag - min(max(offset, -0.5), 0.5)) / spc % self._profile.length
+            found.append(Found(int(some[k]), phase, float(amplitude[k]), float(z[k])))
+        return found
 
     def common_lag(self, y: Array, clock: float, lamps: Lamps, window: float) -> float:
         """Lag in chips by which all lamps together are behind their predicted phases, within ``window`` chips.
 
-        Each code's correlation is looked up where its periods should begin, on a grid of half samples.
+        Each code's correlation is worked out where its periods should begin, on a grid of half samples.
         """
         codes, phase, amplitude = lamps
         spc, n = self._spc(clock), len(y)
         self._fit_size(n)
         self._prepare(codes, clock)
-        correlation = self._correlation(self._cache[codes], _spectrum(y, self._size))
         period = self._profile.length * spc
         half = int(np.ceil(2 * window * spc)) + 1
         score = np.empty(2 * half + 1)
-        align(correlation, rows_of((0.5 * (n - 1) - phase * spc) % period, amplitude), n, period, score)
+        begin = (0.5 * (n - 1) - phase * spc) % period
+        align(self._waves[codes], y.astype(np.float32), rows_of(begin, amplitude), period, score)
         best = min(max(int(score.argmax()), 1), 2 * half - 1)
         before, there, behind = score[best - 1 : best + 2].tolist()
         fine = 0.25 * (behind - before) / max(2 * there - before - behind, 1e-9)
@@ -248,9 +250,11 @@ class Search:
 
     def _fit_size(self, n: int) -> None:
         """FFT length for blocks of ``n`` samples; another length empties the kept spectra."""
-        longest = (self._profile.length + 1) * self._spc(-self._profile.clock_ppm * 1e-6) * 1.01
-        size = _fast_length(n + int(longest) + 1)
+        longest = int((self._profile.length + 1) * self._spc(-self._profile.clock_ppm * 1e-6) * 1.01) + 1
+        size = _fast_length(n + longest)
         if self._cache.shape[1] != size // 2 + 1:
+            self._waves = np.empty((len(self._codes), longest), np.float32)
+            self._sums = np.empty(longest + 3, np.float32)
             self._cache = np.empty((len(self._codes), size // 2 + 1), np.complex64)
             self._cache_clock = np.full(len(self._codes), np.inf)
             self._product = np.empty_like(self._cache)

@@ -146,19 +146,44 @@ def test_fold_weighs_what_was_said_before() -> None:
     assert last[1, [9, 0, 1]].tolist() == [29, 20, -1]
 
 
+def slow_align(waves: np.ndarray, y: np.ndarray, lamps: np.ndarray, period: float, shift: float) -> float:
+    padded = np.pad(y.astype(float), 2 * waves.shape[1])
+
+    def correlation(wave: np.ndarray, lag: float) -> float:
+        low, share = int(np.floor(lag)), lag % 1.0
+        at = [padded[k + 2 * waves.shape[1] :][: waves.shape[1]] @ wave for k in (low, low + 1)]
+        return float((1.0 - share) * at[0] + share * at[1])
+
+    total = 0.0
+    for wave, begin, weight in zip(waves, *lamps, strict=True):
+        begins = [begin - shift + p * period for p in range(-5, 9)]
+        total += float(weight) * sum(abs(correlation(wave, at)) for at in begins if -period < at < len(y))
+    return total
+
+
+@pytest.mark.parametrize("n", [90, 31, 130])
+def test_align_is_the_sum_of_correlations_at_each_shift(n: int) -> None:
+    period, rng = 37.4, np.random.default_rng(n)
+    waves, y = rng.normal(size=(2, 40)).astype(np.float32), rng.normal(size=n).astype(np.float32)
+    lamps, score = np.array([[0.2, 36.9], [2.0, 1.0]]), np.empty(13)
+    cdma_kernels.align(waves, y, lamps, period, score)
+    slow = [slow_align(waves, y, lamps, period, 0.5 * (s - 6)) for s in range(13)]
+    np.testing.assert_allclose(score, slow, rtol=1e-5)
+
+
 def test_align_finds_the_shift_that_lamps_share() -> None:
-    period, n = 37.4, 90
-    correlation = np.zeros((2, 140), np.float32)
-    begin, shift = np.array([5.0, 30.0]), 1.5
-    for row, at in zip(correlation, begin - shift, strict=True):
+    period, n, rng = 37.4, 110, np.random.default_rng(3)
+    waves = rng.choice([-1.0, 1.0], size=(2, 37)).astype(np.float32)
+    begin, y = np.array([5.0, 30.0]), np.zeros(n, np.float32)
+    for wave, at in zip(waves, begin - 2.0, strict=True):
         for p in range(-1, 4):
-            where = at + p * period
-            if -period < where < n:
-                row[int(np.floor(where)) % 140] += 1.0 - where % 1.0
-                row[int(np.floor(where) + 1) % 140] += where % 1.0
+            first = round(at + p * period)
+            low = max(first, 0)
+            high = max(min(first + 37, n), low)
+            y[low:high] += (-1) ** p * wave[low - first : high - first]
     score = np.empty(13)
-    cdma_kernels.align(correlation, np.stack([begin, np.array([2.0, 1.0])]), n, period, score)
-    assert 0.5 * (np.argmax(score) - 6) == shift
+    cdma_kernels.align(waves, y, np.stack([begin, np.array([2.0, 1.0])]), period, score)
+    assert 0.5 * (np.argmax(score) - 6) == 2.0
 
 
 def test_invert_and_what_it_does_to_a_dependent_unknown() -> None:
@@ -187,7 +212,21 @@ def slow_detect(row: np.ndarray, n: int, period: float) -> tuple[float, float, f
 def test_detect_sums_over_the_periods_touched(n: int, period: float) -> None:
     size = n + int(period) + 3
     correlation = np.random.default_rng(n).normal(size=(4, size)).astype(np.float32)
-    out = np.empty((4, 4))
-    cdma_kernels.detect(correlation, n, period, np.empty(int(period) + 3, np.float32), out)
+    out, nobody = np.empty((4, 5)), np.empty((2, 0))
+    cdma_kernels.detect(correlation, nobody, 2.0, n, period, np.empty(int(period) + 3, np.float32), out)
     for row, found in zip(correlation, out, strict=True):
-        np.testing.assert_allclose(found, slow_detect(row, n, period), rtol=1e-5)
+        np.testing.assert_allclose(found[:4], slow_detect(row, n, period), rtol=1e-5)
+        np.testing.assert_allclose(found[4], np.sum(row[: max(n - int(period), 1)] ** 2), rtol=1e-5)
+
+
+def test_detect_passes_over_lamps_that_are_known() -> None:
+    """At each of their periods and ``guard`` samples to either side; of that code alone."""
+    n, period = 90, 37.4
+    size = n + int(period) + 3
+    correlation = np.ones((2, size), np.float32)
+    known, out = np.array([[1.0, -1.0], [4.3, 20.0]]), np.empty((2, 5))
+    cdma_kernels.detect(correlation, known, 2.0, n, period, np.empty(int(period) + 3, np.float32), out)
+    assert correlation[0].all()
+    begins = np.round(4.3 + period * np.arange(-1, 3)).astype(int)
+    muted = (begins[:, None] + np.arange(-2, 3)) % size
+    assert set(np.flatnonzero(correlation[1] == 0.0)) == set(muted.ravel())
