@@ -18,6 +18,12 @@ I8 = npt.NDArray[np.int64]
 TAIL_CHIPS = 2.0
 """By which a period outlasts itself: the tail of its last chip, with room for corrections."""
 
+SURE = 4.0
+"""A data sign is certain when it is so many standard deviations clear."""
+
+ALIKE = 0.1
+"""Relative change of a lamp's strength within a block that surprises nobody."""
+
 
 @kernel("i8(f8[:,::1], f8[:,::1], f8[:,::1], i8, i8[:,::1], i8[:,::1])")
 def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8) -> int:
@@ -134,6 +140,45 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
         unit_var[r] = max(normal[r, r], 1e-12)
     noise_var: float = max(power, 1e-30) / max(size - mains - free, 1)
     return noise_var
+
+
+@kernel("void(i8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1], f8, f8[:,:,::1])")
+def tell_signs(index: I8, pieces: F8, bounds: I8, earlier: F8, long: float, out: F8) -> None:
+    """The sign of each lamp in each code period, where it is certain: by what the last block said, or by length.
+
+    A short piece must be both clear and as strong as the rest of its lamp: what disturbs a block's last samples must
+    not pass for a sign.
+
+    Args:
+        index: of :func:`lay_out`.
+        pieces: (2, K) amplitude and variance of each piece.
+        bounds: of :func:`lay_out`.
+        earlier: (2, L) what the last block said about the first period: sum of soft / variance, and of 1 / variance.
+        long: samples from which a period gets its likelier sign in any case.
+        out: (3, L, P) amplitude with its sign, 0 where not touched; its variance, inf there; the sign, 0 if uncertain.
+    """
+    soft, variance, signs = out[0], out[1], out[2]
+    soft[:] = 0.0
+    variance[:] = np.inf
+    for r in range(pieces.shape[1]):
+        soft[index[0, r], index[1, r]], variance[index[0, r], index[1, r]] = pieces[0, r], pieces[1, r]
+    for i in range(signs.shape[0]):
+        usual, weight = 0.0, 1e-30
+        for p in range(signs.shape[1]):
+            if bounds[i, p + 1] - bounds[i, p] > long:
+                usual += abs(soft[i, p]) / variance[i, p]
+                weight += 1.0 / variance[i, p]
+        usual /= weight
+        for p in range(signs.shape[1]):
+            size, strength, clear = bounds[i, p + 1] - bounds[i, p], abs(soft[i, p]), SURE * np.sqrt(variance[i, p])
+            certain = size > long or (clear < strength and abs(strength - usual) < clear + ALIKE * usual)
+            total = soft[i, p] / variance[i, p]
+            if p == 0:
+                total += earlier[0, i]
+                certain = certain or abs(earlier[0, i]) > SURE * np.sqrt(earlier[1, i])
+            elif size == 0:
+                certain = True
+            signs[i, p] = (-1.0 if total < 0.0 else 1.0) if certain else 0.0
 
 
 @kernel("void(f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1])")

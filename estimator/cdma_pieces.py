@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma_block import Fit, Prior, Sampled, rows_of
-from estimator.cdma_cut import TAIL_CHIPS, compare_shifts, cut, lay_out, solve_rows
+from estimator.cdma_cut import TAIL_CHIPS, compare_shifts, cut, lay_out, solve_rows, tell_signs
 from estimator.cdma_kernels import columns, mixed
 from estimator.cdma_newton import REACH
 
@@ -22,12 +22,6 @@ Index = npt.NDArray[np.int64]
 
 LEADER: Final = 0.4
 """Lamps of at least this share of the strongest lead: their signs are certain before anything is solved."""
-
-SURE: Final = 4.0
-"""A data sign is certain when it is so many standard deviations clear."""
-
-ALIKE: Final = 0.1
-"""Relative change of a lamp's strength within a block that surprises nobody."""
 
 LONG_PIECE: Final = 0.25
 """A code period of which the block holds at least this share gets its likelier sign in any case."""
@@ -38,14 +32,13 @@ class Pieces:
     """The block's signal, a row per lamp and code period touched (K), and two for lag and clock.
 
     Attributes:
-        lamp, period: (K,) of each row. size: (L, P) samples of each period. rows: (K + 2, N).
+        index, bounds: of :func:`estimator.cdma_cut.lay_out`. rows: (K + 2, N).
         found: (K + 2,) amplitudes with their signs; lag in chips; relative clock.
         unit_var: (K,) variance at unit noise. noise_var: per sample.
     """
 
-    lamp: Index
-    period: Index
-    size: Index
+    index: Index
+    bounds: Index
     rows: Array
     found: Array
     unit_var: Array
@@ -81,7 +74,7 @@ def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     cut(prior.chips, lamps, samples, index, k, table, drive, stack)
     found, unit_var = np.empty(k + 2), np.empty(k)
     noise_var = solve_rows(stack, index, k, len(block.q), found, unit_var)
-    return Pieces(index[0, :k], index[1, :k], np.diff(bounds, axis=1), stack[: k + 2], found, unit_var, noise_var)
+    return Pieces(index, bounds, stack[: k + 2], found, unit_var, noise_var)
 
 
 def stacked(block: Sampled, free: int) -> Array:
@@ -101,37 +94,14 @@ def without(block: Sampled, prior: Prior, table: Array) -> Array:
 def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
     """Data signs of a block, from this block and from what the last one said about the first period touched."""
     pieces = solve_pieces(block, prior, table)
-    at = (pieces.lamp, pieces.period)
-    soft, variance = np.zeros(pieces.size.shape), np.full(pieces.size.shape, np.inf)
-    soft[at] = pieces.found[:-2]
-    variance[at] = pieces.noise_var * pieces.unit_var
-    total, weight = soft / variance, 1.0 / variance
-    total[:, 0] += prior.bit_sum
-    weight[:, 0] += prior.bit_weight
-    whole = prior.chips.shape[1] * len(block.x) / (block.x[-1] - block.x[0])
-    long = pieces.size > LONG_PIECE * whole
-    settled = _settled(prior, soft, variance, long)
-    settled[:, 1:] |= pieces.size[:, 1:] == 0
+    whole = prior.chips.shape[1] * len(block.x) / float(block.x[-1] - block.x[0])
+    found = rows_of(pieces.found[:-2], pieces.noise_var * pieces.unit_var)
+    told = np.empty((3, len(prior.phase), pieces.bounds.shape[1] - 1))
+    tell_signs(pieces.index, found, pieces.bounds, rows_of(prior.bit_sum, prior.bit_weight), LONG_PIECE * whole, told)
     reach = REACH / float(block.x[-1])
     lag, clock = pieces.found[-2:].tolist()
     lag, clock = min(max(lag, -REACH), REACH), min(max(clock, -reach), reach)
-    signs = np.where(total < 0, -1.0, 1.0) * settled
-    return Signs(signs, soft, variance, lag, clock, pieces.noise_var)
-
-
-def _settled(prior: Prior, soft: Array, variance: Array, long: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """(L, P) periods whose sign is certain: by what the last block said, or by length.
-
-    A short piece must be both clear and as strong as the rest of its lamp: what disturbs a block's last samples must
-    not pass for a sign.
-    """
-    weight = np.where(long, 1.0 / variance, 0.0)
-    usual = np.sum(np.abs(soft) * weight, axis=1) / np.maximum(np.sum(weight, axis=1), 1e-30)
-    sigma, strength = np.sqrt(variance), np.abs(soft)
-    alike = np.abs(strength - usual[:, None]) < SURE * sigma + ALIKE * usual[:, None]
-    settled: npt.NDArray[np.bool_] = long | (alike & (strength > SURE * sigma))
-    settled[:, 0] |= np.abs(prior.bit_sum) > SURE * np.sqrt(prior.bit_weight)
-    return settled
+    return Signs(told[2], told[0], told[1], lag, clock, pieces.noise_var)
 
 
 SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])

@@ -134,6 +134,39 @@ def test_cut_puts_each_period_into_a_row_of_its_own() -> None:
     np.testing.assert_allclose(out[count + 1], driven * x, atol=1e-7)
 
 
+def slow_signs(
+    soft: np.ndarray, variance: np.ndarray, size: np.ndarray, earlier: np.ndarray, long: float
+) -> np.ndarray:
+    weight = np.where(size > long, 1.0 / variance, 0.0)
+    usual = (np.sum(np.abs(soft) * weight, axis=1) / np.maximum(np.sum(weight, axis=1), 1e-30))[:, None]
+    sigma, strength = np.sqrt(variance), np.abs(soft)
+    alike = np.abs(strength - usual) < cdma_cut.SURE * sigma + cdma_cut.ALIKE * usual
+    certain = (size > long) | (alike & (strength > cdma_cut.SURE * sigma))
+    certain[:, 0] |= np.abs(earlier[0]) > cdma_cut.SURE * np.sqrt(earlier[1])
+    certain[:, 1:] |= size[:, 1:] == 0
+    total = soft / variance
+    total[:, 0] += earlier[0]
+    return np.where(total < 0.0, -1.0, 1.0) * certain
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_signs_are_told_where_they_are_certain(seed: int) -> None:
+    rng, lamps, periods = np.random.default_rng(seed), 9, 5
+    size = rng.integers(0, 40, size=(lamps, periods))
+    bounds = np.concatenate([np.zeros((lamps, 1), np.int64), np.cumsum(size, axis=1)], axis=1)
+    touched = (size > 0) | (np.arange(periods) == 0)
+    at = np.nonzero(touched)
+    pieces = np.stack([rng.normal(scale=10.0, size=len(at[0])), rng.choice([0.2, 2.0, 30.0], size=len(at[0]))])
+    earlier, out = np.stack([rng.normal(scale=5.0, size=lamps), np.ones(lamps)]), np.empty((3, lamps, periods))
+    cdma_cut.tell_signs(np.ascontiguousarray(np.stack([*at, *at])), pieces, bounds, earlier, 20.0, out)
+    soft, variance = np.zeros((lamps, periods)), np.full((lamps, periods), np.inf)
+    soft[at], variance[at] = pieces
+    np.testing.assert_array_equal(out[0], soft)
+    np.testing.assert_array_equal(out[1], variance)
+    np.testing.assert_array_equal(out[2], slow_signs(soft, variance, size, earlier, 20.0))
+    assert {-1.0, 0.0, 1.0} == set(out[2].ravel().tolist())
+
+
 def test_fold_weighs_what_was_said_before() -> None:
     rings, last = np.zeros((2, 3, 10)), np.full((3, 10), -1)
     soft, variance = np.array([[4.0, -6.0, 9.9]]), np.array([[2.0, 3.0, np.inf]])
