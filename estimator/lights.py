@@ -241,7 +241,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
             if lights.course.wheels and in_a_row(lights, middle):
                 row.loosen(narrow, angle, track.P)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
-        likelihood = absorb(lights, track, seen, view_of(lights, back))
+        likelihood = absorb(lights, track, seen, view_of(lights, back), news)
         track.weight += likelihood * news
         views.append((track, seen))
     if len(lights.tracks) > 1:
@@ -265,14 +265,14 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
     ekf.fade(track.x, track.P, n, keep, grow)
 
 
-def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array) -> float:
+def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, news: float) -> float:
     """One hypothesis takes the links in; returns the ln of their likelihood under it."""
     kept, links = table(lights, track, seen)
     if not kept:
         return 0.0
     out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
     ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
-    likelihood = judge(lights, track, kept, out)
+    likelihood = judge(lights, track, kept, out, news)
     return likelihood + ekf_iterate.take_in(track.x, track.P, track.n, links, track.lamps, view, out)
 
 

@@ -229,12 +229,20 @@ def view_of(lights: Lights, back: Array) -> Array:
     return np.concatenate([rx, back, (model.ln, model.floor, model.white, model.edge)])
 
 
-def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> float:
+def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, news: float) -> float:
     """Decide on every link; what is not to be used gets an infinite noise, what may be an outlier a larger one.
 
     Gating waits until the place is known well; before, a deviation is held against the link only softly, because it
     may as well be the place or a gain that is wrong. A lamp that something hides would pull at the place twenty times a
-    second, though, and a robot that stands would be led to where it fits: it only counts against the hypothesis.
+    second, though, and a robot that stands would be led to where it fits: it only counts against the hypothesis. Nor
+    does any other deviation say something new while wheels say that it stands: exchanged lamps would lead it away.
+
+    Args:
+        lights: all of the filter.
+        track: the hypothesis.
+        kept: its links.
+        out: what `ekf_links.linearise` says of them, changed.
+        news: how much of an epoch is news by the way driven since the one before, 0 to 1.
 
     Returns:
         ln of the likelihood of the links that are left out.
@@ -242,6 +250,7 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> float:
     likelihood = 0.0
     half, rim = lights.survey.receiver.half_fov_rad, lights.settings.rim_rad
     cos_rim, cos_out = math.cos(max(half - rim, 0.1)), math.cos(half + rim)
+    news = news if lights.course.wheels else 1.0  # see `weak`
     gating = settled(track) and len(lights.tracks) == 1  # hypotheses are compared by the same links
     for i, (sight, row) in enumerate(zip(kept, out[:, : ekf_links.SLOPES].tolist(), strict=True)):
         r, S = row[ekf_links.RESIDUAL], row[ekf_links.SPREAD] + row[ekf_links.WHITE]
@@ -253,7 +262,7 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array) -> float:
             sight.state = gate(lights, track, sight)
         elif r * r > 4.0 * S:
             soft = 0.25 * r * r
-            out[i, ekf_links.WHITE] += soft - S
+            out[i, ekf_links.WHITE] += soft / news - S if news > 0.0 else math.inf
             if weak(lights, sight):
                 likelihood -= 0.5 * (4.0 + math.log(soft) + ekf_links.LOG_2PI)
                 sight.state = OCCLUDED
