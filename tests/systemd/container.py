@@ -17,9 +17,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tools.bench.vm.image import APART
+from tools.bench.vm.places import LEASH, workspace
+
 SUITE = "bookworm"
 PACKAGES = "systemd,systemd-sysv,dbus,python3,udev"
 TOOLS = {"systemd-nspawn": "systemd-container", "mmdebstrap": "mmdebstrap", "nsenter": "util-linux"}
+ROOM = 1_500_000_000
+"""Bytes that making the base takes for a while."""
 BUILD_S, BOOT_S, COMMAND_S = 900.0, 60.0, 120.0
 
 
@@ -32,18 +37,26 @@ def missing() -> str:
 
 
 def base() -> Path:
-    """The base system as a tar; made where it is not there yet (two minutes, from the distribution's mirror)."""
+    """The base system as a tar; made where it is not there yet (two minutes, from the distribution's mirror).
+
+    Broken off, no process of it goes on, and nothing stays mounted: mmdebstrap binds this machine's /dev/shm into what
+    it makes.
+    """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lumiloop"
     tar = cache / f"{SUITE}.tar"
     if not tar.exists():
         cache.mkdir(parents=True, exist_ok=True)
-        part = cache / f"{SUITE}.{os.getpid()}.tar"  # a name that tells mmdebstrap the format
-        command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}", SUITE, str(part)]
-        try:
-            subprocess.run(command, check=True, timeout=BUILD_S)
-            part.replace(tar)
-        finally:
-            part.unlink(missing_ok=True)
+        with workspace("lumiloop-base", ROOM) as folder:
+            part = folder / tar.name  # a name that tells mmdebstrap the format
+            command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}", SUITE, str(part)]
+            environment = {**os.environ, "TMPDIR": str(folder)}
+            subprocess.run([*LEASH, *APART, *command], check=True, timeout=BUILD_S, env=environment)
+            whole = cache / f"{SUITE}.{os.getpid()}"
+            try:
+                shutil.copyfile(part, whole)
+                whole.replace(tar)
+            finally:
+                whole.unlink(missing_ok=True)
     return tar
 
 

@@ -1,4 +1,4 @@
-"""The making of the virtual bench's image, broken off in the middle: nothing of it goes on, nothing stays mounted."""
+"""The making of a bench's system, broken off in the middle: nothing of it goes on, nothing stays mounted."""
 
 from __future__ import annotations
 
@@ -28,6 +28,14 @@ image._install = lambda folder, root, say: image._do(["sh", "-c", script], "inst
 sys.exit(command.main())
 """
 """A step that starts others and mounts something, and one beside it in another thread."""
+BASE = "from tests.systemd import container; container.base()"
+DEBIAN = """#!/bin/sh
+mount -t tmpfs {place.name} {place}
+touch {place}/there
+sleep 302 & sleep 301 & wait
+"""
+"""In mmdebstrap's place."""
+apart = pytest.mark.skipif(os.geteuid() != 0 or not image._may_be_apart(), reason="root may make name spaces")
 
 
 def running(process: int) -> set[int]:
@@ -48,14 +56,34 @@ def alive(process: int) -> bool:
         return False
 
 
-@pytest.mark.skipif(os.geteuid() != 0 or not image._may_be_apart(), reason="root may make name spaces, others not")
+@apart
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_what_makes_an_image_ends_with_the_bench_and_leaves_no_mount(number: int, tmp_path: Path) -> None:
     place = tmp_path / "mounted"
     place.mkdir()
     command = [sys.executable, "-c", MAKING, "--image-only", str(place)]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as bench:
+    code = _broken_off(command, number, place, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert number == signal.SIGKILL or code == 2
+
+
+@apart
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_what_makes_the_containers_base_ends_with_the_session_and_leaves_no_mount(number: int, tmp_path: Path) -> None:
+    place, programs = tmp_path / "mounted", tmp_path / "bin"
+    place.mkdir()
+    programs.mkdir()
+    (programs / "mmdebstrap").write_text(DEBIAN.format(place=place))
+    (programs / "mmdebstrap").chmod(0o755)
+    cache = tmp_path / "cache"
+    path = f"{programs}:{os.environ['PATH']}"
+    assert _broken_off([sys.executable, "-c", BASE], number, place, PATH=path, XDG_CACHE_HOME=str(cache)) != 0
+    assert [one for one in cache.rglob("*") if one.is_file()] == []
+
+
+def _broken_off(command: list[str], number: int, place: Path, **environment: str) -> int:
+    """Send a signal once both sleepers sleep; what it ended with, when nothing of it goes on and nothing is mounted."""
+    told = {**os.environ, **environment}
+    with subprocess.Popen(command, cwd=ROOT, env=told, stdout=subprocess.PIPE, text=True) as bench:
         end = time.monotonic() + 30.0
         parts: set[int] = set()
         while not {"301", "302"} <= set(map(_last_word, parts)):
@@ -64,12 +92,12 @@ def test_what_makes_an_image_ends_with_the_bench_and_leaves_no_mount(number: int
             parts = running(bench.pid)
         bench.send_signal(number)
         bench.communicate(timeout=20.0)
-    assert number == signal.SIGKILL or bench.returncode == 2
     end = time.monotonic() + 5.0
     while left := [one for one in parts if alive(one)]:
         assert time.monotonic() < end, f"{left} go on"
         time.sleep(0.02)
     assert str(place) not in Path("/proc/self/mounts").read_text()
+    return bench.returncode
 
 
 def _last_word(process: int) -> str:
