@@ -58,6 +58,15 @@ def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
     assert "drives passed then" in (tmp_path / "now" / "report.html").read_text()
 
 
+def test_a_figure_that_is_not_measured_any_more_is_worse(tmp_path: Path) -> None:
+    told = Figure("temperature", 31.0, "deg C")
+    before = read(kept(tmp_path, replace(GOOD, figures=(NOISE, told))))
+    assert regressions([replace(GOOD, figures=())], before) == ["boots: noise is not measured any more, 10 then"]
+    assert regressions([replace(GOOD, figures=(NOISE,))], before) == []
+    failed = replace(GOOD, figures=(), passed=False)
+    assert regressions([failed], before) == ["boots passed then"]
+
+
 @pytest.mark.parametrize(
     ("worse", "value", "lost"),
     [

@@ -91,11 +91,12 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Old:
-    """What another run says of the same thing."""
+    """What another run says of the same thing; ``judged``: the figures of which one way was worse."""
 
     outcome: str
     seconds: float
     figures: dict[str, float]
+    judged: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +175,8 @@ def read(against: Path) -> dict[str, Old]:
 def _old(one: dict[str, Any]) -> Old:
     outcome = "skipped" if one.get("skipped") else "passed" if one["passed"] else "FAILED"
     figures = {figure["name"]: float(figure["value"]) for figure in one.get("figures", ())}
-    return Old(outcome, float(one["seconds"]), figures)
+    judged = frozenset(figure["name"] for figure in one.get("figures", ()) if figure.get("worse"))
+    return Old(outcome, float(one["seconds"]), figures, judged)
 
 
 def regressions(results: list[Result], before: dict[str, Old]) -> list[str]:
@@ -195,6 +197,9 @@ def regressions(results: list[Result], before: dict[str, Old]) -> list[str]:
             for figure in one.figures
             if figure.name in old.figures and figure.lost(old.figures[figure.name])
         ]
+        if one.passed and not one.skipped:  # otherwise it is said above why there are none
+            gone = sorted(old.judged - {figure.name for figure in one.figures})
+            found += [f"{one.name}: {name} is not measured any more, {old.figures[name]:.4g} then" for name in gone]
     return found
 
 
