@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import subprocess
 import threading
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tools.bench.vm import booted, image, places
-from tools.bench.vm.machine import Machine, Ports, command_line
+from tools.bench.vm.machine import Machine, Order, Ports, command_line
 
 
 def test_the_disk_is_never_written_to_and_only_loopback_is_listened_on(tmp_path: Path) -> None:
@@ -48,9 +51,41 @@ def test_a_computer_goes_on_from_what_was_kept_of_it(tmp_path: Path) -> None:
     finally:
         second.stop()
     third = machine("third", "-incoming", "exec:head -c 9000 /dev/urandom")
-    with pytest.raises(places.CannotBench, match=r"QEMU (has ended|does not)"):
-        third._until_status("paused", "taking what is no memory")
-    third.stop()
+    try:
+        with pytest.raises(places.CannotBench, match="QEMU has ended"):
+            third._until_status("paused", "taking what is no memory")
+    finally:
+        third.stop()
+
+
+@pytest.mark.parametrize("hears", [0, 1, 2, 3])
+@pytest.mark.parametrize("cut", ["closed", "reset"])
+def test_a_qemu_that_ends_while_it_is_asked_is_told_from_one_that_does_not_take_it(
+    hears: int, cut: str, tmp_path: Path
+) -> None:
+    """At each word of the talk: before its greeting, after it, and after the first and the second order."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "qmp"))
+    listener.listen()
+    (tmp_path / "qemu").write_text("load of migration failed")
+    process = subprocess.Popen(["sleep", "60"])
+
+    def talks() -> None:
+        link = listener.accept()[0]
+        for word in (b'{"QMP": {}}\n', b'{"return": {}}\n', b'{"return": {"status": "inmigrate"}}\n')[:hears]:
+            link.sendall(word)
+            link.recv(4096, socket.MSG_PEEK if cut == "reset" else 0)  # what is not read resets the line
+        link.close()
+        process.kill()
+
+    talking = threading.Thread(target=talks)
+    talking.start()
+    machine = Machine(process, tmp_path, Ports(1, 2, 3), threading.Event())
+    with pytest.raises(places.CannotBench, match="QEMU has ended with -9:\nload of migration failed"):
+        machine._until_status("paused", "taking what is no memory")
+    talking.join()
+    machine.stop()
+    listener.close()
 
 
 def test_kernels_are_compiled_outside_with_the_settings_that_are_set_inside() -> None:
@@ -65,6 +100,8 @@ def test_what_was_kept_is_of_one_qemu_and_one_command_line(tmp_path: Path, monke
     assert key == booted._key(made)
     (tmp_path / f"booted-{key}").mkdir()
     (tmp_path / f"booted-{key}" / "told.json").write_text('{"seconds": 12.5}')
+    for name in ("disk", "memory"):
+        (tmp_path / f"booted-{key}" / name).write_bytes(b"x")
     assert booted.booted(made, print).seconds == 12.5
     monkeypatch.setattr(booted, "command_line", lambda *given: [*command_line(*given), "-no-hpet"])
     assert booted._key(made) != key
@@ -86,3 +123,39 @@ def test_a_computer_that_does_not_come_up_leaves_nothing_half_done(
     with pytest.raises(places.CannotBench, match="it does not boot"):
         booted.booted(image.Image(tmp_path), lambda text: None)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_kept_is_not_gone_on_from_where_it_is_not_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def boots(folder: Path, made: booted.Booted) -> float:
+        made.disk.write_bytes(b"x")
+        made.memory.write_bytes(b"x")
+        return 31.5
+
+    monkeypatch.setattr(booted, "QEMU", "echo")
+    monkeypatch.setattr(booted, "_boot", boots)
+    said: list[str] = []
+    assert booted.booted(image.Image(tmp_path), said.append).seconds == 31.5
+    assert booted.booted(image.Image(tmp_path), said.append).lacks() == ""
+    assert len(said) == 2
+    (kept,) = tmp_path.iterdir()
+    (kept / "memory").write_bytes(b"")
+    (kept / "told.json").unlink()
+    assert booted.booted(image.Image(tmp_path), said.append).lacks() == ""
+    assert f"{kept} is not whole (no memory, no told.json)" in said[2]
+
+
+@pytest.mark.parametrize("stage", ["wait_until_up", "run"])
+def test_an_agent_that_fails_in_the_first_boot_is_said_as_any_other_reason(
+    stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut(*given: object, **named: object) -> None:
+        raise Order("the line to the agent inside has been cut")
+
+    machine = SimpleNamespace(wait_until_up=lambda: 1.0, run=lambda *words, **named: "running")
+    setattr(machine, stage, cut)
+    monkeypatch.setattr(booted.subprocess, "run", lambda *words, **named: SimpleNamespace(returncode=0))
+    monkeypatch.setattr(booted, "started", lambda *given: nullcontext(machine))
+    with pytest.raises(places.CannotBench, match="not come up well: the line to the agent inside has been cut"):
+        booted._boot(tmp_path, booted.Booted(image.Image(tmp_path), tmp_path))

@@ -55,6 +55,11 @@ class Booted:
         """How long it took from being switched on until it was up."""
         return float(json.loads((self.folder / "told.json").read_text())["seconds"])
 
+    def lacks(self) -> str:
+        """What is missing or empty; empty text: it is whole."""
+        parts = (self.disk, self.memory, self.folder / "told.json")
+        return ", ".join(f"no {part.name}" for part in parts if not part.is_file() or not part.stat().st_size)
+
 
 def booted(image: Image, say: Say) -> Booted:
     """The computer of this image, up; booted now where that has not been done yet.
@@ -63,9 +68,12 @@ def booted(image: Image, say: Say) -> Booted:
         CannotBench: it does not come up, or a unit has failed; says which.
     """
     made = Booted(image, image.folder / f"booted-{_key(image)}")
-    if made.folder.exists():
+    lacks = made.lacks()
+    if not lacks:
         return made
-    for old in image.folder.glob("booted-*"):  # of another QEMU
+    if made.folder.exists():
+        say(f"{made.folder} is not whole ({lacks}); it is booted anew")
+    for old in image.folder.glob("booted-*"):  # of another QEMU, or not whole
         shutil.rmtree(old, ignore_errors=True)
     say("booting the emulated computer for the first time")
     part = image.folder / f"part-{os.getpid()}"
@@ -89,14 +97,14 @@ def _boot(folder: Path, made: Booted) -> float:
     ports = Ports(free_for_both(), free_port(), free_port())
     with started(Start(made.image, made.disk, keep=True), folder, ports, threading.Event()) as machine:
         begun = time.monotonic()
-        machine.wait_until_up()
         try:
+            machine.wait_until_up()
             all_well(machine)
+            seconds = time.monotonic() - begun
+            machine.run(*READ, seconds=60.0)
+            machine.run("sync")
         except Order as error:
             raise CannotBench(f"the emulated computer has not come up well: {error}") from error
-        seconds = time.monotonic() - begun
-        machine.run(*READ, seconds=60.0)
-        machine.run("sync")
         machine.keep(made.memory)
     return seconds
 

@@ -175,10 +175,14 @@ class Machine:
 
     def _cut(self) -> Order:
         """What is wrong when the line to the agent has been cut; `CannotBench` instead if QEMU ends, as it will."""
+        self._see_it_end()
+        return Order("the line to the agent inside has been cut")
+
+    def _see_it_end(self) -> None:
+        """A line of it has been cut: raise `CannotBench` if that is because it ends, which takes it a moment."""
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(QUIT_S)
         self.check()
-        return Order("the line to the agent inside has been cut")
 
     def order(self, patience: float, **order: Any) -> dict[str, Any]:
         """Have the agent do something; its answer.
@@ -261,12 +265,16 @@ class Machine:
         return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", path.read_text(errors="replace")) if path.exists() else ""
 
     def _monitor(self, command: str, **arguments: str) -> dict[str, Any]:
-        if self._qmp is None:
-            link = self._connected("qmp")
-            self._qmp = (link, link.makefile("rb"))
-            self._qmp[1].readline()
-            self._tell("qmp_capabilities", {})
-        return self._tell(command, arguments)
+        try:
+            if self._qmp is None:
+                link = self._connected("qmp")
+                self._qmp = (link, link.makefile("rb"))
+                self._qmp[1].readline()
+                self._tell("qmp_capabilities", {})
+            return self._tell(command, arguments)
+        except OSError as error:  # it may end at any word of this
+            self._see_it_end()
+            raise CannotBench(f"QEMU does not take {command}: {error}") from error
 
     def _connected(self, name: str) -> socket.socket:
         """To one of its sockets; raises `CannotBench` where it has ended, or does not offer it."""
@@ -286,7 +294,9 @@ class Machine:
         assert self._qmp is not None
         self._qmp[0].sendall(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
         while b'"return"' not in (line := self._qmp[1].readline()):
-            if not line or b'"error"' in line:
+            if not line:
+                raise ConnectionError("it has hung up")
+            if b'"error"' in line:
                 raise CannotBench(f"QEMU does not take {command}: {line.decode()}")
         answer: dict[str, Any] = json.loads(line)["return"]
         return answer
