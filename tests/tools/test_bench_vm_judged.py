@@ -1,0 +1,93 @@
+"""Scenarios of the virtual bench against an inside that does not do what it should: each of them can fail."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tools.bench.report import Seen
+from tools.bench.vm import trying_computer, trying_system
+from tools.bench.vm.bench import Bench, Ears, Heard
+from tools.bench.vm.machine import Order
+from tools.bench.world.agreement import Trace
+
+
+def inside(run: Any = None, waited: float = 0.0) -> Bench:
+    """One that answers commands by ``run``, and has waited for a processor so long whenever it is asked again."""
+    told = iter([10.0, 10.0 + waited])
+    machine = SimpleNamespace(run=run, waited_s=lambda: next(told), broken_off=threading.Event())
+    bench = Bench.__new__(Bench)
+    bench.machine, bench.ears, bench.memory = machine, Ears(), {}  # type: ignore[assignment]  # all that is asked
+    return bench
+
+
+def poses(count: int) -> list[Heard]:
+    return [Heard(0.2 * k + 0.04, 0.2 * k, 3, (0.1 * k, 0.0, 0.0), 0.01) for k in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("count", "waited", "right"),
+    [(25, 0.0, True), (23, 0.0, True), (21, 0.0, False), (5, 0.0, False), (15, 2.0, True), (12, 2.0, False)],
+)
+def test_a_datagram_comes_for_each_scan(
+    count: int, waited: float, right: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = inside(waited=waited)
+    monkeypatch.setattr(bench, "collect", lambda seconds: poses(count))
+    if right:
+        assert str(trying_system.sends_datagrams(bench)).startswith(
+            f"{count / 5.0:.1f} a second; the pose is 40 ms old"
+        )
+    else:
+        with pytest.raises(Order, match=f"{count} datagrams of"):
+            trying_system.sends_datagrams(bench)
+
+
+def driven(metres: float) -> Bench:
+    """Poses without an error as far as this, and the truth."""
+    bench = inside()
+    bench.memory["drive"] = poses(round(metres / 0.1) + 1)
+    bench.ears.truth.extend((0.05 * k, (0.025 * k, 0.0, 0.0)) for k in range(2000))
+    return bench
+
+
+def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = np.arange(0.0, 20.0, 0.05)
+    monkeypatch.setattr(trying_system, "outside", lambda: Trace(way, np.zeros((len(way), 2))))
+    seen = trying_system.agrees_with_outside(driven(5.0))
+    assert isinstance(seen, Seen)
+    assert [round(one.value) for one in seen.figures] == [0.0, 5.0, 0.0, 0.0]
+    with pytest.raises(Order, match=r"way compared: 0\.\d+ m"):
+        trying_system.agrees_with_outside(driven(0.6))
+    nowhere = driven(5.0)
+    nowhere.memory["drive"] = [Heard(0.2, 0.2, 1, None, 0.0)] * 20
+    with pytest.raises(Order, match="no pose of the drive claims a place"):
+        trying_system.agrees_with_outside(nowhere)
+
+
+FILES = {
+    "installed": {"/opt/lumiloop", "/usr/bin/lumiloop"},
+    "own": {"/etc/lumiloop", "/etc/lumiloop/lumiloop.toml", "/var/lib/lumiloop", "/var/lib/private/lumiloop"},
+}
+
+
+@pytest.mark.parametrize("kept", ["", "/opt/lumiloop", "/var/lib/private/lumiloop", "/usr/bin/lumiloop"])
+def test_what_is_left_of_a_removed_package_is_named(kept: str) -> None:
+    there = set().union(*FILES.values())
+
+    def run(*words: str, **more: object) -> str:
+        if words[0] == "dpkg":
+            there.difference_update(FILES["installed" if words[1] == "--remove" else "own"] - {kept})
+        if words[0] == "sh":
+            return "\n".join(path for path in words[2].split() if path in there)
+        return "inactive"
+
+    if not kept:
+        assert trying_computer.is_removed(inside(run)) == "nothing is left"
+    else:
+        with pytest.raises(Order, match=f"left: .*{kept}"):
+            trying_computer.is_removed(inside(run))
