@@ -10,6 +10,7 @@ import pytest
 
 from daemon.results import Trajectory
 from estimator.result import Loop
+from tests.logs import __main__ as command
 from tests.logs import bless, golden, made
 from tests.logs.__main__ import main
 from tests.logs.catalog import ENTRIES, Entry, ledger_of, origin
@@ -45,8 +46,11 @@ def test_recordings_of_the_simulator_are_small_and_real_ones_are_not_committed()
 
 def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LUMILOOP_DATA", raising=False)
-    assert main(["room", "exp1"]) == 0
-    assert "exp1   not replayed: LUMILOOP_DATA" in capsys.readouterr().out
+    assert main(["room", "exp1"]) == 1, "it was asked for"
+    told = capsys.readouterr().out
+    assert "room   same" in told
+    assert "exp1   not replayed: LUMILOOP_DATA" in told
+    assert "1 of 2 logs not replayed (exp1): LUMILOOP_DATA does not name" in told
     with pytest.raises(SystemExit):
         main(["nowhere"])
     blessed = golden.load("room")
@@ -60,6 +64,22 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
     monkeypatch.setattr(golden, "load", lambda name: near)
     assert main(["room"]) == 0
     assert "another processor, or other versions: 0.0009" in capsys.readouterr().out
+
+
+def test_real_logs_that_are_left_out_are_said_and_fail_where_all_are_demanded(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("LUMILOOP_DATA", raising=False)
+    monkeypatch.setattr(command, "checked", lambda entry, root: golden.Verdict(True, "as blessed"))
+    real = [entry.name for entry in ENTRIES if entry.source]
+    said = f"{len(real)} of {len(ENTRIES)} logs not replayed ({', '.join(real)}): LUMILOOP_DATA does not name"
+    assert main([]) == 0
+    assert f"{said} the folder of real logs; --all fails without them\n" in capsys.readouterr().out
+    assert main(["--all"]) == 1
+    assert capsys.readouterr().out.endswith(f"{said} the folder of real logs\n")
+    monkeypatch.setenv("LUMILOOP_DATA", "/somewhere")
+    assert main(["--all"]) == 0
+    assert "not replayed" not in capsys.readouterr().out
 
 
 def test_a_log_that_is_not_there_or_another_one_is_named(
