@@ -83,7 +83,7 @@ def _parameters(text: str) -> tuple[Point, ...]:
 COMMAND: Final = Layout(
     (
         _point("request", "request number", "A number other than the last starts the command; write it last, or all in "
-               "one request."),
+               "one request. Begin with 1: 0, which stands there after a start, is acknowledged before it is asked."),
         _point("command", "command", f"{_CODES}."),
         *_parameters("map frame, for SET_POSE"),
         _point("acknowledge", "acknowledge number", "The number of the last request that was finished.", "R"),

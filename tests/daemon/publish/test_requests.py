@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.publish import registers
-from daemon.publish.holding import CommandCode, Holding, Outcome, Request, WrittenOdometry
+from daemon.publish.holding import COMMAND, CommandCode, Holding, Outcome, Request, WrittenOdometry
 from daemon.publish.requests import Responder, frame_size
 from tests.daemon.publish.test_registers import snapshot
 
@@ -256,3 +256,18 @@ def test_odometry_that_is_not_known_is_not_taken() -> None:
     bench = Bench()
     bench.ask(write(1100, 1, 0, 0x8000, 0, 0, 0, 0, 0))
     assert bench.odometry == []
+
+
+def test_the_first_request_is_1_and_0_is_one_after_the_numbers_have_wrapped() -> None:
+    commands: list[Request] = []
+    holding = Holding(commands.append, lambda reading: None)
+    for number, asked in ((0, []), (1, [1]), (65535, [1, 65535]), (0, [1, 65535, 0])):
+        holding.write(1000, struct.pack(">HH", number, CommandCode.RELOCALISE))
+        assert [one.number for one in commands] == asked
+        if asked:
+            assert struct.unpack(">HH", holding.read(1008, 2))[1] == Outcome.RUNNING
+            holding.acknowledge(number, Outcome.DONE)
+            assert struct.unpack(">HH", holding.read(1008, 2)) == (number, Outcome.DONE)
+        else:
+            assert struct.unpack(">HH", holding.read(1008, 2)) == (0, Outcome.NONE)
+    assert "Begin with 1" in next(point.text for point in COMMAND.points if point.name == "request")
