@@ -11,6 +11,9 @@ from typing import Final
 
 SERVICE: Final = Path("/run/lumiloop")
 """The service manager's RuntimeDirectory."""
+LOCAL_SOCKETS: Final = Path("/proc/net/unix")
+ACCEPTS: Final = 0x10000
+"""The flag of a socket that is listened on (__SO_ACCEPTCON)."""
 SERVICE_STATE: Final = Path("/var/lib/lumiloop")
 """The service manager's StateDirectory."""
 
@@ -58,10 +61,22 @@ def daemons_in(folder: Path) -> list[str]:
 
 
 def _served(path: Path) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock, contextlib.suppress(OSError):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
         sock.setblocking(False)
-        sock.connect(str(path))
-        return True
+        try:
+            sock.connect(str(path))
+        except PermissionError:  # another user's, or in a folder that is not open to us
+            return _listened_on(path)
+        except OSError:
+            return False
+    return True
+
+
+def _listened_on(path: Path) -> bool:
+    """Whether somebody listens on a local socket, by the kernel's table, which is open to everybody (proc_net(5))."""
+    with contextlib.suppress(OSError):
+        rows = [line.split(maxsplit=7) for line in LOCAL_SOCKETS.read_text(errors="surrogateescape").splitlines()]
+        return any(row[7:] == [str(path)] and int(row[3], 16) & ACCEPTS for row in rows)
     return False
 
 

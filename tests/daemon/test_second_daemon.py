@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import logging
+import os
+import shutil
 import socket
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from daemon import cli
+from daemon.folders import streams_served
 
 REFUSED = ("run", "--set", "map.localise=true", "--set", "modbus.port=0")
 """A run that ends at once: it needs a map, and there is none."""
@@ -34,3 +38,30 @@ def test_one_of_the_same_name_runs_already(
     caplog.clear()
     assert cli.main([*command, "name=bay3"]) == cli.FAILED  # what a dead one has left is none
     assert "already" not in caplog.text
+
+
+@pytest.mark.parametrize("closed", ["socket", "folder"])
+def test_one_whose_stream_is_not_open_to_us_is_seen_too(closed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service's, started by another user without its group."""
+    folder = Path(tempfile.mkdtemp(prefix="lumiloop-"))
+    folder.chmod(0o755)
+    monkeypatch.setattr("daemon.folders.SERVICE", folder)
+    path, dead = folder / "bay3.stream", folder / "bay4.stream"
+    us = os.geteuid()
+    with socket.socket(socket.AF_UNIX) as other, socket.socket(socket.AF_UNIX) as bound:
+        try:
+            other.bind(str(path))
+            other.listen()
+            bound.bind(str(dead))
+            for one in (path, dead) if closed == "socket" else (folder,):
+                one.chmod(0)
+            if us == 0:
+                os.seteuid(65534)
+            with pytest.raises(PermissionError), socket.socket(socket.AF_UNIX) as link:
+                link.connect(str(path))
+            assert streams_served("bay3") == [path]
+            assert streams_served("bay4") == []
+        finally:
+            os.seteuid(us)
+            folder.chmod(0o755)
+            shutil.rmtree(folder)
