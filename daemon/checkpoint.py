@@ -33,7 +33,7 @@ from daemon.restore import (
     piece_of,
     weak_set,
 )
-from estimator.atlas import Atlas
+from estimator.atlas import Aside, Atlas
 from estimator.keyframe import Keyframe, Submap
 from estimator.lamps import Survey
 from estimator.residual import ResidualMap
@@ -153,6 +153,8 @@ def take(state: State, rest: dict[str, object]) -> Taken:
     """
     taken = Taken()
     taken.hold_all(set(map(_submap_of, state.keyframes.values())).union(state.atlas.submaps.values()))
+    if (aside := state.atlas.aside) is not None:
+        taken.hold_all(set(map(_submap_of, aside.frames.values())).union(aside.submaps.values()))
     try:
         taken.seal({"state": state, "rest": rest})
     except (TypeError, AttributeError, ValueError, pickle.PicklingError, RecursionError) as error:
@@ -196,6 +198,12 @@ def _keep_atlas(atlas: Atlas, taken: Taken) -> Any:
     return blank, (Atlas,), said, None, None, fill
 
 
+def _keep_aside(aside: Aside, taken: Taken) -> Any:
+    said = _fields_of(aside)
+    said["submaps"], said["frames"] = taken.hold(aside.submaps), taken.hold(aside.frames)  # neither is ever changed
+    return blank, (Aside,), said, None, None, fill
+
+
 def _keep_function(function: types.FunctionType, taken: Taken) -> Any:
     if "<" not in function.__qualname__:
         return NotImplemented
@@ -212,6 +220,7 @@ _KEPT: Final[dict[type, Callable[[Any, Taken], Any]]] = {
     **dict.fromkeys((Submap, Survey, ResidualMap, *FIXED), _keep_piece),
     State: _keep_state,
     Atlas: _keep_atlas,
+    Aside: _keep_aside,
     types.FunctionType: _keep_function,
     WeakSet: lambda held, taken: (weak_set, (tuple(held),)),
     _Ref: lambda ref, taken: (piece_of, (ref.number,)),

@@ -29,6 +29,7 @@ from daemon.picture import Facts, Painter
 from daemon.publish.snapshot import Condition, Snapshot, Trust
 from daemon.reasons import REASONS
 from daemon.reasons import Reason as Cause
+from daemon.setaside import another, let_go
 from daemon.state import judge
 from daemon.state_evidence import SILENT_PERIODS, Evidence
 from daemon.state_memory import Memory
@@ -228,7 +229,7 @@ class Cycle:
 
     @property
     def map_id(self) -> int:
-        """Identity of the map frame, another one after every RESET."""
+        """Identity of the map frame, another one after every RESET, and once a stored map was let go of."""
         return self._painter.map_id
 
     @map_id.setter
@@ -303,11 +304,14 @@ class Cycle:
         limits = parts.budget.limits(self.budget_us, light, self._carrier())
         if self.paused:
             limits = replace(limits, update_map=False, rung=Rung.CARRIED)
-        self.result = parts.step(records, limits)
+        before, self.result = self.result, parts.step(records, limits)
         self.laps.lap("step")
         self._tell_unused(limits)
         parts.worker.submit(self.result.jobs)
-        if any(isinstance(record, Command) and record.order is Order.RESET for record in records):
+        reset = any(isinstance(record, Command) and record.order is Order.RESET for record in records)
+        if let_go(before, self.result, self.map_id):
+            self._painter.map_id = another(self.map_id, self.result.t_mono)
+        if reset:
             self._painter.map_id = (self._painter.map_id + 1) % 2**32
         return limits
 

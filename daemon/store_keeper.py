@@ -154,7 +154,7 @@ class Keeper:
         state = self._state()
         if state is None or empty(state):
             return NO_MAP
-        return ADRIFT if state.atlas.adrift is not None and self._saved == self._revision(state) else DONE
+        return ADRIFT if state.atlas.unproved is not None and self._saved == self._revision(state) else DONE
 
     async def run(self) -> None:
         """Save on the schedule until cancelled."""
@@ -246,8 +246,8 @@ class Keeper:
     def _revision(self, state: State) -> Revision:
         """Changes when there is something new to save."""
         atlas = state.atlas
-        if atlas.adrift is not None:
-            return self._map_id(), atlas.adrift, -1
+        if (first := atlas.unproved) is not None:
+            return self._map_id(), first, -1
         return self._map_id(), state.next_key, atlas.closures
 
     def _image(self, state: State) -> MapImage:

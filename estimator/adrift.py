@@ -8,6 +8,7 @@ joins the two parts, ``T_map_odom`` takes the robot there at once, and ordinary 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -20,7 +21,7 @@ from estimator.atlas import LOOK, Atlas
 from estimator.closing import join
 from estimator.globalsearch import Around
 from estimator.hypotheses import WATCH_M, Hypothesis, Seek, Watch
-from estimator.keyframe import Keyframe
+from estimator.keyframe import Keyframe, Submap
 from estimator.linear3 import invert3
 from estimator.loop import Found
 from estimator.mapframe import move_map, rehang, shift_map, unlist
@@ -28,6 +29,9 @@ from estimator.records import Array
 from estimator.relocate import Looked, Piece, Query, look
 from estimator.result import Fix, LoopReason
 from estimator.state import State
+
+Take = Callable[[State, Seek, Keyframe, tuple[Hypothesis, ...], object], None]
+"""Takes in what a look has found: for which search, at which keyframe, for which places it was asked."""
 
 HINT_M, HINT_RAD = 1.0, 0.5
 """How far the robot may be from where a person has said that it is."""
@@ -69,6 +73,8 @@ def begin(state: State) -> bool:
     state.suspicion.leap.forget()
     atlas.cut(state.next_key)
     atlas.seek = Seek()
+    if atlas.aside is not None:
+        atlas.aside.seek = Seek()
     return True
 
 
@@ -146,19 +152,26 @@ def keyframe_laid(state: State, frame: Keyframe) -> None:
 
 
 def look_for(state: State, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
-    """Hand out a look for a keyframe."""
+    """Hand out a look for a keyframe in what is not adrift."""
+    hand_out(state, state.atlas.seek, frame, state.atlas.settled(), around, take_look)
+
+
+def hand_out(
+    state: State, seek: Seek, frame: Keyframe, among: Iterable[Submap], around: tuple[Around, ...] | None, take: Take
+) -> None:
+    """Hand out a look for a keyframe among submaps."""
     atlas, told = state.atlas, state.settings.loops
-    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in atlas.settled() if one.settled is not None)
+    pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in among if one.settled is not None)
     if not pieces or told is None:
         return
-    seek, asked = atlas.seek, atlas.seek.alive
+    asked = seek.alive
     seek.lit = frame.key
     due = seek.due(frame) or seek.elsewhere(around or ())
     if due:
         seek.around = around or ()
     guesses = tuple(se2.compose(one.T_map_odom, frame.T_odom_keyframe) for one in asked)
     query = Query(frame, pieces, seek.terrain, guesses, seek.past, due, around, outvoted=around is not None)
-    then = partial(take_look, state, seek, frame, asked)
+    then = partial(take, state, seek, frame, asked)
     seek.job = atlas.ask(LOOK, partial(look, query, told), then)
 
 
@@ -335,7 +348,8 @@ def said(state: State, one: Hypothesis) -> bool | None:
 def land(state: State, one: Hypothesis, alone: bool) -> None:
     """The place is known: join what was mapped adrift to the older map, and take the robot there.
 
-    ``alone``: by the laser alone.
+    A map in a frame of its own is taken to the robot instead, if light has told where that is. ``alone``: by the laser
+    alone.
     """
     atlas, (frame, fit) = state.atlas, one.held[-1]
     found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in atlas.submaps]
@@ -344,13 +358,16 @@ def land(state: State, one: Hypothesis, alone: bool) -> None:
     T_map_keyframe = se2.compose(atlas.submaps[fit.key].T_map_submap, fit.T_submap_keyframe)
     T_map_odom = se2.compose(T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
     moved = se2.compose(T_map_odom, se2.inverse(state.T_map_odom))
-    shift_map(state, moved, atlas.since)
-    if atlas.since == atlas.kept:  # what was mapped since the start: the start lies in it
-        state.T_map_start = se2.compose(moved, state.T_map_start)
-    move_map(state, T_map_odom)
-    since, first = atlas.since, atlas.adrift
+    stays = atlas.foreign and state.absolute is not None and state.absolute.placed
+    since, first, was = atlas.since, atlas.adrift, state.T_map_odom
+    shift_map(state, moved, since)
+    if stays:
+        state.T_map_odom = T_map_odom  # for the moment: it is no jump
+    else:
+        move_map(state, T_map_odom)
     if first is not None:
-        atlas.watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain, since=since, alone=alone)
+        watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain, since=since, alone=alone)
+        atlas.watch = replace(watch, foreign_m=atlas.way_m if atlas.foreign else None)
     atlas.adrift, atlas.since, atlas.seek = None, 0, Seek()
     for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
         if it.key in atlas.submaps:
@@ -360,7 +377,10 @@ def land(state: State, one: Hypothesis, alone: bool) -> None:
             join(atlas, at, replace(close, reason=LoopReason.PLACED))
     bridge(atlas, first)
     resettle(state, frame, fit.P, first)
-    rehang(state, since)
+    if stays:
+        shift_map(state, se2.inverse(moved), 0)
+        state.T_map_odom = was
+    rehang(state, 0 if stays else since)
 
 
 def bridge(atlas: Atlas, first: int | None) -> None:
@@ -393,9 +413,8 @@ def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> 
         return
     from estimator.relocate_light import disputed, told
 
-    if atlas.foreign:  # map and robot are one again: light takes both into the survey's frame, as after a first start
-        tie.placed, tie.proved, tie.since, atlas.foreign = False, False, 0, False
-        tie.gap, tie.odd_since = None, None
+    if atlas.foreign:  # map and robot are one again: light takes both to where they are, as after a first start
+        tie.since, atlas.foreign = 0, False
     elif tie.placed or told(state):  # the map's frame is the survey's
         absolute.hang_on_anchor(state)
         askew = askew_at(atlas, se2.compose(state.T_map_odom, state.fused.T_odom_base), first)

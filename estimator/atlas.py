@@ -81,6 +81,20 @@ class Constraints:
         self.between, self.T = self.between[which], self.T[which]
         self.information, self.loop = self.information[which], self.loop[which]
 
+    def split(self, first: int) -> Constraints:
+        """Take out what joins submaps with keys below ``first``, and return it; what joins them with others goes."""
+        a, b = (self.between < first).T
+        which = a & b
+        out = Constraints(self.between[which], self.T[which], self.information[which], self.loop[which])
+        self.keep(~(a | b))
+        return out
+
+    def put(self, other: Constraints) -> None:
+        """Add all of the other ones."""
+        self.between, self.T = np.vstack((other.between, self.between)), np.vstack((other.T, self.T))
+        self.information = np.vstack((other.information, self.information))
+        self.loop = np.append(other.loop, self.loop)
+
     def covariance(self, row: int) -> Array:
         """Of a constraint's T, 3x3, in b's axes."""
         H = np.empty((3, 3))
@@ -129,6 +143,26 @@ class Waiting:
 
 
 @dataclass(slots=True, eq=False)
+class Aside:
+    """A stored map in a frame of its own in which the robot has not been found yet; see `estimator.aside`.
+
+    Attributes:
+        submaps, constraints: as of `Atlas`. frames: its keyframes by ID. kept: as of `Atlas`, for when it is found.
+        first: key of the first submap that is no part of it, since: ID of the first such keyframe.
+        begun_m: way driven when it was first put aside. seek: the search for the place in it.
+    """
+
+    submaps: dict[int, Submap]
+    constraints: Constraints
+    frames: dict[int, Keyframe]
+    kept: int
+    first: int
+    since: int
+    begun_m: float
+    seek: Seek
+
+
+@dataclass(slots=True, eq=False)
 class Atlas:
     """Submaps, constraints, and work under way.
 
@@ -152,7 +186,7 @@ class Atlas:
             only used; see `Settings.localise`. foreign: that map does not lie in the light survey's frame, and the
             robot's place in it has not been found yet. askew: covariance (m, m, rad; map axes) of the place that light
             had told, and so of that map, in the survey's frame before the place was lost; T_askew: the pose then. See
-            `Absolute.kept`.
+            `Absolute.kept`. aside: such a foreign map while light tells the place, None: there is none.
         closures: loops accepted so far. news: the latest, until it was reported.
     """
 
@@ -186,6 +220,7 @@ class Atlas:
     foreign: bool = False
     askew: Array = field(default_factory=lambda: np.zeros((3, 3)))
     T_askew: Array = field(default_factory=se2.identity)
+    aside: Aside | None = None
     closures: int = 0
     news: Loop | None = None
 
@@ -193,6 +228,15 @@ class Atlas:
     def newest(self) -> Submap | None:
         """The submap being driven through."""
         return next(reversed(self.submaps.values()), None)
+
+    @property
+    def unproved(self) -> int | None:
+        """Key of the first submap that is no part of the stored map, while that is undecided; None: it is decided."""
+        if self.aside is not None:
+            return self.aside.first
+        if self.watch is not None and self.watch.foreign_m is not None:
+            return self.watch.first
+        return self.adrift
 
     @property
     def looking(self) -> bool:

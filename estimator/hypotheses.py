@@ -230,7 +230,8 @@ class Watch:
     Attributes:
         first: key of the first submap that is no part of the map it was found in. until_m: way until then.
         strikes: looks that have spoken against it since one held it. job: ID of the look under way. terrain: of the
-            latest. since: first keyframe of that part. alone: the laser alone has decided.
+            latest. since: first keyframe of that part. alone: the laser alone has decided. foreign_m: way driven when a
+            map in a frame of its own began to be looked in, None: it lies in the survey's, or there is no light.
     """
 
     first: int
@@ -240,6 +241,7 @@ class Watch:
     job: int = 0
     since: int = 0
     alone: bool = False
+    foreign_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

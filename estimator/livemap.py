@@ -210,6 +210,14 @@ def begin(state: State) -> None:
             state.live.laid(submap, frames)
 
 
+def redraw(state: State) -> None:
+    """The map has become another one: show what it holds now; an answer that shows the other is not waited for."""
+    if state.live is not None:
+        state.atlas.asked.pop(state.live.job, None)
+        state.live.clear()
+        begin(state)
+
+
 def forget(state: State, first: int) -> None:
     """The submaps from key ``first`` on are taken out of the map; an answer that still shows them is not waited for."""
     live = state.live

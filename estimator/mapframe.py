@@ -22,7 +22,7 @@ def move_map(state: State, T_map_odom: Array) -> None:
 
 def shift_map(state: State, moved: Array, since: int) -> None:
     """Move the submaps that begin with keyframe ``since`` or later, 0 being the start, as one piece; and the newest."""
-    if since == 0:
+    if since in (0, state.atlas.kept):  # all that was laid since the start
         state.T_map_start = se2.compose(moved, state.T_map_start)
     for lone in reversed(state.lone.values()):
         if lone.first < since:

@@ -115,27 +115,32 @@ class MapImage:
 def image_of(state: State, identity: Identity | None = None) -> MapImage:
     """The map of this moment, without what is adrift, or lies where only the laser has said and is still watched.
 
+    While a stored map is put aside it is that one, as it was stored.
+
     At most a millisecond.
     """
-    atlas, joined, watch = state.atlas, state.atlas.constraints, state.atlas.watch
+    atlas, watch = state.atlas, state.atlas.watch
+    whole = atlas if atlas.aside is None else atlas.aside
+    frames = state.keyframes if atlas.aside is None else atlas.aside.frames
+    joined = whole.constraints
     adrift = math.inf if atlas.adrift is None else atlas.adrift
     adrift = min(adrift, watch.first) if watch is not None and watch.alone else adrift
     pieces: list[Piece] = []
     hung: dict[int, tuple[int, Array]] = {}
-    for submap in atlas.submaps.values():
+    for submap in whole.submaps.values():
         if submap.key >= adrift:
             break
         pieces.append(_piece(submap))
         if len(submap.hung):
             hung |= {other.key: (submap.key, other.into[1]) for other in submap.hung if other.into is not None}
     tie, identity = state.absolute, identity or Identity()
-    placed = tie is not None and tie.placed and atlas.adrift is None
+    placed = tie is not None and tie.placed and atlas.unproved is None
     gains, sensors, lamps = _learned(state)
     return MapImage(
         identity=replace(identity, surveyed=identity.surveyed or placed),
         submaps=tuple(piece for piece in pieces if piece.settled is not None),
         constraints=Constraints(joined.between, joined.T, joined.information, joined.loop),
-        frames=tuple(state.keyframes.values()),
+        frames=tuple(frames.values()),
         hung=hung,
         unsettled=tuple(piece for piece in pieces if piece.settled is None),
         noise_m=state.noise_m or NOISE_M,

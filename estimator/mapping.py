@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 
-from estimator import absolute, adrift, keyframe, localmap, se2, watch
+from estimator import absolute, adrift, aside, keyframe, localmap, se2, watch
 from estimator.atlas import OWN
 from estimator.closing import keyframe_laid
 from estimator.fusion import covariance, noise_of
@@ -98,6 +98,7 @@ def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
     keyframe_laid(state, frame, P, noise_of(state, scan), anew)
     adrift.keyframe_laid(state, frame)
     watch.keyframe_laid(state, frame)
+    aside.keyframe_laid(state, frame)
     state.keyframes[key] = frame
     state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
     return key

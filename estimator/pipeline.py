@@ -10,6 +10,7 @@ import numpy as np
 from estimator import (
     absolute,
     adrift,
+    aside,
     closing,
     lateness,
     livemap,
@@ -89,6 +90,7 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
     look_for_lamps(state, limits)
     lap("search")
     adrift.step_done(state)
+    aside.step_done(state)
     return report(state, match, keyframe, limits)
 
 
@@ -233,6 +235,8 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
         places=adrift.places(state),
+        aside=state.atlas.aside is not None,
+        let_go=state.let_go,
         lag=state.lag.told,
         jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
         anew=state.anew,

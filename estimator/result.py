@@ -266,6 +266,8 @@ class StepResult:
         protection: bound on the error of T_map_base; None: none can be given.
         places: None where the place in the map is known; else how many places of it fit all that was seen: 0 none yet,
             1 one that is being confirmed.
+        aside: a stored map is put aside: light tells the place, and in that map it is still looked for. let_go: how
+            many stored maps were let go of since the start, because the robot is nowhere in them: the map is another.
         lag: between the stamps of scans and wheels, None where none is beyond doubt.
         jobs: work for the background worker; each answer comes back as a record of a later step.
     """
@@ -288,5 +290,7 @@ class StepResult:
     anew: int = 0
     protection: Protection | None = None
     places: int | None = None
+    aside: bool = False
+    let_go: int = 0
     lag: Lag | None = None
     jobs: tuple[Job, ...] = ()

@@ -93,7 +93,8 @@ class State:
         way: metres driven, and turned as keyframes count turns, by the prediction; paces: of them, in keyframes.
         t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
         t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
-        anew: how often the local map was begun anew because nothing fitted the old one.
+        anew: how often the local map was begun anew because nothing fitted the old one. let_go: how many stored maps
+            were let go of because the robot is nowhere in them.
         lag: between the stamps of scans and wheels. suspicion: whether the robot was carried off.
         journal: is told of every match before it is fused, None: nobody asks.
     """
@@ -118,6 +119,7 @@ class State:
     since_keyframe: int = 0
     failures: int = 0
     anew: int = 0
+    let_go: int = 0
     jumps: int = 0
     noise_m: float = 0.0
     kinship: Array = field(default_factory=lambda: np.zeros(2))

@@ -3,6 +3,7 @@
 A room that is not in the map may look like one that is. While the robot stays in it nothing tells; what it sees when
 it leaves does, and then it is adrift again instead of going on in the wrong place. What it has mapped there meanwhile
 goes if the laser alone had decided; until the watch is over that is not saved, and takes the place of nothing older.
+Where light has the place and the map came in a frame of its own, it is the map that goes: it is put aside (`aside`).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from estimator import adrift, se2
+from estimator import adrift, aside, se2
 from estimator.atlas import LOOK
 from estimator.hypotheses import Watch
 from estimator.keyframe import Keyframe
@@ -53,6 +54,10 @@ def take(state: State, watch: Watch, payload: object) -> None:
     watch.strikes = 0 if fit.verdict is Verdict.HOLDS else watch.strikes + (fit.verdict is Verdict.NO)
     if watch.strikes >= STRIKES and state.atlas.watch is watch and state.atlas.adrift is None:
         state.atlas.watch = None
+        if watch.foreign_m is not None and aside.lit(state):
+            aside.put_aside(state, watch.first, watch.since, watch.foreign_m)
+            return
         if watch.alone:
             adrift.disown(state, watch.first, watch.since)
         adrift.begin(state)
+        state.atlas.foreign |= watch.foreign_m is not None

@@ -339,7 +339,7 @@ class _Later:
 
 def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> None:
     """Else it would be saved at once, without its name and without what a person has surveyed of it."""
-    atlas = SimpleNamespace(adrift=None, closures=3)
+    atlas = SimpleNamespace(unproved=None, closures=3)
     state: Any = SimpleNamespace(atlas=atlas, next_key=9, light=None, keyframes={1: None})
     used, start = [1], SimpleNamespace()
     saved: list[object] = []

@@ -62,11 +62,15 @@ def test_a_map_of_another_frame_comes_to_where_light_has_the_robot_and_is_the_su
     assert state.atlas.foreign
     robot = Robot(state, Observer(0.0, odometry=True, lidar=True, lights=True))
     off, said = [], []
-    for arrived in records(14.0, lit=True):
+    for arrived in records(50.0, lit=True):
         t = arrived[-1].t_end  # type: ignore[union-attr]
         robot.take(t, arrived)
         off.append(robot.moment(t, WAY.at(np.array([robot.t_mono]))[0]).off_m)
         said.append(robot.memory.state)
+        if said[-1] is Said.TRACKING and state.atlas.watch is not None:
+            assert not image_of(state).identity.surveyed
+        if len(said) > 140 and state.atlas.watch is None:
+            break
     assert state.atlas.adrift is None
     assert not state.atlas.foreign
     assert max(off[-20:]) < 0.15
