@@ -17,8 +17,6 @@ import threading
 from pathlib import Path
 from typing import Final
 
-from daemon.hugepages import gather
-
 PRIORITY: Final = 40
 """Of SCHED_FIFO: above ordinary threaded interrupts' users, below the interrupts themselves (50)."""
 BEHIND: Final = 1
@@ -80,14 +78,13 @@ def claim() -> tuple[str, ...]:
     """Take what the limits allow, for the calling thread and its process; what was taken, or why not, a phrase each.
 
     Threads made later do not inherit it (SCHED_RESET_ON_FORK): only the loop is in a hurry. They get their place from
-    :func:`line_up`. The memory of :func:`reserve` is taken, and put into large pages, whatever the limits say.
+    :func:`line_up`. The memory of :func:`reserve` is taken whatever the limits say.
     """
     if not _stakes:
         reserve()
-    paged = gather()
     said = _schedule(resource.getrlimit(resource.RLIMIT_RTPRIO)[0])
     line_up()
-    return said, _lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]), paged
+    return said, _lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0])
 
 
 def line_up() -> int:

@@ -211,18 +211,6 @@ def test_the_journal_has_fields(machine: Container) -> None:
     assert "What can be done" in machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT)
 
 
-def test_its_memory_is_in_large_pages_where_this_kernel_has_them(machine: Container) -> None:
-    """The unit's restrictions are not in the way of `daemon.hugepages`."""
-    ask = (
-        "from mmap import *; held = mmap(-1, 9 << 20, flags=MAP_PRIVATE | MAP_ANONYMOUS); held.write(bytes(9 << 20)); "
-    )
-    ask += "from daemon.hugepages import gather; print(gather(60.0))"
-    here = subprocess.run([sys.executable, "-c", ask], cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    said = re.findall(r"(\d+) MB in large pages", machine.run("journalctl", "--no-pager", "-u", UNIT))
-    assert ("MB in large pages" in here) == bool(said), here
-    assert all(int(mb) > 30 for mb in said)
-
-
 def test_it_may_write_only_where_it_should(machine: Container) -> None:
     root = Path(f"/proc/{_main(machine)}/root")
     mounts = Path(f"/proc/{_main(machine)}/mountinfo").read_text()
