@@ -152,7 +152,7 @@ class Daemon:
             log.info("stopping")
             self._keep_sample_clock()
             await _stop(tasks.get("cycle"))
-            saving = asyncio.create_task(self.keeper.finish(), name="map at the stop")
+            saving = asyncio.create_task(self.keeper.finish(stop.is_set()), name="map at the stop")
             for name in ("lidar", *tasks):  # the lidar before what only listens: its laser is to go off
                 await _stop(tasks.get(name))
             for task in (stopped, warming):

@@ -29,6 +29,7 @@ from daemon.config import MapConfig
 from daemon.folders import maps_folder
 from daemon.store_file import BadMap, Damaged, Foreign
 from daemon.store_tables import OtherBuilding, Stored, against_survey, read
+from daemon.store_trial import Trial
 from daemon.wholefile import sync_folder, write_whole
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ class Store:
 
     Attributes:
         refused: whether a map was found and could not be used. trouble: what kept `claim` from taking the folder.
+        trial: of the map that a run begins with which has taken the folder.
     """
 
     def __init__(self, folder: Path, mend: bool = True) -> None:
@@ -151,6 +153,7 @@ class Store:
         self._good: dict[Path, bool] = {}
         self._lock: int | None = None
         self.trouble = ""
+        self.trial: Final = Trial(folder)
 
     def claim(self) -> None:
         """Take the folder for this process before there is a map to save: what keeps it from that is known at once.
@@ -198,6 +201,8 @@ class Store:
             for generation in files:
                 try:
                     start = self._read(generation, judge)
+                    if self._lock is not None:
+                        self.trial.begin(start.stored.meta.map_id)
                 except OtherBuilding as error:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:

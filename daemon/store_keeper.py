@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -20,7 +21,9 @@ from typing import TYPE_CHECKING, Final
 
 from daemon.store import Start, Store, said
 from daemon.store_file import BadMap
+from daemon.store_trial import PROOF_S
 from daemon.versions import release
+from hal.beside import beside
 from hal.clock import Clock
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
@@ -94,6 +97,7 @@ class Keeper:
         self._saved: Revision | None = None  # the revision that is on the disk
         self._map_of = map_id()
         self._anew = self._last = False
+        self._proved_at = math.inf
         self._due = clock.now() + FIRST_S
         self._look_due = clock.now() + LOOK_S
         self._waiting: list[Told] = []
@@ -132,8 +136,8 @@ class Keeper:
         self._start, self._map_of = None, self._map_id()
 
     def loaded(self) -> None:
-        """The estimator has been loaded: what it begins with need not be saved."""
-        state = self._state()
+        """The estimator has been loaded: what it begins with need not be saved, but proved to be no start's end."""
+        state, self._proved_at = self._state(), self._clock.now() + PROOF_S
         if state is not None and self._start is not None:
             self._saved = self._revision(state)
 
@@ -160,12 +164,26 @@ class Keeper:
         """Save on the schedule until cancelled."""
         while True:
             await asyncio.sleep(BEAT_S)
+            if self._clock.now() >= self._proved_at:
+                await self._proved()
             self._go_on()
 
-    async def finish(self) -> None:
-        """Save what has changed since the last time, wait for it, but not for ever."""
+    async def _proved(self) -> None:
+        """The map that the run began with has not ended it."""
+        self._proved_at = math.inf
+        if self._store is not None:
+            with contextlib.suppress(RuntimeError):  # no thread: the next start has one less to go
+                await beside(self._store.trial.proved, "map")
+
+    async def finish(self, in_order: bool = True) -> None:
+        """Save what has changed since the last time, wait for it, but not for ever.
+
+        ``in_order``: the run ends because somebody wants it.
+        """
         with contextlib.suppress(asyncio.TimeoutError):
             async with asyncio.timeout(STOP_S):
+                if in_order:
+                    await self._proved()
                 await self._over.wait()
                 self._due, self._last = self._clock.now(), True
                 self._go_on()

@@ -32,7 +32,7 @@ def store_with(folder: Path, *seeds: int) -> Store:
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if path.name != "lock")
+    return sorted(path.name for path in folder.iterdir() if path.name not in ("lock", "starts"))
 
 
 def name(number: int, map_id: int = MAP, more: str = "") -> str:

@@ -1,0 +1,131 @@
+"""A map that ends every start is set aside after three; one that lasts, or that was stopped in order, never."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+
+import pytest
+
+from daemon import store_keeper, store_trial
+from daemon.config import MapConfig
+from daemon.store import Start, started
+from daemon.store_trial import MOST, NAME, PROOF_S
+from tests.daemon.keeping import Bench
+from tests.daemon.mapmaker import content
+from tests.daemon.test_store import MAP, name, names, store_with
+
+
+def begin(folder: Path, proved: bool = False) -> Start | None:
+    """One start; it dies, or is proved."""
+    store, start = started(MapConfig(folder=str(folder)), None)
+    assert store is not None
+    if proved:
+        store.trial.proved()
+    store.close()
+    return start
+
+
+def test_what_no_start_outlives_is_set_aside_and_the_generation_before_it_has_its_turn(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store_with(tmp_path, 1, 2).close()
+    for _ in range(MOST):
+        start = begin(tmp_path)
+        assert start is not None
+        assert start.content == content(seed=2)
+    assert not caplog.messages or "refused" not in caplog.text
+    start = begin(tmp_path)
+    assert start is not None
+    assert start.content == content(seed=1)
+    assert name(2, more=".broken") in names(tmp_path)
+    (said,) = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert name(2, more=".broken") in said.getMessage()
+    assert f"{MOST} starts in a row" in said.getMessage()
+    for _ in range(MOST - 1):
+        assert begin(tmp_path) is not None, "it has as many starts as the one before"
+    assert begin(tmp_path) is None, "and without any map there is a start still"
+
+
+def test_a_start_that_lasts_makes_good_for_those_before(tmp_path: Path) -> None:
+    store_with(tmp_path, 1).close()
+    for number in range(3 * MOST):
+        assert begin(tmp_path, proved=number % MOST == MOST - 1) is not None
+    assert names(tmp_path) == [name(1)]
+
+
+def test_another_run_of_the_computer_counts_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A battery that fails says nothing of the map."""
+    folder, boot = tmp_path / "maps", tmp_path / "boot_id"
+    monkeypatch.setattr(store_trial, "BOOT", boot)
+    store_with(folder, 1).close()
+    for number in range(2 * MOST):
+        boot.write_text(f"boot-{number}\n")
+        assert begin(folder) is not None
+    boot.unlink()
+    for _ in range(MOST):
+        assert begin(folder) is not None
+    assert begin(folder) is None
+
+
+@pytest.mark.parametrize("held", [b"", b"\xff", b"rubbish", f"{MAP:08x} ".encode()])
+def test_a_count_that_cannot_be_read_is_none(tmp_path: Path, held: bytes) -> None:
+    store_with(tmp_path, 1).close()
+    (tmp_path / NAME).write_bytes(held)
+    assert begin(tmp_path) is not None
+
+
+def test_a_folder_that_cannot_be_written_counts_nothing(tmp_path: Path) -> None:
+    store_with(tmp_path, 1).close()
+    (tmp_path / NAME).mkdir()
+    for _ in range(2 * MOST):
+        assert begin(tmp_path, proved=True) is not None
+        assert begin(tmp_path) is not None
+
+
+def test_who_only_looks_or_uses_a_map_as_it_is_counts_nothing(tmp_path: Path) -> None:
+    store_with(tmp_path, 1).close()
+    for _ in range(2 * MOST):
+        started(MapConfig(folder=str(tmp_path)), None, mend=False)
+        started(MapConfig(folder=str(tmp_path), localise=True), None)
+    assert names(tmp_path) == [name(1)]
+    assert not (tmp_path / NAME).exists()
+
+
+def test_a_run_is_proved_when_it_has_lasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_keeper, "BEAT_S", 0.01)
+
+    async def run() -> None:
+        store_with(tmp_path, 1).close()
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        bench.store.claim()
+        bench.store.load()
+        bench.keeper.loaded()
+        beats = asyncio.create_task(bench.keeper.run())
+        bench.clock.t += PROOF_S - 0.1
+        await asyncio.sleep(0.1)
+        assert (tmp_path / NAME).exists()
+        bench.clock.t += 0.1
+        async with asyncio.timeout(20.0):
+            while (tmp_path / NAME).exists():  # noqa: ASYNC110  # nothing tells of it
+                await asyncio.sleep(0.01)
+        beats.cancel()
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("in_order", [True, False])
+def test_a_stop_in_order_proves_it_and_a_defect_does_not(tmp_path: Path, in_order: bool) -> None:
+    async def run() -> None:
+        store_with(tmp_path, 1).close()
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        bench.store.claim()
+        bench.store.load()
+        bench.keeper.loaded()
+        await bench.keeper.finish(in_order)
+        assert (tmp_path / NAME).exists() is not in_order
+
+    asyncio.run(run())
