@@ -17,6 +17,7 @@ import pickle
 import types
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
+from enum import Enum
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 from weakref import WeakSet
@@ -172,7 +173,11 @@ class _Writer(pickle.Pickler):
     def reducer_override(self, obj: object) -> Any:
         """How the kinds of objects are kept that pickle does not know how to keep."""
         kept = _KEPT.get(type(obj))
-        return NotImplemented if kept is None else kept(obj, self._taken)
+        if kept is not None:
+            return kept(obj, self._taken)
+        if isinstance(obj, Enum):  # Python 3.11.0 to 3.11.3 name members by getattr, which a state must not call
+            return type(obj), (obj.value,)
+        return NotImplemented
 
 
 def _pickled(what: object, taken: Taken) -> bytes:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from daemon import restore as reading
+from daemon.checkpoint import Taken
 from daemon.faults import Fault
 from daemon.publish.snapshot import State as Said
 from daemon.restore import ROOT, CannotRestore, Piece, function_within, restore
@@ -158,7 +159,11 @@ def test_what_is_honest_comes_back() -> None:
         "arrays": [np.arange(6.0).reshape(2, 3)[:, ::2], np.zeros(0, np.uint8), np.float64(1.5), np.array(["ab"])],
         "partial": functools.partial(se2.compose, 1),
     }
-    back = reading._Reader(pickle.dumps(honest, 5), {}.__getitem__).load()
+    taken = Taken()
+    taken.seal(honest)
+    (root,) = taken.pieces()
+    assert root.number == ROOT
+    back = reading._Reader(root.content, {}.__getitem__).load()
     assert vars(back["watch"]).keys() == vars(watch).keys()
     assert back["watch"].late == 3
     assert (back["limits"], back["fault"]) == (honest["limits"], Fault.LIDAR_SILENT)
