@@ -65,6 +65,7 @@ def at_a_terminal(words: list[str]) -> Generator[tuple[subprocess.Popen[bytes], 
 
 
 @pytest.mark.system
+@pytest.mark.realtime
 @pytest.mark.parametrize("line", ["tty", "tcp"])
 def test_the_same_bodies_pass_on_a_tty_and_over_tcp(line: str, tmp_path: Path) -> None:
     """Fakes in other processes, met through the kernel; the fake's control socket is the operator."""
@@ -188,7 +189,7 @@ import sys, time
 from pathlib import Path
 from tests.hil.programs import Served, daemon, process
 folder = Path(sys.argv[1])
-waits = "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(open(sys.argv.pop(), 'w').close()))"
+waits = "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(open(sys.argv[-1], 'w').close()))"
 words = [sys.executable, "-c", waits + "; print('on', file=sys.stderr, flush=True); time.sleep(60)"]
 with process([*words, str(folder / "fake")], lambda said: "on" in said) as one:
     with daemon(words, Served("line", None, folder), str(folder / "ended")) as other:
