@@ -170,7 +170,8 @@ def hand_out(
     if due:
         seek.around = around or ()
     guesses = tuple(se2.compose(one.T_map_odom, frame.T_odom_keyframe) for one in asked)
-    query = Query(frame, pieces, seek.terrain, guesses, seek.past, due, around, outvoted=around is not None)
+    firm = tuple(one.firm() for one in asked)
+    query = Query(frame, pieces, seek.terrain, guesses, seek.past, due, around, outvoted=around is not None, firm=firm)
     then = partial(take, state, seek, frame, asked)
     seek.job = atlas.ask(LOOK, partial(look, query, told), then)
 

@@ -93,6 +93,10 @@ class Hypothesis:
         at = np.array([frame.T_odom_keyframe[:2] for frame, _ in self.held]).reshape(-1, 2)
         return float(np.hypot(*np.ptp(at, axis=0))) if len(at) else 0.0
 
+    def firm(self) -> bool:
+        """Whether enough looks have held it, from places far enough apart."""
+        return len(self.held) >= HELD and self.apart() >= HELD_M
+
 
 @dataclass(slots=True, eq=False)
 class Seek:
@@ -173,7 +177,7 @@ class Seek:
         if not self.complete or one.idle:
             return False
         most = 2 * one.holds > one.looks
-        return witnessed or (len(self.alive) == 1 and most and len(one.held) >= HELD and one.apart() >= HELD_M)
+        return witnessed or (len(self.alive) == 1 and most and one.firm())
 
     def recalled(self) -> Hypothesis | None:
         """The place where the robot stood last, if the laser holds it, and no other one in the whole map.

@@ -111,6 +111,7 @@ class Query:
             they may have been taken in somebody's hands.
         search: whether new places are searched for. windows: where; everywhere if None. nodes: most that are opened.
         outvoted: whether something else says that the robot is in the windows, or at the guesses; see `fit`.
+        firm: of each guess whether earlier looks do, from places far enough apart; none are if it is empty.
     """
 
     frame: Keyframe
@@ -122,6 +123,7 @@ class Query:
     windows: tuple[Around, ...] | None = None
     nodes: int = NODES
     outvoted: bool = False
+    firm: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +147,9 @@ def look(query: Query, told: LoopSettings) -> Looked:
     """Look for a keyframe in the whole map."""
     terrain = terrain_of(query.pieces, query.before)
     view = view_of(query.frame, told)
-    guesses = tuple(fit(view, terrain, T, told, query.outvoted) for T in query.guesses)
+    firm = query.firm or (False,) * len(query.guesses)
+    asked = zip(query.guesses, firm, strict=True)
+    guesses = tuple(fit(view, terrain, T, told, query.outvoted or held) for T, held in asked)
     if view is None or not query.search:
         return Looked(terrain, guesses, (), None, 0)
     hits, complete, nodes = searched(query, terrain, view)
@@ -223,8 +227,8 @@ def same(T: Array, other: Array) -> bool:
 def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings, outvoted: bool = False) -> Fit:
     """Match a scan at a place of the map, and judge it.
 
-    ``outvoted``: something else says that it is here or nearby (light, a person). Then a single witness that has looked
-    through where the scan has points does not rule the place out: a door that stood open then is shut now.
+    ``outvoted``: something else says that it is here or nearby (light, a person, earlier looks). Then a single witness
+    that has looked through where the scan has points does not rule the place out: a door that stood open then is shut.
     """
     near = nearest(terrain, T)
     piece = terrain.pieces[near[0]]

@@ -53,6 +53,13 @@ def test_a_look_that_speaks_against_a_place_rules_it_out() -> None:
     assert looked_at([HOLDS, OPEN, NO, OPEN])[1] is None
 
 
+@pytest.mark.parametrize(("looks", "firm"), [(2, False), (3, True)])
+def test_a_place_is_firm_once_enough_looks_have_held_it(looks: int, firm: bool) -> None:
+    one = looked_at([HOLDS] * looks)[1]
+    assert one is not None
+    assert one.firm() is firm
+
+
 @pytest.mark.parametrize(
     ("verdicts", "sure"),
     [

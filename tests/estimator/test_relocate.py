@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from estimator import se2
+from estimator import relocate, se2
 from estimator.globalsearch import Around
 from estimator.keyframe import Keyframe, keep
 from estimator.loop import LoopSettings
 from estimator.records import Array
-from estimator.relocate import Piece, Query, look, same
+from estimator.relocate import POSSIBLE, Piece, Query, Verdict, look, same
 from tests.estimator.adrift import BEAMS, furnished, mapped
 from tests.estimator.world import scan_in
 
@@ -43,3 +43,17 @@ def test_what_was_seen_before_rules_a_new_place_out_unless_light_or_a_person_has
     query = Query(frame, pieces(), None, (), (before,), windows=(window,), outvoted=outvoted)
     places = [one.T_map_keyframe for one, _ in look(query, LoopSettings()).fresh]
     assert any(same(HERE, T) for T in places) == found
+
+
+@pytest.mark.parametrize("firm", [False, True])
+@pytest.mark.parametrize("second", [0.1, 0.3])
+def test_one_witness_alone_rules_no_place_out_that_earlier_looks_have_held(
+    firm: bool, second: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A door that stood open is shut now: of two places that look alike the right one would be gone, and the wrong one
+    be sure."""
+    monkeypatch.setattr(relocate, "worst", lambda *_: (0.36, second))
+    query = Query(seen_from(2, HERE, np.zeros(3)), pieces(), None, (HERE,), (), search=False, firm=(firm,))
+    (one,) = look(query, LoopSettings()).guesses
+    assert one.share > 0.9
+    assert one.verdict is (Verdict.OPEN if firm and second < POSSIBLE else Verdict.NO)
