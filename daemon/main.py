@@ -172,8 +172,8 @@ class Daemon:
         if self._world.start is not None:
             self._begin(self._world.start.stored.meta.map_id)
             gc.freeze()  # the map stays
-            self.keeper.loaded()
             self._remember()
+        self.keeper.loaded()
 
     def _begin(self, map_id: int) -> None:
         """Load the map that is stored; without it, and under another identity, where nothing can be begun with it.
@@ -183,11 +183,14 @@ class Daemon:
         Raises:
             NoMap: there is none that can be used, and `map.localise` asks for one.
         """
+        store = self._world.store
+        if store is not None:
+            store.trial.begin()
         try:
             self._estimator.load()
         except CannotBegin as error:
-            assert self._world.store is not None
-            self._world.store.refuse(error)
+            assert store is not None
+            store.refuse(error)
             if self._estimator.localise:
                 raise NoMap(f"map {map_id:08x} cannot be used, and `map.localise` is true; start again") from error
             self._estimator.start = None

@@ -202,7 +202,7 @@ class Store:
                 try:
                     start = self._read(generation, judge)
                     if self._lock is not None:
-                        self.trial.begin(start.stored.meta.map_id)
+                        self.trial.judge(start.stored.meta.map_id)
                 except OtherBuilding as error:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:

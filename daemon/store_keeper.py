@@ -136,7 +136,7 @@ class Keeper:
         self._start, self._map_of = None, self._map_id()
 
     def loaded(self) -> None:
-        """The estimator has been loaded: what it begins with need not be saved, but proved to be no start's end."""
+        """The estimator can begin: what it begins with need not be saved, but proved to be no start's end."""
         state, self._proved_at = self._state(), self._clock.now() + PROOF_S
         if state is not None and self._start is not None:
             self._saved = self._revision(state)

@@ -2,7 +2,8 @@
 
 Such a file is good by all that can be told from it, and meets a defect of the software. A service that is started again
 and again with it would never come up; without it the robot works, and the file is there for who mends the defect. What
-counts are starts since the computer was switched on: a battery that fails says nothing of a map.
+counts are starts since the computer was switched on, a battery that fails says nothing of a map, and those that have
+come as far as to begin with it: nor does a cache or a folder for a recording that has no room.
 """
 
 from __future__ import annotations
@@ -36,22 +37,32 @@ class Trial:
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         self._open = False
+        self._next = ""
 
-    def begin(self, map_id: int) -> None:
-        """A start begins with a map.
+    def judge(self, map_id: int) -> None:
+        """A map is about to be used.
+
+        Where one was set aside in this run of the computer, and no start has lasted since, another map is not the next
+        one to go: what ends every start is something else then.
 
         Raises:
-            Fatal: as many before it have come to grief. What is tried next begins anew.
+            Fatal: as many starts with it have come to grief. What is tried next begins anew.
         """
         boot = _boot()
-        head = f"{map_id:08x} {boot} "
-        before = self._before(head)
-        again = before >= MOST
-        with contextlib.suppress(OSError):
-            self._path.write_text(f"{head}{0 if again else before + 1}\n", encoding="ascii")
-        self._open = True
-        if again:
+        map_of, run, before = self._before()
+        mine, self._open, self._next = f"{map_id:08x}", True, ""
+        if run != boot or (map_of != mine and before > 0):
+            before = 0
+        elif map_of != mine:
+            return
+        if before >= MOST and self._wrote(f"{mine} {boot} 0\n"):
             raise Fatal
+        self._next = f"{mine} {boot} {before + 1}\n"
+
+    def begin(self) -> None:
+        """The estimator is about to begin with it: what ends this start from now on may be the map."""
+        if self._next:
+            self._wrote(self._next)
 
     def proved(self) -> None:
         """This start has lasted, or was ended in order."""
@@ -60,12 +71,20 @@ class Trial:
             with contextlib.suppress(OSError):
                 self._path.unlink(missing_ok=True)
 
-    def _before(self, head: str) -> int:
+    def _wrote(self, said: str) -> bool:
         try:
-            said = self._path.read_text(encoding="ascii")
-            return int(said[len(head) :]) if said.startswith(head) else 0
+            self._path.write_text(said, encoding="ascii")
+        except OSError:
+            return False
+        return True
+
+    def _before(self) -> tuple[str, str, int]:
+        """Map, run of the computer and count that the file tells of; empty where it cannot be read."""
+        try:
+            map_of, run, count = self._path.read_text(encoding="ascii").split()
+            return map_of, run, int(count)
         except (OSError, ValueError):
-            return 0
+            return "", "", 0
 
 
 def _boot() -> str:

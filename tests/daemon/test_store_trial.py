@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 from pathlib import Path
 
 import pytest
 
-from daemon import store_keeper, store_trial
+from daemon import main, store_keeper, store_trial
 from daemon.config import MapConfig
+from daemon.main import Daemon, World
 from daemon.store import Start, started
 from daemon.store_trial import MOST, NAME, PROOF_S
+from daemon.warmup import CannotLoad
+from hal.clock import LoopClock, run_virtual
+from hal.fake.transport import FakeOpener
 from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import content
+from tests.daemon.mapmaker import Shape, content
+from tests.daemon.test_daemon import SETTINGS
 from tests.daemon.test_store import MAP, name, names, store_with
 
 
@@ -21,6 +27,7 @@ def begin(folder: Path, proved: bool = False) -> Start | None:
     """One start; it dies, or is proved."""
     store, start = started(MapConfig(folder=str(folder)), None)
     assert store is not None
+    store.trial.begin()
     if proved:
         store.trial.proved()
     store.close()
@@ -53,6 +60,68 @@ def test_a_start_that_lasts_makes_good_for_those_before(tmp_path: Path) -> None:
     for number in range(3 * MOST):
         assert begin(tmp_path, proved=number % MOST == MOST - 1) is not None
     assert names(tmp_path) == [name(1)]
+
+
+def test_a_count_that_cannot_be_begun_anew_sets_nothing_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else no generation would be used any more: each would be found to have had its starts."""
+    store_with(tmp_path, 1, 2).close()
+    for _ in range(MOST):
+        begin(tmp_path)
+
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    start = begin(tmp_path)
+    assert start is not None
+    assert start.content == content(seed=2)
+    assert names(tmp_path) == [name(1), name(2)]
+
+
+def test_maps_do_not_go_one_after_the_other_where_something_else_ends_every_start(tmp_path: Path) -> None:
+    store = store_with(tmp_path, 1)
+    store.save(content(Shape(map_id=0x77)), 0x77)
+    store.close()
+    for _ in range(MOST):
+        start = begin(tmp_path)
+        assert start is not None
+        assert start.stored.meta.map_id == 0x77
+    assert begin(tmp_path) is None, "what a person has begun anew does not come back by itself"
+    for _ in range(2 * MOST):
+        assert begin(tmp_path) is not None
+    assert name(1) in names(tmp_path)
+    assert begin(tmp_path, proved=True) is not None
+    for _ in range(MOST):
+        assert begin(tmp_path) is not None
+    assert begin(tmp_path) is None, "it is on trial again once a start has lasted"
+
+
+@pytest.mark.jit
+@pytest.mark.parametrize(("room", "counts"), [(False, False), (True, True)])
+def test_only_a_start_that_has_come_to_its_map_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: bool, counts: bool
+) -> None:
+    """Where there is no room for kernels no start comes so far, and each is tried anew after ten seconds."""
+    store_with(tmp_path, 1).close()
+    store, start = started(MapConfig(folder=str(tmp_path)), None)
+    assert store is not None
+
+    async def warm_up() -> None:
+        if not room:
+            raise CannotLoad("no space left on device")
+
+    def ended(*_: object) -> None:
+        raise CannotLoad("a defect with this map")
+
+    async def go() -> None:
+        clock = LoopClock(asyncio.get_running_loop(), utc_at_zero=1.7e9)
+        world = World(clock, opener=FakeOpener(clock), warm_up=warm_up, store=store, start=start)
+        await Daemon(SETTINGS, world).run(asyncio.Event())
+
+    monkeypatch.setattr(main, "new_state", ended)
+    with pytest.raises(CannotLoad):
+        run_virtual(go())
+    assert (tmp_path / NAME).exists() is counts
 
 
 def test_another_run_of_the_computer_counts_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,6 +171,7 @@ def test_a_run_is_proved_when_it_has_lasted(tmp_path: Path, monkeypatch: pytest.
         assert bench.store is not None
         bench.store.claim()
         bench.store.load()
+        bench.store.trial.begin()
         bench.keeper.loaded()
         beats = asyncio.create_task(bench.keeper.run())
         bench.clock.t += PROOF_S - 0.1
@@ -124,6 +194,7 @@ def test_a_stop_in_order_proves_it_and_a_defect_does_not(tmp_path: Path, in_orde
         assert bench.store is not None
         bench.store.claim()
         bench.store.load()
+        bench.store.trial.begin()
         bench.keeper.loaded()
         await bench.keeper.finish(in_order)
         assert (tmp_path / NAME).exists() is not in_order
