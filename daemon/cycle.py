@@ -309,10 +309,8 @@ class Cycle:
         self._tell_unused(limits)
         parts.worker.submit(self.result.jobs)
         reset = any(isinstance(record, Command) and record.order is Order.RESET for record in records)
-        if let_go(before, self.result, self.map_id):
+        if let_go(before, self.result, self.map_id) or reset:
             self._painter.map_id = another(self.map_id, self.result.t_mono)
-        if reset:
-            self._painter.map_id = (self._painter.map_id + 1) % 2**32
         return limits
 
     def _carrier(self) -> bool:

@@ -27,9 +27,10 @@ LET_GO: Final = (
 
 
 def another(map_id: int, t_mono: float) -> int:
-    """Identity of the map that follows one that was let go of at an instant; never 0.
+    """Identity of the map that follows one that was let go of, or forgotten (RESET), at an instant; never 0.
 
-    Not the next number: whoever switches back to the stored map, and drives out of it again, begins a third one.
+    Not the next number: whoever switches back to the stored map, and leaves it so again, begins a third one, and what
+    is stored of the second stays.
     """
     return zlib.crc32(struct.pack("<Id", map_id, t_mono)) or 1
 

@@ -79,7 +79,7 @@ def test_a_switch_under_lamps_is_in_the_dump_and_is_repeated(tmp_path: Path, mon
     steps = np.diff(np.array([one.odom for one in posed]), axis=0)
     assert np.hypot(*steps[:, :2].T).max() < 0.1, "T_odom_base does not jump"
     assert [one.map_id for one in (posed[0], posed[-1])] == [1, 1]
-    assert {one.map_id for one in posed} == {1, 2}
+    assert len({one.map_id for one in posed}) == 2
     (dump,) = (tmp_path / "rec").glob(f"{flight.DUMP}*-{flight.ASKED}")
     assert len(list(dump.glob(flight.SWITCHED))) == 1
     assert not (dump / "000000.lumirec").exists(), "it begins in the middle of the run"
