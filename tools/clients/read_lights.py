@@ -80,12 +80,13 @@ def link(code: int, lamp: int, use: int, strength: int, residual: int) -> dict[s
 
 if __name__ == "__main__":
     words = sys.argv[1:]
-    reader = Reader(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 1502)
-    while True:
-        try:
-            print(reader.read())
-        except TimeoutError:
-            print("no answer")
-        except ConnectionRefusedError:
-            sys.exit("nobody listens there: is lumiloop running, and does `bind` allow this machine?")
-        time.sleep(0.1)
+    try:
+        reader = Reader(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 1502)
+        while True:
+            try:
+                print(reader.read())
+            except TimeoutError:
+                print("no answer")
+            time.sleep(0.1)
+    except (OSError, ValueError) as error:
+        sys.exit(f"{error}: is lumiloop running, and do `bind` and `allow` admit this machine?\n\n{__doc__}")

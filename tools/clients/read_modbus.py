@@ -14,8 +14,7 @@ import sys
 import time
 
 STATES = ("STARTING", "NO_LIDAR", "MAPPING", "TRACKING", "DEGRADED", "AMBIGUOUS", "LOST", "RELOCATING")
-REGISTERS = 64
-UINT16, INT32 = 0xFFFF, -(2**31)  # what "not known" reads as
+REGISTERS, UINT16, INT32 = 64, 0xFFFF, -(2**31)  # the last two: what "not known" reads as
 
 
 class Reader:
@@ -88,12 +87,13 @@ def decode(answer: bytes) -> dict[str, float | int | str | None]:
 
 if __name__ == "__main__":
     words = sys.argv[1:]
-    reader = Reader(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 1502, "tcp" in words)
-    while True:
-        try:
-            print(reader.read())
-        except TimeoutError:
-            print("no answer")
-        except ConnectionRefusedError:
-            sys.exit("nobody listens there: is lumiloop running, and does `bind` allow this machine?")
-        time.sleep(0.1)
+    try:
+        reader = Reader(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 1502, "tcp" in words)
+        while True:
+            try:
+                print(reader.read())
+            except TimeoutError:
+                print("no answer")
+            time.sleep(0.1)
+    except (OSError, ValueError) as error:
+        sys.exit(f"{error}: is lumiloop running, and do `bind` and `allow` admit this machine?\n\n{__doc__}")

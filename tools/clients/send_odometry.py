@@ -54,7 +54,10 @@ class Sender:
 
 if __name__ == "__main__":
     words = sys.argv[1:]
-    sender = Sender(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 15021)
+    try:
+        sender = Sender(words[0] if words else "127.0.0.1", int(words[1]) if len(words) > 1 else 15021)
+    except (OSError, ValueError) as error:
+        sys.exit(f"{error}\n\n{__doc__}")
     begin = time.monotonic()
     while True:
         turned = 0.2 * (time.monotonic() - begin)

@@ -94,3 +94,5 @@ if __name__ == "__main__":
             print(pose, flush=True)
     except KeyboardInterrupt:
         sys.exit(130)
+    except (OSError, ValueError) as error:
+        sys.exit(f"{error}\n\n{__doc__}")
