@@ -220,7 +220,8 @@ class LastPose:
 
     def _say(self, error: str, defect: Exception | None = None) -> None:
         if error and not self.error:
-            log.warning("the pose cannot be kept for the next start: %s; it is tried again", error, exc_info=defect)
+            level = logging.INFO if defect is None else logging.WARNING  # the fault warns
+            log.log(level, "the pose cannot be kept for the next start: %s; it is tried again", error, exc_info=defect)
         elif self.error and not error:
             log.info("the pose is kept for the next start again")
         self.error = error

@@ -116,7 +116,7 @@ class StallWatch:
         stolen = self._stolen()
         waited = None if stolen is None or self._kept is None else stolen - self._kept
         self.said = f"no cycle began for {lasted:.3f} s: {cause(caught, lasted, worked, waited)}{more}"
-        log.warning("%s", self.said)
+        log.info("%s", self.said)  # long ones are a fault, which warns
         self._said_at, self._unsaid = now, 0
 
     def _stolen(self) -> float | None:

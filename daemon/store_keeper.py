@@ -316,7 +316,7 @@ class Keeper:
             self._anew |= self._saved is not None and (self._saved == revision or self._saved[0] != self._map_id())
         if error and not self.error:
             again = "" if self._last else ", and it is tried again"
-            log.error("the map cannot be saved: %s; what was saved before stays%s", error, again)
+            log.info("the map cannot be saved: %s; what was saved before stays%s", error, again)  # the fault warns
         self.error = error
         for told in waiting:
             told(error)

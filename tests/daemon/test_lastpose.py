@@ -108,7 +108,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
     pose.take(at(9.0, 9.0))
     pose.close()
     assert LastPose(file / "maps").of_map(7) == (9.0, 2.0, 0.5)
-    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+    assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
 
 
 def wait_for(condition: Callable[[], object]) -> None:
@@ -156,7 +156,8 @@ def test_a_robot_that_stands_has_its_pose_written_again_after_a_failure(
     assert synced.is_set()
     assert LastPose(tmp_path).of_map(7) == (1.0, 2.0, 0.5)
     wait_for(lambda: pose.busy_since is None)
-    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"], "said once, however often it failed"
+    said = "INFO" if isinstance(failure, OSError) else "WARNING"  # a defect has its own line, beside the fault's
+    assert [record.levelname for record in caplog.records] == [said, "INFO"], "said once, however often it failed"
     pose.close()
 
 

@@ -118,6 +118,8 @@ def test_without_a_folder_and_for_localisation_only_it_is_refused(tmp_path: Path
 def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
+
     async def run() -> None:
         bench = Bench(tmp_path)
         assert bench.store is not None

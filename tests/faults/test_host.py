@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import resource
 import shutil
 import signal
@@ -204,6 +205,8 @@ def test_one_process_survives_one_after_the_other(tmp_path: Path, monkeypatch: p
         still = int(fault is Fault.LOOP_STALLED and come > gone)  # a loaded machine may stall once more at the end
         assert come == gone + still, f"fault {int(fault)}: said {come} times, over {gone} times"
         assert gone >= 1
+    warned = re.findall(r" (?:WARNING|ERROR) +(.*)", log)
+    assert [line for line in warned if not line.startswith(("fault ", "Modbus: SAVE_MAP refused"))] == []
 
 
 def test_killed_it_comes_back_with_its_map(tmp_path: Path) -> None:
