@@ -63,7 +63,7 @@ def put_aside(state: State, first: int, since: int, begun_m: float, seek: Seek |
     atlas.submaps = {key: submap for key, submap in atlas.submaps.items() if key >= first}
     state.keyframes = {key: frame for key, frame in state.keyframes.items() if key >= since}
     atlas.adrift, atlas.since, atlas.bridge, atlas.seek, atlas.watch = None, 0, None, Seek(), None
-    atlas.kept, atlas.foreign = 0, False
+    atlas.kept, atlas.held, atlas.foreign = 0, False, False  # light holds the robot in a map of its own
     atlas.waiting, atlas.tied, atlas.ties, atlas.stale = [], None, {}, True
     rehang(state, 0)
     livemap.redraw(state)
@@ -109,7 +109,7 @@ def found(state: State, aside: Aside, one: Hypothesis) -> None:
         return
     atlas.submaps, state.keyframes = aside.submaps | atlas.submaps, aside.frames | state.keyframes
     atlas.constraints.put(aside.constraints)
-    atlas.aside, atlas.kept, atlas.foreign = None, aside.kept, True
+    atlas.aside, atlas.kept, atlas.held, atlas.foreign = None, aside.kept, state.settings.localise, True
     atlas.adrift, atlas.since, atlas.seek = aside.first, aside.since, aside.seek
     land(state, one, True)
     if atlas.watch is not None:
