@@ -102,7 +102,7 @@ async def measure(bus: AsyncBus, address: int, block_s: float) -> Capability:
         raise DeviceRefused(
             bus.name,
             f"adapter {bus.about} cannot read {LENGTHS[0]} bytes in one go ({limit})",
-            "use an I2C controller of the processor itself",
+            "end what else reads on this bus; if nothing does, use an I2C controller of the processor itself",
         )
     wanted = min(_wanted(block_s, found.scl_hz), MAX_LENGTH)
     shorter = limit if found.length < wanted else ""
