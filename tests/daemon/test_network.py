@@ -133,7 +133,7 @@ def test_a_plc_sets_the_pose_and_is_told_when_it_is_done() -> None:
         await outside(lambda: plc.order(2, CommandCode.RESET, 0, 0, 0))
         await asyncio.sleep(0.3)
         assert await outside(plc.outcome) == (2, Outcome.DONE)
-        assert bench.snapshots[-1].map_id == map_id % 2**32 + 1
+        assert bench.snapshots[-1].map_id not in (0, map_id)
         await outside(lambda: plc.order(3, 99, 0, 0, 0))
         await asyncio.sleep(0.3)
         assert await outside(plc.outcome) == (3, Outcome.UNKNOWN)
