@@ -397,6 +397,7 @@ def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> Non
         here = clock.here(t, t + age, t + age + apart + delay)
         assert here == pytest.approx(t + apart + (0.003, 0.003, 0.001, 0.001)[k])
     assert clock.here(1.0, 1.02, 700.02) == pytest.approx(700.0), "switched on anew"
+    assert clock.here(3.0, 3.02, 760.02) == pytest.approx(760.0), "and again, longer ago than it had run before"
 
 
 def test_a_pose_datagram_is_read_as_the_daemon_writes_it() -> None:
