@@ -67,7 +67,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.LIDAR_BROKEN: (
         "the lidar reports a fault of its own, or its port is open and nothing answers",
-        "check its power and cable, power it off and on; if it comes back, replace it",
+        "it starts up for some seconds after power-on; else check its power and cable, power it off and on; if that "
+        "does not help, replace it",
     ),
     Fault.LIDAR_SILENT: ("the lidar is connected and sends no valid scan", "power it off and on; check the cable"),
     Fault.LIDAR_GARBLED: ("more than 5 % of the lidar's frames are damaged", "check cable, shielding and USB hub"),

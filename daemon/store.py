@@ -29,7 +29,7 @@ from daemon.config import MapConfig
 from daemon.folders import maps_folder
 from daemon.store_file import BadMap, Damaged, Foreign
 from daemon.store_tables import OtherBuilding, Stored, against_survey, read
-from daemon.store_trial import Trial
+from daemon.store_trial import Fatal, Innocent, Trial
 from daemon.wholefile import sync_folder, write_whole
 
 if TYPE_CHECKING:
@@ -188,6 +188,13 @@ class Store:
         belongs to another building: what a person has begun anew does not come back by itself.
         """
         try:
+            return self._newest(judge)
+        except Innocent as them:
+            self._put_back(them)
+            return self._newest(judge)
+
+    def _newest(self, judge: Judge) -> Start | None:
+        try:
             generations = self.generations()
         except OSError as error:
             log.error(
@@ -201,8 +208,7 @@ class Store:
             for generation in files:
                 try:
                     start = self._read(generation, judge)
-                    if self._lock is not None:
-                        self.trial.judge(start.stored.meta.map_id)
+                    self._on_trial(start.stored.meta.map_id)
                 except OtherBuilding as error:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:
@@ -214,8 +220,24 @@ class Store:
                     self._origin = generation.path
                     return start
             if not elsewhere:
-                return None
+                break
+        self._on_trial(None)
         return None
+
+    def _on_trial(self, map_id: int | None) -> None:
+        """A run that may change the folder counts the starts with what it begins with."""
+        if self._lock is not None:
+            self.trial.judge(map_id)
+
+    def _put_back(self, them: Innocent) -> None:
+        """Take the maps again that were set aside because no start had lasted with them."""
+        log.warning("%s: %s; they are taken again", self.folder, them)
+        self.refused = False
+        for name in them.names:
+            with contextlib.suppress(OSError):
+                before = self.folder / name.removesuffix(BROKEN)
+                if not before.exists():
+                    (self.folder / name).replace(before)
 
     def load_map(self, map_id: int, judge: Judge = unjudged) -> Start:
         """The newest good generation of one map.
@@ -278,6 +300,8 @@ class Store:
             aside = path.with_name(path.name + BROKEN)
             with contextlib.suppress(OSError):
                 where = path.replace(aside)
+                if isinstance(error, Fatal):
+                    self.trial.set_aside(where.name)
         log.error("%s is refused: %s; %s", where, error, error.remedy)
 
     def save(self, content: bytes, map_id: int) -> Path:

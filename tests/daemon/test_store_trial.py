@@ -55,6 +55,66 @@ def test_what_no_start_outlives_is_set_aside_and_the_generation_before_it_has_it
     assert begin(tmp_path) is None, "and without any map there is a start still"
 
 
+def set_aside(folder: Path) -> None:
+    """Both generations of a map, by starts that die."""
+    store_with(folder, 1, 2).close()
+    for _ in range(2 * MOST):
+        assert begin(folder) is not None
+    assert begin(folder) is None
+    assert names(folder) == [name(1, more=".broken"), name(2, more=".broken")]
+
+
+def test_what_was_set_aside_is_put_back_where_starts_without_it_do_not_last_either(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    set_aside(tmp_path)
+    for _ in range(MOST - 1):
+        assert begin(tmp_path) is None
+    for _ in range(3 * MOST):
+        start = begin(tmp_path)
+        assert start is not None
+        assert start.content == content(seed=2)
+    assert names(tmp_path) == [name(1), name(2)]
+    (said,) = [words for words in caplog.messages if "taken again" in words]
+    assert name(2) in said
+    assert begin(tmp_path, proved=True) is not None
+    for _ in range(MOST):
+        begin(tmp_path)
+    start = begin(tmp_path)
+    assert start is not None
+    assert start.content == content(seed=1), "on trial again once a start has lasted"
+
+
+def test_what_was_set_aside_stays_there_where_a_start_without_it_lasts(tmp_path: Path) -> None:
+    set_aside(tmp_path)
+    assert begin(tmp_path, proved=True) is None
+    for _ in range(2 * MOST):
+        assert begin(tmp_path) is None
+    assert names(tmp_path) == [name(1, more=".broken"), name(2, more=".broken")]
+
+
+def test_another_map_in_use_is_a_start_without_those_set_aside(tmp_path: Path) -> None:
+    """What ends every start takes no second map with it, and the first one comes back."""
+    store = store_with(tmp_path, 1)
+    store.save(content(Shape(map_id=0x77)), 0x77)
+    store.close()
+    for _ in range(MOST):
+        begin(tmp_path)
+    began = [begin(tmp_path) for _ in range(MOST + 1)]
+    assert [None if one is None else one.stored.meta.map_id for one in began] == [None, MAP, MAP, 0x77]
+
+
+def test_a_map_put_back_by_hand_meanwhile_is_not_written_over(tmp_path: Path) -> None:
+    set_aside(tmp_path)
+    for _ in range(MOST - 1):
+        begin(tmp_path)
+    (tmp_path / name(2)).write_bytes(content(seed=3))
+    start = begin(tmp_path)
+    assert start is not None
+    assert start.content == content(seed=3)
+    assert (tmp_path / name(2, more=".broken")).exists()
+
+
 def test_a_start_that_lasts_makes_good_for_those_before(tmp_path: Path) -> None:
     store_with(tmp_path, 1).close()
     for number in range(3 * MOST):
