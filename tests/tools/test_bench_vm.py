@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish import registers
+from daemon.faults import Fault
+from daemon.publish import parts, registers
+from daemon.publish.snapshot import NO_CONDITION
 from tools.bench.modbus import example
 from tools.bench.otherclock import OtherClock
 from tools.bench.vm import __main__ as command
@@ -40,7 +42,7 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) >= 25
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
     names = [[part.__name__.rpartition("_")[2] for part in parts] for parts in PARTS]
-    assert names == [["system", "devices", "surroundings"], ["photodiode", "process"], ["computer"]]
+    assert names == [["system", "devices", "surroundings", "removal"], ["photodiode", "process"], ["computer"]]
 
 
 def test_scenarios_up_to_the_named_ones_and_only_the_computers_that_they_take() -> None:
@@ -279,23 +281,14 @@ def test_what_the_emulated_processor_has_waited_is_its_own_thread_s(tmp_path: Pa
     assert _waited_s(task) == 7.0
 
 
-def said_by(lines: list[dict[str, str]]) -> str:
-    return "\n".join(["-- Boot --", *map(json.dumps, lines)])
-
-
-def test_faults_that_have_come_and_not_gone_are_read_from_the_journal_at_one_go() -> None:
-    told = [
-        {"LUMILOOP_FAULT": "153", "MESSAGE_ID": bench.COME_ID},
-        {"LUMILOOP_FAULT": "155", "MESSAGE_ID": bench.COME_ID},
-        {"LUMILOOP_FAULT": "153", "MESSAGE_ID": bench.OVER_ID},
-        {"LUMILOOP_FAULT": "151", "MESSAGE_ID": bench.OVER_ID},
-    ]
-    asked: list[tuple[str, ...]] = []
+def test_faults_that_are_present_are_read_where_the_daemon_puts_them() -> None:
+    """By the number of the register, as a controller would."""
+    condition = replace(NO_CONDITION, faults=(Fault.ADC_MISSING, Fault.ADC_BUS_STUCK))
+    block = parts.BLOCK.encode(replace(example(7), condition=condition))
     one = Looked()
-    one.run = lambda *words, check: asked.append(words) or said_by(told)  # type: ignore[attr-defined]
-    assert one.present(151, 153, 155) == [155]
-    assert len(asked) == 1
-    assert [word for word in asked[0] if "FAULT=" in word] == [f"LUMILOOP_FAULT={code}" for code in (151, 153, 155)]
+    one.registers = lambda first, count: block[2 * (first - 400) :][: 2 * count]  # type: ignore[method-assign,misc]
+    assert one.present(151, 153, 155) == [153, 155]
+    assert bench.FAULTS == parts.FAULTS
 
 
 def test_a_long_answer_comes_whole_through_a_port_that_takes_little_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

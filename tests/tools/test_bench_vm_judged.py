@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tools.bench.report import Seen
-from tools.bench.vm import trying_computer, trying_system
+from tools.bench.vm import trying_removal, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.machine import Order
 from tools.bench.world.agreement import Trace
@@ -87,7 +87,7 @@ def test_what_is_left_of_a_removed_package_is_named(kept: str) -> None:
         return "inactive"
 
     if not kept:
-        assert trying_computer.is_removed(inside(run)) == "nothing is left"
+        assert trying_removal.is_removed(inside(run)) == "nothing is left"
     else:
         with pytest.raises(Order, match=f"left: .*{kept}"):
-            trying_computer.is_removed(inside(run))
+            trying_removal.is_removed(inside(run))

@@ -17,13 +17,14 @@ from tools.bench.vm import (
     trying_devices,
     trying_photodiode,
     trying_process,
+    trying_removal,
     trying_surroundings,
     trying_system,
 )
 from tools.bench.vm.common import WRITTEN, Scenario
 
 PARTS: Final = (
-    (trying_system, trying_devices, trying_surroundings),
+    (trying_system, trying_devices, trying_surroundings, trying_removal),
     (trying_photodiode, trying_process),
     (trying_computer,),
 )

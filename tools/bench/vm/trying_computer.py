@@ -1,15 +1,9 @@
-"""Scenarios: what happens to the computer; the package is removed at last."""
+"""Scenarios: what happens to the computer."""
 
 from __future__ import annotations
 
-from typing import Final
-
-from tools.bench.vm.bench import CONFIG, DONE, PLACED, SAVE_MAP, UNIT, Bench
+from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench
 from tools.bench.vm.common import RIGHT_S, begin, come_up, map_id, need, right, scenario, start
-
-INSTALLED: Final = ("/opt/lumiloop", "/usr/bin/lumiloop", f"/usr/lib/systemd/system/{UNIT}", "/usr/share/doc/lumiloop")
-OWN: Final = (CONFIG, "/var/lib/lumiloop")
-KEPT: Final = ("/etc/lumiloop", "/var/lib/private/lumiloop", "/var/cache/lumiloop", "/var/cache/private/lumiloop")
 
 
 @scenario("anew")
@@ -54,20 +48,3 @@ def explains_itself(bench: Bench) -> str:
     text = bench.machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT, *first, seconds=120)
     need(len(boots) >= 3 and "What can be done" in text, f"{boots}\n{text[-500:]}")
     return f"{len(boots)} boots"
-
-
-@scenario("gone")
-def is_removed(bench: Bench) -> str:
-    """`dpkg --remove` leaves configuration and maps, `--purge` nothing."""
-    bench.machine.run("dpkg", "--remove", "lumiloop", seconds=120)
-    need(bench.machine.run("systemctl", "is-active", UNIT, check=False).strip() != "active", "it still runs")
-    need(not (left := _there(bench, *INSTALLED)), f"of the programs are left: {left}")
-    need(_there(bench, *OWN) == list(OWN), "configuration or maps have gone")
-    bench.machine.run("dpkg", "--purge", "lumiloop", seconds=120)
-    need(not (left := _there(bench, *INSTALLED, *OWN, *KEPT)), f"are left: {left}")
-    return "nothing is left"
-
-
-def _there(bench: Bench, *paths: str) -> list[str]:
-    """Which of these are there."""
-    return bench.machine.run("sh", "-c", f"ls -d {' '.join(paths)} 2>/dev/null", check=False).split()

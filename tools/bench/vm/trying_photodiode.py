@@ -71,19 +71,20 @@ def _ordered(bench: Bench, order: str, code: int) -> str:
     seconds = time.monotonic() - begun
     _sound(bench)
     same_process(bench, pid)
+    need(bench.journaled(code), f"the journal has no fault {code}")
     return f"fault {code} after {seconds:.1f} s, over after {time.monotonic() - begun:.1f} s; the laser went on"
 
 
 @scenario()
 def is_not_acknowledged(bench: Bench) -> str:
-    """The converter acknowledges nothing for eight seconds (ENXIO of the kernel's)."""
-    return _ordered(bench, "order off where=adc for=8", NACK)
+    """The converter acknowledges nothing for five seconds (ENXIO of the kernel's)."""
+    return _ordered(bench, "order off where=adc for=5", NACK)
 
 
 @scenario()
 def hangs(bench: Bench) -> str:
-    """SDA is held low for eight seconds: every transfer times out in the kernel."""
-    return _ordered(bench, "order hang where=adc for=8", STUCK)
+    """SDA is held low for five seconds: every transfer times out in the kernel."""
+    return _ordered(bench, "order hang where=adc for=5", STUCK)
 
 
 @scenario("anew")

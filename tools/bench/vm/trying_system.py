@@ -11,7 +11,7 @@ import numpy as np
 
 from tools.bench.plots import Plot, Series, histogram
 from tools.bench.report import Figure, Seen
-from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
+from tools.bench.vm.bench import CONFIG, DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
 from tools.bench.vm.common import TRACKING_S, begin, come_up, map_id, need, right, scenario, start
 from tools.bench.vm.machine import Order
 from tools.bench.vm.reference import DRIVE_S, outside
@@ -61,9 +61,10 @@ def probes(bench: Bench) -> str:
 
 @scenario("anew")
 def starts(bench: Bench) -> str:
-    """`systemctl enable --now lumiloop`: warmed up and READY."""
+    """`systemctl enable --now lumiloop`: warmed up and READY; `lumiloop check` finds nothing wrong."""
     bench.machine.run("sh", "-c", f"rm {MARKS}")
     seconds = start(bench)
+    bench.machine.run("lumiloop", "check", CONFIG)
     warm = bench.machine.run("journalctl", "-q", "--no-pager", "-o", "cat", "-u", "lumiloop-warmup.service")
     told = re.search(r"kernels compiled in [\d.]+ s", warm)
     need(told, f"it was not warmed up: {warm}")
