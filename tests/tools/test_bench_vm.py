@@ -394,12 +394,13 @@ def test_a_datagram_that_was_under_way_for_long_does_not_shift_its_pose() -> Non
 
 
 def test_a_pose_datagram_is_read_as_the_daemon_writes_it() -> None:
-    one = replace(example(7), t_mono=12.5, t_sent=12.53)
+    one = replace(example(7), t_mono=12.5, t_sent=12.53, missed=4, overruns=5, fault=106)
     read = bench.heard(registers.encode_datagram(one), 100.03, OtherClock())
     assert read.t_pose == pytest.approx(100.0, abs=2e-4)
     assert one.pose is not None
     assert read.pose == pytest.approx(one.pose, abs=1e-4)
     assert (read.t_came, read.state, read.loops) == (100.03, one.state, one.loop_counter)
+    assert (read.missed, read.overruns, read.fault) == (one.missed, one.overruns, one.fault) == (4, 5, 106)
 
 
 def test_the_truth_is_interpolated() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -61,8 +62,10 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
     seen = trying_system.agrees_with_outside(driven(5.0))
     assert isinstance(seen, Seen)
     assert [round(one.value) for one in seen.figures] == [0.0, 5.0, 0.0, 0.0]
-    with pytest.raises(Order, match=r"way compared: 0\.\d+ m"):
-        trying_system.agrees_with_outside(driven(0.6))
+    short = driven(0.6)
+    short.memory["drive"][-1] = replace(short.memory["drive"][-1], missed=3, overruns=2, fault=301)
+    with pytest.raises(Order, match=r"way compared: 0\.\d+ m.*; meanwhile 3 scans missed, 2 cycles .* \[301\]"):
+        trying_system.agrees_with_outside(short)
     nowhere = driven(5.0)
     nowhere.memory["drive"] = [Heard(0.2, 0.2, 1, None, 0.0)] * 20
     with pytest.raises(Order, match="no pose of the drive claims a place"):

@@ -46,7 +46,8 @@ Pose = tuple[float, float, float]
 class Heard:
     """A pose datagram: when it came, when its pose was true (both this computer's clock), what it says.
 
-    ``loops``: how many have been closed since the daemon's start.
+    ``loops``: how many have been closed since the daemon's start; ``missed``: scans, ``overruns``: cycles over their
+    budget, as counted. ``fault``: the gravest.
     """
 
     t_came: float
@@ -55,6 +56,9 @@ class Heard:
     pose: Pose | None
     sigma_m: float
     loops: int = 0
+    missed: int = 0
+    overruns: int = 0
+    fault: int = 0
 
 
 @dataclass(slots=True)
@@ -94,11 +98,12 @@ def heard(data: bytes, now: float, clock: OtherClock) -> Heard:
     age, t_mono = struct.unpack_from("<HQ", data, 22)
     x, y, yaw = struct.unpack_from("<iii", data, 40)
     sigma = max(struct.unpack_from("<HH", data, 76)) / 1e4
-    (loops,) = struct.unpack_from("<H", data, 108)
+    (loops,), (fault,) = struct.unpack_from("<H", data, 108), struct.unpack_from("<H", data, 16)
+    counts = (loops, *struct.unpack_from("<II", data, 116), fault)
     pose = None if x == -(2**31) else (x / 1e4, y / 1e4, yaw / 1e6)
     if pose is None:
-        return Heard(now, now, state, None, sigma, loops)
-    return Heard(now, clock.here(t_mono / 1e6, t_mono / 1e6 + age / 1e4, now), state, pose, sigma, loops)
+        return Heard(now, now, state, None, sigma, *counts)
+    return Heard(now, clock.here(t_mono / 1e6, t_mono / 1e6 + age / 1e4, now), state, pose, sigma, *counts)
 
 
 def inverse_then(frame: Pose, pose: Pose) -> Pose:
