@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench
 from tools.bench.vm.common import RIGHT_S, begin, come_up, map_id, need, right, scenario, start
-
-MAPPED_S: Final = 10.0
-"""The robot stands for four seconds and drives to where it sees the other half of the room: anywhere it is found soon."""
 
 
 @scenario("anew")
@@ -41,7 +36,6 @@ def loses_its_power(bench: Bench) -> str:
 def is_rebooted(bench: Bench) -> str:
     """Reboot, the robot driving on: comes up by itself, and finds itself in the same map."""
     bench.drive()
-    bench.wait(MAPPED_S)
     bench.machine.reboot()
     return _up_again(bench, ("TRACKING",))
 

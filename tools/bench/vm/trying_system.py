@@ -182,7 +182,7 @@ def agrees_with_outside(bench: Bench) -> Seen:
 
 
 def _trouble(drive: list[Heard]) -> str:
-    """What the emulated processor did not get done meanwhile: a drive with scans or map work left out is another one."""
+    """What the emulated processor left undone meanwhile: a drive without some scans or map work is another one."""
     missed, over = drive[-1].missed - drive[0].missed, drive[-1].overruns - drive[0].overruns
     faults = sorted({one.fault for one in drive} - {0})
     return f"meanwhile {missed} scans missed, {over} cycles over their budget, faults {faults or 'none'}"
