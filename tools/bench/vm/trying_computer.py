@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench
 from tools.bench.vm.common import RIGHT_S, begin, come_up, map_id, need, right, scenario, start
 
@@ -14,9 +17,13 @@ def comes_up_once_more(bench: Bench) -> str:
     return f"{said}; READY after {seconds:.1f} s; {1e3 * begin(bench):.0f} mm at most"
 
 
-def _up_again(bench: Bench, states: tuple[str, ...]) -> str:
+def _up_again(bench: Bench, states: tuple[str, ...], meanwhile: Callable[[], None] = lambda: None) -> str:
     boot = bench.machine.wait_until_up()
-    seconds = bench.placed(240.0, states)
+    begun = time.monotonic()
+    bench.until("a new process", 60.0, lambda: bench.main_pid() != 0, every=2.0)
+    meanwhile()
+    bench.placed(240.0, states)
+    seconds = time.monotonic() - begun
     need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
     found = right(bench, bench.collect(RIGHT_S))
     state = " or ".join(states)
@@ -34,10 +41,9 @@ def loses_its_power(bench: Bench) -> str:
 
 @scenario("anew")
 def is_rebooted(bench: Bench) -> str:
-    """Reboot, the robot driving on: comes up by itself, and finds itself in the same map."""
-    bench.drive()
+    """Reboot, the robot setting off meanwhile: comes up by itself, and finds itself in the same map."""
     bench.machine.reboot()
-    return _up_again(bench, ("TRACKING",))
+    return _up_again(bench, ("TRACKING",), bench.drive)
 
 
 @scenario()

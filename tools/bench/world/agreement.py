@@ -26,6 +26,9 @@ from tools.sim.scene import SimulatedScene
 Array = npt.NDArray[np.float64]
 STEP_M: Final = 0.05
 FINE_S: Final = 0.02
+GROUP: Final = 25
+"""Stamps that are late by the same."""
+LEAST_M: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,19 +96,30 @@ def _at(one: Trace, driven: Array, axis: int) -> Array:
     return np.asarray(np.interp(driven, one.driven[order], one.off[order, axis]))
 
 
-def lateness(tried: Array, traced: Callable[[float], Trace], other: Trace) -> float:
-    """By how many seconds of ``tried`` its stamps have to be set back for one trace to say most nearly the same.
+def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, other: Trace) -> Array:
+    """By how many seconds each of ``count`` stamps has to be set back for two traces to say most nearly the same.
 
     A line on which every scan is under way for a while, the emulated computer's, makes all instants later by as much:
-    at 0.6 m/s 10 ms are 6 mm along the way, which are the line's and not what was made of the scans.
+    at 0.6 m/s 10 ms are 6 mm along the way, which are the line's and not what was made of the scans. How much it is
+    changes with what else the computer around has to do, in seconds and not from scan to scan: stamps are set back in
+    groups. One in which less than half a metre was driven tells nothing, and has what the one before had.
 
     Args:
         tried: seconds, ascending.
-        traced: the trace with stamps set back by so much.
-        other: the one to agree with.
+        traced: the trace of some of the stamps, each set back by so much.
+        count: of stamps.
+        other: the trace to agree with.
     """
-    medians = [float(np.median(differences(traced(float(by)), other)[1])) for by in tried]
-    return float(tried[int(np.argmin(medians))])
+    late, before = np.zeros(count), 0.0
+    for first in range(0, count, GROUP):
+        part = slice(first, first + GROUP if count - first >= 2 * GROUP else count)
+        gaps = [differences(traced(part, np.full(len(late[part]), by)), other)[1] for by in tried.tolist()]
+        if min(map(len, gaps)) * STEP_M >= LEAST_M:
+            before = float(tried[int(np.argmin([np.median(gap) for gap in gaps]))])
+        late[part] = before
+        if part.stop == count:
+            break
+    return late
 
 
 def figures(one: Trace, other: Trace, names: str) -> tuple[tuple[Figure, ...], tuple[Plot, ...]]:
