@@ -169,6 +169,8 @@ class Daemon:
         warmth = await self._world.warm_up()
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
+        if self._world.store is not None:
+            self._world.store.trial.begin()
         if self._world.start is not None:
             self._begin(self._world.start.stored.meta.map_id)
             gc.freeze()  # the map stays
@@ -184,8 +186,6 @@ class Daemon:
             NoMap: there is none that can be used, and `map.localise` asks for one.
         """
         store = self._world.store
-        if store is not None:
-            store.trial.begin()
         try:
             self._estimator.load()
         except CannotBegin as error:

@@ -29,7 +29,7 @@ from daemon.config import MapConfig
 from daemon.folders import maps_folder
 from daemon.store_file import BadMap, Damaged, Foreign
 from daemon.store_tables import OtherBuilding, Stored, against_survey, read
-from daemon.store_trial import Fatal, Innocent, Trial
+from daemon.store_trial import MOST, Fatal, Trial
 from daemon.wholefile import sync_folder, write_whole
 
 if TYPE_CHECKING:
@@ -140,7 +140,8 @@ class Store:
     """A folder of maps, used by one process at a time.
 
     Attributes:
-        refused: whether a map was found and could not be used. trouble: what kept `claim` from taking the folder.
+        damaged: whether a map was found and could not be used. left_out: or is not, because no start has outlived it.
+        trouble: what kept `claim` from taking the folder.
         trial: of the map that a run begins with which has taken the folder.
     """
 
@@ -148,12 +149,17 @@ class Store:
         """Nothing is touched yet. ``mend``: what is broken may be moved aside."""
         self.folder = folder
         self._mend = mend
-        self.refused = False
+        self.damaged = self.left_out = False
         self._origin: Path | None = None
         self._good: dict[Path, bool] = {}
         self._lock: int | None = None
         self.trouble = ""
         self.trial: Final = Trial(folder)
+
+    @property
+    def refused(self) -> bool:
+        """Whether there is a map that is not used."""
+        return self.damaged or self.left_out
 
     def claim(self) -> None:
         """Take the folder for this process before there is a map to save: what keeps it from that is known at once.
@@ -187,28 +193,38 @@ class Store:
         Where a generation is damaged the one before it counts. Another map than the latest is taken only if that one
         belongs to another building: what a person has begun anew does not come back by itself.
         """
-        try:
-            return self._newest(judge)
-        except Innocent as them:
-            self._put_back(them)
-            return self._newest(judge)
+        if self._lock is not None:
+            self.trial.read()
+        while True:
+            start, before = self._newest(judge), self.trial.out
+            name = self._origin.name if start is not None and self._origin is not None else ""
+            if self._lock is None or not self.trial.changes(name):
+                return start
+            if not self.trial.out:
+                them = ", ".join(before)
+                log.warning("%s: %d starts without %s have not lasted either; tried again", self.folder, MOST, them)
 
     def _newest(self, judge: Judge) -> Start | None:
+        """As :meth:`load`, of those that are not left out."""
+        self._origin, self.left_out = None, False
         try:
             generations = self.generations()
         except OSError as error:
             log.error(
                 "maps in %s cannot be read: %s; mend that, or name another `map.folder`", self.folder, said(error)
             )
-            self.refused = True
+            self.damaged = True
             return None
         by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
         for _, files in groupby(by_map, key=lambda one: one.map_id):
             elsewhere, refused = True, False
             for generation in files:
+                if generation.path.name in self.trial.out:
+                    log.error("%s is refused: %s; %s", generation.path, fatal := Fatal(), fatal.remedy)
+                    elsewhere, refused, self.left_out = False, True, True
+                    continue
                 try:
                     start = self._read(generation, judge)
-                    self._on_trial(start.stored.meta.map_id)
                 except OtherBuilding as error:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:
@@ -221,23 +237,16 @@ class Store:
                     return start
             if not elsewhere:
                 break
-        self._on_trial(None)
         return None
 
-    def _on_trial(self, map_id: int | None) -> None:
-        """A run that may change the folder counts the starts with what it begins with."""
-        if self._lock is not None:
-            self.trial.judge(map_id)
-
-    def _put_back(self, them: Innocent) -> None:
-        """Take the maps again that were set aside because no start had lasted with them."""
-        log.warning("%s: %s; they are taken again", self.folder, them)
-        self.refused = False
-        for name in them.names:
+    def lasted(self) -> None:
+        """This run has lasted: what it was begun without is moved aside, all others are good."""
+        if self._lock is None:
+            return
+        for name in self.trial.lasted():
             with contextlib.suppress(OSError):
-                before = self.folder / name.removesuffix(BROKEN)
-                if not before.exists():
-                    (self.folder / name).replace(before)
+                aside = (self.folder / name).replace(self.folder / (name + BROKEN))
+                log.warning("%s: a start without it has lasted; it is kept for whoever mends that", aside)
 
     def load_map(self, map_id: int, judge: Judge = unjudged) -> Start:
         """The newest good generation of one map.
@@ -291,7 +300,7 @@ class Store:
 
     def _refuse(self, path: Path, error: BadMap | OSError) -> None:
         """Say why a file is not used; one that is damaged gets out of the way."""
-        self.refused = True
+        self.damaged = True
         if isinstance(error, OSError):
             log.error("%s cannot be read: %s; mend that, or move it away", path, said(error))
             return
@@ -300,8 +309,6 @@ class Store:
             aside = path.with_name(path.name + BROKEN)
             with contextlib.suppress(OSError):
                 where = path.replace(aside)
-                if isinstance(error, Fatal):
-                    self.trial.set_aside(where.name)
         log.error("%s is refused: %s; %s", where, error, error.remedy)
 
     def save(self, content: bytes, map_id: int) -> Path:

@@ -97,7 +97,7 @@ class Keeper:
         self._saved: Revision | None = None  # the revision that is on the disk
         self._map_of = map_id()
         self._anew = self._last = False
-        self._proved_at = math.inf
+        self._proved_at, self._lasted = math.inf, False
         self._due = clock.now() + FIRST_S
         self._look_due = clock.now() + LOOK_S
         self._waiting: list[Told] = []
@@ -170,24 +170,27 @@ class Keeper:
 
     async def _proved(self) -> None:
         """The map that the run began with has not ended it."""
-        self._proved_at = math.inf
+        self._proved_at, self._lasted = math.inf, True
         if self._store is not None:
             with contextlib.suppress(RuntimeError):  # no thread: the next start has one less to go
-                await beside(self._store.trial.proved, "map")
+                await beside(self._store.lasted, "map")
 
     async def finish(self, in_order: bool = True) -> None:
         """Save what has changed since the last time, wait for it, but not for ever.
 
-        ``in_order``: the run ends because somebody wants it.
+        ``in_order``: the run ends because somebody wants it. One that a defect ends before it has lasted saves nothing:
+        a service that dies again and again would leave a map each time.
         """
         with contextlib.suppress(asyncio.TimeoutError):
             async with asyncio.timeout(STOP_S):
-                if in_order:
-                    await self._proved()
+                if in_order and not self._lasted and self._store is not None:
+                    with contextlib.suppress(RuntimeError):
+                        await beside(self._store.trial.ended, "map")
                 await self._over.wait()
-                self._due, self._last = self._clock.now(), True
-                self._go_on()
-                await self._over.wait()
+                if in_order or self._lasted:
+                    self._due, self._last = self._clock.now(), True
+                    self._go_on()
+                    await self._over.wait()
         if not self._over.is_set():
             log.error("the map could not be saved within %.0f s of the stop; the one before stays", STOP_S)
         elif self._store is not None:

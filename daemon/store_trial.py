@@ -1,26 +1,28 @@
 """A stored map with which every start comes to grief: after three in a row the generation before it has its turn.
 
 Such a file is good by all that can be told from it, and meets a defect of the software. A service that is started again
-and again with it would never come up; without it the robot works, and the file is there for who mends the defect. What
-counts are starts since the computer was switched on, a battery that fails says nothing of a map, and those that have
-come as far as to begin with it: nor does a cache or a folder for a recording that has no room. Where the starts without
-any map come to grief as well, it was not the maps: they are put back.
+and again with it would never come up; without it the robot works. What counts are starts since the computer was
+switched on, a battery that fails says nothing of a map, and those that have come as far as to begin: a cache or a
+folder for a recording that has no room says nothing either.
+
+What is left out stays where it is until a start without it has lasted, which is what speaks against it: only then it is
+moved aside (`daemon.store`). Where three starts without any map do not last either, all are tried again, and so on in
+turn.
 """
 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from daemon.store_file import Damaged
+from daemon.wholefile import write_whole
 
 NAME: Final = "starts"
-"""File in the folder of maps: a map's identity, the boot, how many starts began with it that are not proved, and the
-files that have been set aside since the last one that was."""
-NONE: Final = "-"
-"""In place of an identity: the start began without a map."""
+"""File in the folder of maps: what has been counted, as JSON."""
 MOST: Final = 3
 PROOF_S: Final = 10.0
 """A start that has lasted so long since its map was loaded is none that the map has ended."""
@@ -30,93 +32,10 @@ BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 class Fatal(Damaged):
     """Nothing is wrong with it, but no start outlives it."""
 
-    remedy = "it is kept for whoever mends that, and done without; under its old name it is tried again"
+    remedy = "it is left out; once a start without it has lasted it is moved aside, for whoever mends that"
 
     def __init__(self) -> None:
         super().__init__(f"{MOST} starts in a row have begun with it, and none has lasted for {PROOF_S:g} s")
-
-
-class Innocent(Exception):
-    """Starts without the maps that were set aside have come to grief as well.
-
-    Attributes:
-        names: the files that are to be put back. None of them goes again before a start has lasted.
-    """
-
-    def __init__(self, names: tuple[str, ...]) -> None:
-        super().__init__(f"{MOST} starts in a row without {', '.join(names)} have not lasted either")
-        self.names = names
-
-
-class Trial:
-    """Counts starts, in a file. Where it cannot be written, none counts."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / NAME
-        self._open = False
-        self._next: Told | None = None
-
-    def judge(self, map_id: int | None) -> None:
-        """A map is about to be used, or there is none.
-
-        Where one was set aside in this run of the computer, and no start has lasted since, another map is not the next
-        one to go: what ends every start is something else then.
-
-        Raises:
-            Fatal: as many starts with it have come to grief. What is tried next begins anew.
-            Innocent: it is no better without what was set aside.
-        """
-        mine, told = NONE if map_id is None else f"{map_id:08x}", self._before()
-        self._open, self._next = True, None
-        if told.boot != _boot():
-            told = Told(mine, _boot())
-        elif told.of != mine and told.aside:
-            told = replace(told, of=NONE, count=told.count if told.of == NONE else 0)
-        elif told.of != mine and told.count == 0:
-            return
-        elif told.of != mine:
-            told = Told(mine, told.boot)
-        if told.of == NONE and not told.aside:
-            return
-        if told.count >= MOST and told.of != NONE and self._wrote(replace(told, count=0)):
-            raise Fatal
-        if told.count >= MOST and told.of == NONE and self._wrote(Told(NONE, told.boot)):
-            raise Innocent(told.aside)
-        self._next = replace(told, count=told.count + 1)
-
-    def begin(self) -> None:
-        """The estimator is about to begin with it: what ends this start from now on may be the map."""
-        if self._next is not None:
-            self._wrote(self._next)
-
-    def set_aside(self, name: str) -> None:
-        """The file with which no start has lasted is called so from now on."""
-        told = self._before()
-        self._wrote(replace(told, aside=(*told.aside, name)))
-
-    def proved(self) -> None:
-        """This start has lasted, or was ended in order."""
-        if self._open:
-            self._open = False
-            with contextlib.suppress(OSError):
-                self._path.unlink(missing_ok=True)
-
-    def _wrote(self, told: Told) -> bool:
-        words = "\n".join((f"{told.of} {told.boot} {told.count}", *told.aside, ""))
-        try:
-            self._path.write_text(words, encoding="utf-8", errors="surrogateescape")
-        except OSError:
-            return False
-        return True
-
-    def _before(self) -> Told:
-        """What the file tells; of no map and no run where it cannot be read."""
-        try:
-            first, *aside = self._path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-            of, boot, count = first.split()
-            return Told(of, boot, int(count), tuple(aside))
-        except (OSError, ValueError):
-            return Told()
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +43,77 @@ class Told:
     """What the file holds.
 
     Attributes:
-        of: the map, :data:`NONE` for starts without those set aside. boot: the run of the computer. count: of starts.
-        aside: names of files.
+        boot: the run of the computer. of: the file that starts have begun with, empty: with none. count: of starts in a
+            row that have not lasted. out: files that are left out.
     """
 
-    of: str = ""
     boot: str = ""
+    of: str = ""
     count: int = 0
-    aside: tuple[str, ...] = ()
+    out: tuple[str, ...] = ()
+
+
+class Trial:
+    """Counts starts, in a file. Where it cannot be written, none counts.
+
+    Attributes:
+        out: names of the files that are left out.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NAME
+        self._told, self._begun = Told(), False
+        self.out: tuple[str, ...] = ()
+
+    def read(self) -> None:
+        """Take up what earlier starts of this run of the computer have come to."""
+        boot = _boot()
+        try:
+            told = json.loads(self._path.read_text(encoding="ascii"))
+            before = Told(str(told["boot"]), str(told["of"]), int(told["count"]), tuple(map(str, told["out"])))
+        except (OSError, ValueError, KeyError, TypeError):
+            before = Told()
+        self._told = before if before.boot == boot else Told(boot)
+        self.out = self._told.out
+
+    def changes(self, name: str) -> bool:
+        """This start would begin with this file, empty: with none. Whether it shall choose anew, out of others.
+
+        Where it may, what is chosen then has as many starts as this had.
+        """
+        told = self._told if self._told.of == name else replace(self._told, of=name, count=0)
+        out = (*told.out, name) if name else ()
+        if told.count < MOST or out == told.out or not self._wrote(replace(told, count=0, out=out)):
+            self._told = told
+            return False
+        self.out = out
+        return True
+
+    def begin(self) -> None:
+        """The estimator is about to begin: what ends this start from now on may be the map."""
+        if self._told.of or self._told.out:
+            self._begun = self._wrote(replace(self._told, count=self._told.count + 1))
+
+    def ended(self) -> None:
+        """Somebody has ended this start before it had lasted, so it says nothing."""
+        if self._begun:
+            self._begun = False
+            self._wrote(replace(self._told, count=self._told.count - 1))
+
+    def lasted(self) -> tuple[str, ...]:
+        """This start has: no other one counts any more. Returns what it has done without."""
+        out, self.out, self._begun = self.out, (), False
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+        return out
+
+    def _wrote(self, told: Told) -> bool:
+        try:
+            write_whole(self._path, json.dumps(asdict(told)).encode())
+        except OSError:
+            return False
+        self._told = told
+        return True
 
 
 def _boot() -> str:

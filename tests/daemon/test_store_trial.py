@@ -1,17 +1,19 @@
-"""A map that ends every start is set aside after three; one that lasts, or that was stopped in order, never."""
+"""A map that ends every start is left out after three, and moved aside once a start without it has lasted."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
+import json
 import logging
+import os
 from pathlib import Path
 
 import pytest
 
 from daemon import main, store_keeper, store_trial
 from daemon.config import MapConfig
-from daemon.main import Daemon, World
+from daemon.main import Daemon, Pacemaker, World
 from daemon.store import Start, started
 from daemon.store_trial import MOST, NAME, PROOF_S
 from daemon.warmup import CannotLoad
@@ -20,140 +22,138 @@ from hal.fake.transport import FakeOpener
 from tests.daemon.keeping import Bench
 from tests.daemon.mapmaker import Shape, content
 from tests.daemon.test_daemon import SETTINGS
-from tests.daemon.test_store import MAP, name, names, store_with
+from tests.daemon.test_store import name, names, store_with
 
 
-def begin(folder: Path, proved: bool = False) -> Start | None:
-    """One start; it dies, or is proved."""
+def begin(folder: Path, lasts: bool = False, ends: bool = False) -> Start | None:
+    """One start; it dies, or lasts, or is ended by somebody."""
     store, start = started(MapConfig(folder=str(folder)), None)
     assert store is not None
     store.trial.begin()
-    if proved:
-        store.trial.proved()
+    if lasts:
+        store.lasted()
+    if ends:
+        store.trial.ended()
     store.close()
     return start
 
 
-def test_what_no_start_outlives_is_set_aside_and_the_generation_before_it_has_its_turn(
+def seeds(folder: Path, count: int) -> list[int | None]:
+    """Which of two generations so many starts that die have begun with, None: with no map."""
+    known = {content(seed=seed): seed for seed in (1, 2, 3)}
+    begun = [begin(folder) for _ in range(count)]
+    return [None if one is None else known[one.content] for one in begun]
+
+
+def test_starts_that_die_go_through_the_generations_and_no_map_in_turn(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Of a good map nothing is lost, whatever ends them."""
     store_with(tmp_path, 1, 2).close()
-    for _ in range(MOST):
-        start = begin(tmp_path)
-        assert start is not None
-        assert start.content == content(seed=2)
-    assert not caplog.messages or "refused" not in caplog.text
-    start = begin(tmp_path)
-    assert start is not None
-    assert start.content == content(seed=1)
-    assert name(2, more=".broken") in names(tmp_path)
-    (said,) = [record for record in caplog.records if record.levelno == logging.ERROR]
-    assert name(2, more=".broken") in said.getMessage()
-    assert f"{MOST} starts in a row" in said.getMessage()
-    for _ in range(MOST - 1):
-        assert begin(tmp_path) is not None, "it has as many starts as the one before"
-    assert begin(tmp_path) is None, "and without any map there is a start still"
-
-
-def set_aside(folder: Path) -> None:
-    """Both generations of a map, by starts that die."""
-    store_with(folder, 1, 2).close()
-    for _ in range(2 * MOST):
-        assert begin(folder) is not None
-    assert begin(folder) is None
-    assert names(folder) == [name(1, more=".broken"), name(2, more=".broken")]
-
-
-def test_what_was_set_aside_is_put_back_where_starts_without_it_do_not_last_either(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    set_aside(tmp_path)
-    for _ in range(MOST - 1):
-        assert begin(tmp_path) is None
-    for _ in range(3 * MOST):
-        start = begin(tmp_path)
-        assert start is not None
-        assert start.content == content(seed=2)
+    assert seeds(tmp_path, MOST) == [2] * MOST
+    assert "refused" not in caplog.text
+    assert seeds(tmp_path, MOST) == [1] * MOST
+    said = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert len(said) == MOST, "each start says what it leaves out"
+    assert all(name(2) in words and f"{MOST} starts in a row" in words for words in said)
+    assert seeds(tmp_path, MOST) == [None] * MOST
+    assert "tried again" not in caplog.text
+    assert seeds(tmp_path, 3 * MOST + 1) == [2] * MOST + [1] * MOST + [None] * MOST + [2]
+    assert sum("tried again" in words for words in caplog.messages) == 2
     assert names(tmp_path) == [name(1), name(2)]
-    (said,) = [words for words in caplog.messages if "taken again" in words]
-    assert name(2) in said
-    assert begin(tmp_path, proved=True) is not None
-    for _ in range(MOST):
-        begin(tmp_path)
-    start = begin(tmp_path)
-    assert start is not None
-    assert start.content == content(seed=1), "on trial again once a start has lasted"
 
 
-def test_what_was_set_aside_stays_there_where_a_start_without_it_lasts(tmp_path: Path) -> None:
-    set_aside(tmp_path)
-    assert begin(tmp_path, proved=True) is None
-    for _ in range(2 * MOST):
-        assert begin(tmp_path) is None
-    assert names(tmp_path) == [name(1, more=".broken"), name(2, more=".broken")]
-
-
-def test_another_map_in_use_is_a_start_without_those_set_aside(tmp_path: Path) -> None:
-    """What ends every start takes no second map with it, and the first one comes back."""
-    store = store_with(tmp_path, 1)
-    store.save(content(Shape(map_id=0x77)), 0x77)
-    store.close()
-    for _ in range(MOST):
-        begin(tmp_path)
-    began = [begin(tmp_path) for _ in range(MOST + 1)]
-    assert [None if one is None else one.stored.meta.map_id for one in began] == [None, MAP, MAP, 0x77]
-
-
-def test_a_map_put_back_by_hand_meanwhile_is_not_written_over(tmp_path: Path) -> None:
-    set_aside(tmp_path)
-    for _ in range(MOST - 1):
-        begin(tmp_path)
-    (tmp_path / name(2)).write_bytes(content(seed=3))
-    start = begin(tmp_path)
-    assert start is not None
-    assert start.content == content(seed=3)
-    assert (tmp_path / name(2, more=".broken")).exists()
+@pytest.mark.parametrize(("dying", "aside"), [(MOST, [2]), (2 * MOST, [1, 2])])
+def test_once_a_start_without_it_has_lasted_it_is_moved_aside(tmp_path: Path, dying: int, aside: list[int]) -> None:
+    store_with(tmp_path, 1, 2).close()
+    seeds(tmp_path, dying)
+    begin(tmp_path, lasts=True)
+    assert names(tmp_path) == [name(k, more=".broken" if k in aside else "") for k in (1, 2)]
+    assert seeds(tmp_path, 2) == [None if 1 in aside else 1] * 2
 
 
 def test_a_start_that_lasts_makes_good_for_those_before(tmp_path: Path) -> None:
-    store_with(tmp_path, 1).close()
+    store_with(tmp_path, 2).close()
     for number in range(3 * MOST):
-        assert begin(tmp_path, proved=number % MOST == MOST - 1) is not None
+        assert begin(tmp_path, lasts=number % MOST == MOST - 1) is not None
     assert names(tmp_path) == [name(1)]
 
 
-def test_a_count_that_cannot_be_begun_anew_sets_nothing_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else no generation would be used any more: each would be found to have had its starts."""
+def test_a_start_that_somebody_ends_says_nothing(tmp_path: Path) -> None:
     store_with(tmp_path, 1, 2).close()
-    for _ in range(MOST):
-        begin(tmp_path)
-
-    def full(*_: object, **__: object) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    start = begin(tmp_path)
-    assert start is not None
-    assert start.content == content(seed=2)
+    seeds(tmp_path, MOST)
+    for _ in range(3 * MOST):
+        start = begin(tmp_path, ends=True)
+        assert start is not None
+        assert start.content == content(seed=1)
+    assert seeds(tmp_path, MOST + 1) == [1] * MOST + [None]
     assert names(tmp_path) == [name(1), name(2)]
 
 
-def test_maps_do_not_go_one_after_the_other_where_something_else_ends_every_start(tmp_path: Path) -> None:
+def test_starts_with_one_map_do_not_count_for_another(tmp_path: Path) -> None:
+    store = store_with(tmp_path, 1)
+    store.close()
+    assert seeds(tmp_path, MOST - 1) == [1] * (MOST - 1)
+    store_with(tmp_path, 2).close()
+    assert seeds(tmp_path, MOST + 1) == [2] * MOST + [1]
+
+
+def test_a_count_that_cannot_be_written_leaves_nothing_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store_with(tmp_path, 1, 2).close()
+    seeds(tmp_path, MOST)
+    before = (tmp_path / NAME).read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert seeds(tmp_path, 2) == [2, 2]
+    assert (tmp_path / NAME).read_bytes() == before
+    assert names(tmp_path) == [name(1), name(2)]
+
+
+def test_another_map_does_not_stand_in_for_one_that_is_left_out(tmp_path: Path) -> None:
+    """What a person has begun anew does not come back by itself, nor does what ends every start take it with it."""
     store = store_with(tmp_path, 1)
     store.save(content(Shape(map_id=0x77)), 0x77)
     store.close()
-    for _ in range(MOST):
-        start = begin(tmp_path)
-        assert start is not None
-        assert start.stored.meta.map_id == 0x77
-    assert begin(tmp_path) is None, "what a person has begun anew does not come back by itself"
+    begun = [begin(tmp_path) for _ in range(2 * MOST + 1)]
+    found = [None if one is None else one.stored.meta.map_id for one in begun]
+    assert found == [0x77] * MOST + [None] * MOST + [0x77]
+    assert len(names(tmp_path)) == 2
+
+
+def test_a_robot_without_any_map_counts_nothing(tmp_path: Path) -> None:
     for _ in range(2 * MOST):
-        assert begin(tmp_path) is not None
-    assert name(1) in names(tmp_path)
-    assert begin(tmp_path, proved=True) is not None
-    for _ in range(MOST):
-        assert begin(tmp_path) is not None
-    assert begin(tmp_path) is None, "it is on trial again once a start has lasted"
+        assert begin(tmp_path) is None
+    assert not (tmp_path / NAME).exists()
+
+
+@pytest.mark.jit
+def test_a_daemon_that_dies_at_once_goes_through_them_and_leaves_no_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole process but for the wires, whose cycle a defect ends with or without a map."""
+    store_with(tmp_path, 1).close()
+
+    def go() -> bool:
+        store, start = started(MapConfig(folder=str(tmp_path)), None)
+
+        async def run() -> None:
+            clock = LoopClock(asyncio.get_running_loop(), utc_at_zero=1.7e9)
+            opener = FakeOpener(clock)
+            await Daemon(SETTINGS, World(clock, opener=opener, store=store, start=start)).run(asyncio.Event())
+
+        with pytest.raises(ZeroDivisionError):
+            run_virtual(run())
+        return start is not None
+
+    async def defect(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Pacemaker, "run", defect)
+    assert [go() for _ in range(3 * MOST)] == [True] * MOST + [False] * MOST + [True] * MOST
+    assert names(tmp_path) == [name(1)]
 
 
 @pytest.mark.jit
@@ -198,7 +198,9 @@ def test_another_run_of_the_computer_counts_anew(tmp_path: Path, monkeypatch: py
     assert begin(folder) is None
 
 
-@pytest.mark.parametrize("held", [b"", b"\xff", b"rubbish", f"{MAP:08x} ".encode()])
+@pytest.mark.parametrize(
+    "held", [b"", b"\xff", b"rubbish", b"[]", b"{}", b'{"boot": "-", "of": 1, "count": "x", "out": []}']
+)
 def test_a_count_that_cannot_be_read_is_none(tmp_path: Path, held: bytes) -> None:
     store_with(tmp_path, 1).close()
     (tmp_path / NAME).write_bytes(held)
@@ -209,7 +211,7 @@ def test_a_folder_that_cannot_be_written_counts_nothing(tmp_path: Path) -> None:
     store_with(tmp_path, 1).close()
     (tmp_path / NAME).mkdir()
     for _ in range(2 * MOST):
-        assert begin(tmp_path, proved=True) is not None
+        assert begin(tmp_path, lasts=True) is not None
         assert begin(tmp_path) is not None
 
 
@@ -247,7 +249,7 @@ def test_a_run_is_proved_when_it_has_lasted(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("in_order", [True, False])
-def test_a_stop_in_order_proves_it_and_a_defect_does_not(tmp_path: Path, in_order: bool) -> None:
+def test_a_stop_in_order_does_not_count_and_a_defect_does_and_saves_nothing(tmp_path: Path, in_order: bool) -> None:
     async def run() -> None:
         store_with(tmp_path, 1).close()
         bench = Bench(tmp_path)
@@ -256,7 +258,9 @@ def test_a_stop_in_order_proves_it_and_a_defect_does_not(tmp_path: Path, in_orde
         bench.store.load()
         bench.store.trial.begin()
         bench.keeper.loaded()
+        bench.drive()
         await bench.keeper.finish(in_order)
-        assert (tmp_path / NAME).exists() is not in_order
+        assert json.loads((tmp_path / NAME).read_bytes())["count"] == (0 if in_order else 1)
+        assert (len(names(tmp_path)) > 1) is in_order
 
     asyncio.run(run())
