@@ -110,7 +110,11 @@ case "${1:-}" in
         environment
         files
         tell_system install
-        say "installed into ${DESTDIR:-/}; edit /etc/lumiloop/lumiloop.toml, then: systemctl enable --now lumiloop"
+        if [ -n "$DESTDIR" ]; then
+            say "laid down in $DESTDIR"
+        else
+            say "installed; edit /etc/lumiloop/lumiloop.toml, then: systemctl enable --now lumiloop"
+        fi
         ;;
     uninstall)
         ours
@@ -128,7 +132,11 @@ case "${1:-}" in
             rm -f "$DESTDIR/var/lib/lumiloop" "$DESTDIR/var/lib/lumiloop-record" "$DESTDIR/var/cache/lumiloop"
         fi
         tell_system uninstall
-        say "removed; configuration, maps and recordings stay (PURGE=1 removes them too)"
+        if [ "${PURGE:-0}" = 1 ]; then
+            say "removed, configuration, maps and recordings too"
+        else
+            say "removed; configuration, maps and recordings stay (PURGE=1 removes them too)"
+        fi
         ;;
     *) fail "usage: $0 install | uninstall" ;;
 esac

@@ -46,10 +46,11 @@ LOOPS: Final[dict[LoopReason, str]] = {
     LoopReason.PLACED: "found in the whole map: the one place that fits all that was seen since the place was lost",
 }
 COMMANDS: Final[dict[CommandCode, str]] = {
-    CommandCode.SET_POSE: "The robot is at `x`, `y`, `yaw` in the map. Done when a pose is published. In a stored "
-    "map it is then looked for within 1 m and 0.5 rad of that (RELOCATING), and everywhere in the map where four looks "
-    "find nothing there: a wrong place is not believed, it costs the time of the search. Where the map is this run's "
-    "own it is taken at its word, and the map goes along; lamps that know better contradict it later.",
+    CommandCode.SET_POSE: "The robot is at `x`, `y`, `yaw` in the map. Done when the order has been taken: whether "
+    "the place is right, the state says. In a stored map the robot is looked for within 1 m and 0.5 rad of that "
+    "(RELOCATING), and where four looks find nothing there, which are made as it drives, everywhere in it: a wrong "
+    "place is not believed, it costs the search. Where the map is this run's own it is taken at its word, and the map "
+    "goes along; lamps that know better contradict it later.",
     CommandCode.RESET: "Map and pose are forgotten, a new map is begun. The stored ones stay.",
     CommandCode.SAVE_MAP: "The map is written to the disk. Done when it is there and has been read back.",
     CommandCode.RELOCALISE: "The robot was carried off: it is looked for everywhere in the map.",

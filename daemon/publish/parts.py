@@ -85,7 +85,9 @@ POINTS: Final = (
               rule=Rule.WRAP, can_be_unknown=False)
         for part, text in PARTS.items()
     ),
-    Point("down", "parts that are down", U16, _bits("down"), f"Bits: {_names(PARTS)}.", can_be_unknown=False),
+    Point("down", "parts that are down", U16, _bits("down"),
+          f"Bits: {_names(PARTS)}. Of the program: a device that is gone is a fault and no bit here.",
+          can_be_unknown=False),
     Point("hanging", "threads that have not come back", U16, _bits("hanging"), f"Bits: {_names(THREADS)}.",
           can_be_unknown=False),
 )  # fmt: skip

@@ -27,6 +27,7 @@ async def test_is_found(adc: AdcEnd, told: Telling) -> None:
     there = {chip.address: chip for chip in finding.chips}
     assert adc.address in there, f"nothing answers at {adc.address:#04x}; there are {sorted(map(hex, there))}"
     assert there[adc.address].usable, str(there[adc.address])
+    assert adc.chip in there[adc.address].name, f"{there[adc.address]}, and not {adc.chip}"
 
 
 async def test_blocks_and_rate(adc: AdcEnd, told: Telling) -> None:

@@ -22,7 +22,11 @@ def checked(entry: Entry, root: Path | None) -> golden.Verdict:
     """Replay one."""
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
-    return golden.judged(golden.load(entry.name), ledger.final(), [loop for _, loop in ledger.loops], entry.every)
+    try:
+        blessed = golden.load(entry.name)
+    except golden.Damaged as error:
+        return golden.Verdict(False, str(error))
+    return golden.judged(blessed, ledger.final(), [loop for _, loop in ledger.loops], entry.every)
 
 
 def main(arguments: list[str] | None = None) -> int:

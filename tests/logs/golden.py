@@ -114,15 +114,33 @@ def save(name: str, trajectory: Trajectory, every: int, facts: dict[str, str]) -
     return path
 
 
+class Damaged(Exception):
+    """A golden file cannot be read; names the file and the remedy."""
+
+
+FACTS: Final = ("environment", "poses", "loops", "digest", "reason")
+
+
 def load(name: str) -> Golden:
-    """Read a golden file."""
+    """Read a golden file.
+
+    Raises:
+        Damaged: it is none.
+    """
     path = FOLDER / f"{name}.txt"
     facts = {}
     for line in path.read_text().splitlines():
         if line.startswith("# "):
             key, _, value = line[2:].partition(": ")
             facts[key] = value
-    rows = np.loadtxt(path, comments="#", ndmin=2)
+    lacks = [fact for fact in FACTS if fact not in facts]
+    try:
+        rows = np.loadtxt(path, comments="#", ndmin=2)
+    except ValueError as error:
+        raise Damaged(f"{path}: {error}; git checkout it, or bless it anew: {REMEDY}") from error
+    if lacks or rows.shape[1:] != (4,):
+        lacking = f"no line {lacks[0]!r}" if lacks else f"{rows.shape[1]} columns, there must be 4"
+        raise Damaged(f"{path}: {lacking}; git checkout it, or bless it anew: {REMEDY}")
     return Golden(facts, rows[:, 0], rows[:, 1:])
 
 

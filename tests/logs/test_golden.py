@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from estimator.result import Loop
 from tests.logs import __main__ as command
 from tests.logs import bless, golden, made
 from tests.logs.__main__ import main
-from tests.logs.catalog import ENTRIES, Entry, ledger_of, origin
+from tests.logs.catalog import BY_NAME, ENTRIES, Entry, ledger_of, origin
 from tests.logs.conftest import Replayed
 
 
@@ -64,6 +65,30 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
     monkeypatch.setattr(golden, "load", lambda name: near)
     assert main(["room"]) == 0
     assert "another processor, or other versions: 0.0009" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("spoil", "checked", "blessed"),
+    [
+        (lambda text: text.replace("# loops: ", "# loops: 9"), "loops", "moved by up to 0.00000"),
+        (lambda text: text + "garbage\n", "room.txt: the number of columns changed", "what was there is damaged"),
+        (lambda text: text.replace("# environment:", "#environment:"), "no line 'environment'", "damaged"),
+    ],
+)
+def test_a_golden_file_that_somebody_has_edited_is_told_and_can_be_blessed(
+    spoil: Callable[[str], str], checked: str, blessed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (golden.FOLDER / "room.txt").read_text()
+    assert "# loops: " in text
+    (tmp_path / "room.txt").write_text(spoil(text))
+    monkeypatch.setattr(golden, "FOLDER", tmp_path)
+    entry = BY_NAME["room"]
+    verdict = command.checked(entry, None)
+    assert not verdict.same
+    assert checked in verdict.said
+    assert blessed in bless.bless(entry, None, "it had been edited")
+    assert command.checked(entry, None).same
+    assert "unchanged" in bless.bless(entry, None, "it had been edited")
 
 
 def test_real_logs_that_are_left_out_are_said_and_fail_where_all_are_demanded(

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,7 +116,7 @@ def inside(root: Path, *command: str, seconds: float = BUILD_S) -> str:
 @contextmanager
 def booted(root: Path, *binds: str) -> Iterator[Container]:
     """Boot it; ``binds``: as nspawn's ``--bind``. Pulled off the mains at the end."""
-    command = ["systemd-nspawn", "-q", "-D", str(root), "-b", "--register=no", "--keep-unit", "--console=pipe"]
+    command = [*LEASH, "systemd-nspawn", "-q", "-D", str(root), "-b", "--register=no", "--keep-unit", "--console=pipe"]
     command += [f"--machine=lumiloop-{os.getpid()}", "--private-network", *(f"--bind={bind}" for bind in binds)]
     command += ["--property=DeviceAllow=char-pts rw"] if binds else []
     with (root.parent / "console").open("w") as console:
@@ -127,7 +127,9 @@ def booted(root: Path, *binds: str) -> Iterator[Container]:
         yield Container(root, leader)
     finally:
         # all of its processes die with its first one, before that is gone; then nspawn ends, and leaves nothing
-        os.kill(leader or process.pid, signal.SIGKILL)
+        if process.poll() is None:  # else its numbers are somebody else's by now
+            with suppress(ProcessLookupError):
+                os.kill(leader or process.pid, signal.SIGKILL)
         process.wait(timeout=BOOT_S)
 
 
