@@ -14,6 +14,7 @@ from tools.bench.report import Seen
 from tools.bench.vm import trying_removal, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.machine import Order
+from tools.bench.world import agreement
 from tools.bench.world.agreement import Trace
 
 
@@ -61,11 +62,18 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
     monkeypatch.setattr(trying_system, "outside", lambda: Trace(way, np.zeros((len(way), 2))))
     seen = trying_system.agrees_with_outside(driven(5.0))
     assert isinstance(seen, Seen)
-    assert [round(one.value) for one in seen.figures] == [0.0, 5.0, 0.0, 0.0]
+    assert [round(one.value) for one in seen.figures] == [0.0, 5.0, 0.0, 0.0, 0.0]
     short = driven(0.6)
     short.memory["drive"][-1] = replace(short.memory["drive"][-1], missed=3, overruns=2, fault=301)
     with pytest.raises(Order, match=r"way compared: 0\.\d+ m.*; meanwhile 3 scans missed, 2 cycles .* \[301\]"):
         trying_system.agrees_with_outside(short)
+    for name, late in (("LATE_S", np.full(51, 0.012)), ("SPREAD_S", np.linspace(0.0, 0.012, 51))):
+        monkeypatch.setattr(agreement, "lateness", lambda *_, late=late: late)
+        trying_system.agrees_with_outside(driven(5.0))
+        with monkeypatch.context() as less:
+            less.setattr(trying_system, name, 0.011)
+            with pytest.raises(Order, match="late by: 12"):
+                trying_system.agrees_with_outside(driven(5.0))
     nowhere = driven(5.0)
     nowhere.memory["drive"] = [Heard(0.2, 0.2, 1, None, 0.0)] * 20
     with pytest.raises(Order, match="no pose of the drive claims a place"):

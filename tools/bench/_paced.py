@@ -140,6 +140,7 @@ class Feeder:
         self.told = Told()
         self.stretch = ""
         self.daemon: Daemon | None = None
+        self.failure: Exception | None = None
         self.stop = asyncio.Event()
         self.on_samples: Callable[[RawSamples], None] = lambda block: None
         self._wanted = wanted
@@ -149,7 +150,15 @@ class Feeder:
         self._begun = (0.0, 0.0)
 
     async def run(self, on_scan: Callable[[RawScan], None]) -> None:
-        """See :class:`hal.lidar.Lidar`."""
+        """See :class:`hal.lidar.Lidar`. A mistake in here ends it all: the daemon would start it anew, in mid-count."""
+        try:
+            await self._feed(on_scan)
+        except Exception as error:
+            self.failure = error
+            self.stop.set()
+            raise
+
+    async def _feed(self, on_scan: Callable[[RawScan], None]) -> None:
         daemon = self.daemon
         assert daemon is not None
         while daemon.cycle.cycles == 0:  # noqa: ASYNC110  # nothing tells of the first cycle
@@ -281,6 +290,8 @@ async def go(wanted: Wanted, drive: Any) -> Told:
     feeder.daemon = daemon = Daemon(settings, world)
     daemon.pacemaker.watch = watch = StallWatch()
     await daemon.run(feeder.stop)
+    if feeder.failure is not None:
+        raise feeder.failure
     feeder.told.stalls, feeder.told.said = daemon.cycle.taker.pulse.stalls, watch.said
     return feeder.told
 

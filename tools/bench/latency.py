@@ -156,7 +156,8 @@ def paced(folder: Path, drive: Path, fifo: bool, turns: int, burn: Callable[[boo
         asked = answered = 0
         for line in child.stdout:
             if line.startswith("told "):
-                child.wait(30.0)
+                if child.wait(30.0):
+                    break
                 return json.loads(line[5:]) | {"asked": asked, "answered": answered}
             if line.strip() == "ended":  # it still serves: what is asked until now is answered
                 asked, answered = load.end()

@@ -102,7 +102,8 @@ def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, 
     A line on which every scan is under way for a while, the emulated computer's, makes all instants later by as much:
     at 0.6 m/s 10 ms are 6 mm along the way, which are the line's and not what was made of the scans. How much it is
     changes with what else the computer around has to do, in seconds and not from scan to scan: stamps are set back in
-    groups. One in which less than half a metre was driven tells nothing, and has what the one before had.
+    groups. One in which less than half a metre was driven tells nothing, and has what the one before had. An error
+    along the way that changes from group to group looks like it: who judges bounds by how much groups may differ.
 
     Args:
         tried: seconds, ascending.
@@ -110,7 +111,7 @@ def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, 
         count: of stamps.
         other: the trace to agree with.
     """
-    late, before = np.zeros(count), 0.0
+    late, before = np.full(count, math.nan), math.nan
     for first in range(0, count, GROUP):
         part = slice(first, first + GROUP if count - first >= 2 * GROUP else count)
         gaps = [differences(traced(part, np.full(len(late[part]), by)), other)[1] for by in tried.tolist()]
@@ -119,7 +120,8 @@ def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, 
         late[part] = before
         if part.stop == count:
             break
-    return late
+    told = late[np.isfinite(late)]
+    return np.where(np.isfinite(late), late, told[0] if len(told) else 0.0)
 
 
 def figures(one: Trace, other: Trace, names: str) -> tuple[tuple[Figure, ...], tuple[Plot, ...]]:
