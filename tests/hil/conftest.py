@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from hal.errors import HalError
-from tests.hil.ends import FAKE, AdcEnd, LidarEnd, Operator, operator_for
+from tests.hil.ends import FAKE, AdcEnd, LidarEnd, Operator, operator_for, where_on_a_bus
 from tests.hil.programs import Served, program, served_lidar
 from tests.hil.walking import Walked, walk_real, walk_simulated
 from tools.bench.plots import Plot
@@ -103,15 +103,19 @@ def _needs(request: pytest.FixtureRequest, device: str) -> None:
     """Skip a test that needs what this bench does not have; fakes have everything."""
     marked = [kind for mark in request.node.iter_markers("needs") for kind in mark.args]
     assert set(marked) <= set(KINDS), f"{request.node.name} needs {marked}; known are {KINDS}"
-    have = {text.strip() for text in str(request.config.getoption("--have")).split(",") if text.strip()}
-    if unknown := sorted(have - set(KINDS)):
-        raise pytest.UsageError(f"--have {unknown[0]}: known are motion and light; an operator is named by --operator")
-    if request.config.getoption("--operator"):
-        have.add("operator")
+    have = _there(request.config)
     lacking = [kind for kind in marked if kind not in have]
     if device != FAKE and lacking:
-        remedy = {"operator": "--operator terminal"}.get(lacking[0], f"--have {lacking[0]}")
+        remedy = " ".join("--operator terminal" if kind == "operator" else f"--have {kind}" for kind in lacking)
         pytest.skip(f"needs {' and '.join(lacking)} on {device}; where there is: {remedy}")
+
+
+def _there(config: pytest.Config) -> set[str]:
+    """What there is besides the devices; raises `pytest.UsageError` for a word that is not known."""
+    have = {text.strip() for text in str(config.getoption("--have")).split(",") if text.strip()}
+    if unknown := sorted(have - set(KINDS)):
+        raise pytest.UsageError(f"--have {unknown[0]}: known are motion and light; an operator is named by --operator")
+    return have | ({"operator"} if config.getoption("--operator") else set())
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -132,8 +136,10 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """See early that the run to compare with can be read, and the report be written."""
+    """See early that options say something, that the run to compare with can be read, and the report be written."""
     config.stash[RESULTS] = {}
+    where_on_a_bus(str(config.getoption("--adc")))
+    _there(config)
     folder = config.getoption("--hil-report")
     if folder:
         try:

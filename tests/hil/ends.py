@@ -32,6 +32,7 @@ from hal.hokuyo.driver import HokuyoDriver
 from hal.i2c import BusOpener
 from hal.lidar import RawScan
 from hal.opening import open_bus, open_port
+from hal.photodiode.chips import chip_named
 from hal.photodiode.driver import PhotodiodeAdc
 from hal.port import PortOpener
 
@@ -225,6 +226,26 @@ class LidarEnd(End[RawScan]):
         return HokuyoDriver(self.device, clock=self.clock, opener=self.opener)
 
 
+def where_on_a_bus(name: str) -> tuple[str, int, str]:
+    """Bus, address and kind of chip that ``--adc`` names.
+
+    Raises:
+        pytest.UsageError: it does not.
+    """
+    bus, at, rest = (f"{BUS}@0x4d" if name == FAKE else name).rpartition("@")
+    address, _, chip = rest.partition(",")
+    try:
+        number = int(address, 0) if at and bus else None
+    except ValueError:
+        number = None
+    if number is None:
+        raise pytest.UsageError(f"--adc {name}: expected BUS@ADDRESS[,CHIP], as /dev/i2c-1@0x4d")
+    try:
+        return bus, number, chip_named(chip or "mcp3221").name
+    except ValueError as error:
+        raise pytest.UsageError(f"--adc {name}: {error}") from error
+
+
 @dataclass
 class AdcEnd(End[RawSamples]):
     """A photodiode's converter; as :class:`LidarEnd`."""
@@ -233,14 +254,7 @@ class AdcEnd(End[RawSamples]):
     fake: FakeAdc | None = None
 
     def __post_init__(self) -> None:
-        bus, at, rest = (f"{BUS}@0x4d" if self.name == FAKE else self.name).rpartition("@")
-        address, _, chip = rest.partition(",")
-        try:
-            self.bus, self.address, self.chip = bus, int(address, 0), chip or "MCP3221"
-        except ValueError:
-            at = ""
-        if not at or not bus:
-            raise pytest.UsageError(f"--adc {self.name}: expected BUS@ADDRESS[,CHIP], as /dev/i2c-1@0x4d")
+        self.bus, self.address, self.chip = where_on_a_bus(self.name)
 
     def plug(self) -> dict[str, Target]:
         """One under ordinary lamps."""

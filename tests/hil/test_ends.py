@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tests.hil.ends import AdcEnd, operator_for
+from tests.hil.ends import AdcEnd, operator_for, where_on_a_bus
 from tests.hil.programs import ROOT, free_port, program, served_lidar, served_receiver
 
 ON_DEVICES = 8
@@ -219,6 +219,12 @@ def test_a_suite_that_is_killed_leaves_no_program_behind(number: int, tmp_path: 
 def test_a_converter_that_is_named_wrongly(name: str) -> None:
     with pytest.raises(pytest.UsageError, match="as /dev/i2c-1@0x4d"):
         AdcEnd(name)
+
+
+def test_a_converter_is_named_by_bus_address_and_chip() -> None:
+    assert where_on_a_bus("unix:/a@b@0x54,adc121c021") == ("unix:/a@b", 0x54, "ADC121C021")
+    with pytest.raises(pytest.UsageError, match="chip foo: not known"):
+        where_on_a_bus("/dev/i2c-1@0x4d,foo")
 
 
 def test_programs_and_operators_that_are_not_there(tmp_path: Path) -> None:
