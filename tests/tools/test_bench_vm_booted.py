@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from tools.bench.vm import booted, image, places
+from tools.bench.vm import machine as machines
 from tools.bench.vm.machine import Machine, Order, Ports, command_line
 
 
@@ -159,3 +160,16 @@ def test_an_agent_that_fails_in_the_first_boot_is_said_as_any_other_reason(
     monkeypatch.setattr(booted, "started", lambda *given: nullcontext(machine))
     with pytest.raises(places.CannotBench, match="not come up well: the line to the agent inside has been cut"):
         booted._boot(tmp_path, booted.Booted(image.Image(tmp_path), tmp_path))
+
+
+def test_a_qemu_that_says_nothing_any_more_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machines, "DEAF_S", 0.2)
+    monkeypatch.setattr(machines, "QUIT_S", 0.2)
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "qmp"))
+    listener.listen()
+    machine = Machine(subprocess.Popen(["sleep", "60"]), tmp_path, Ports(1, 2, 3), threading.Event())
+    with pytest.raises(places.CannotBench, match="QEMU does not take cont: timed out"):
+        machine._monitor("cont")
+    machine.stop()
+    listener.close()

@@ -21,6 +21,8 @@ from tools.bench.vm.image import Image
 from tools.bench.vm.places import LEASH, BrokenOff, CannotBench
 
 BOOT_S, QUIT_S, LOOK_S, KEEP_S = 400.0, 10.0, 0.5, 120.0
+DEAF_S = 60.0
+"""What QEMU itself may take to hear a word or to answer one, on a busy computer too."""
 MODBUS, ODOMETRY = 1502, 5601
 UNUSED = (
     *(f"{unit}.service" for unit in ("serial-getty@ttyS0", "getty@tty1", "systemd-logind", "systemd-binfmt")),
@@ -279,6 +281,7 @@ class Machine:
     def _connected(self, name: str) -> socket.socket:
         """To one of its sockets; raises `CannotBench` where it has ended, or does not offer it."""
         link, end = socket.socket(socket.AF_UNIX), time.monotonic() + QUIT_S
+        link.settimeout(DEAF_S)
         while True:
             try:
                 link.connect(str(self.folder / name))
