@@ -29,7 +29,7 @@ from daemon.config import MapConfig
 from daemon.folders import maps_folder
 from daemon.store_file import BadMap, Damaged, Foreign
 from daemon.store_tables import OtherBuilding, Stored, against_survey, read
-from daemon.store_trial import MOST, Fatal, Trial
+from daemon.store_trial import LEFT_OUT, MOST, Trial
 from daemon.wholefile import sync_folder, write_whole
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ class Store:
             elsewhere, refused = True, False
             for generation in files:
                 if generation.path.name in self.trial.out:
-                    log.error("%s is refused: %s; %s", generation.path, fatal := Fatal(), fatal.remedy)
+                    log.error("%s is refused: %s", generation.path, LEFT_OUT)
                     elsewhere, refused, self.left_out = False, True, True
                     continue
                 try:

@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from daemon.store_file import Damaged
 from daemon.wholefile import write_whole
 
 NAME: Final = "starts"
@@ -27,15 +26,10 @@ MOST: Final = 3
 PROOF_S: Final = 10.0
 """A start that has lasted so long since its map was loaded is none that the map has ended."""
 BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
-
-
-class Fatal(Damaged):
-    """Nothing is wrong with it, but no start outlives it."""
-
-    remedy = "it is left out; once a start without it has lasted it is moved aside, for whoever mends that"
-
-    def __init__(self) -> None:
-        super().__init__(f"{MOST} starts in a row have begun with it, and none has lasted for {PROOF_S:g} s")
+LEFT_OUT: Final = (
+    f"{MOST} starts in a row have begun with it, and none has lasted for {PROOF_S:g} s; it is left out, and moved "
+    "aside, for whoever mends that, once a start without it has lasted"
+)
 
 
 @dataclass(frozen=True, slots=True)
