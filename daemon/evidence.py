@@ -145,7 +145,7 @@ class Observer:
         if result is None or result.lights is None:
             return Light(alive, placed=self._placed, known=self._known)
         lights, gap = result.lights, result.gap
-        against = _contradicts(lights) and lights.fix is not Fix.NONE
+        against = result.misplaced or (_contradicts(lights) and lights.fix is not Fix.NONE)
         self._placed, self._known = result.placed, _axes(result.known_axes)
         moved = result.jumps > self._jumps and self._odd
         self._jumps = result.jumps
@@ -158,6 +158,8 @@ class Observer:
             lost=lights.fix is Fix.LOST,
             agrees=None if not alive or (gap is None and not against) else not self._odd,
             moved=moved,
+            elsewhere=alive and result.misplaced,
+            apart=alive and result.apart,
             known=self._known,
         )
 

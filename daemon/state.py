@@ -32,6 +32,8 @@ RECALLED_S: Final = 0.3
 """The same where the pose was proved before a gap, or before the daemon ended, and is found again where it was."""
 CONTRADICTED_S: Final = 0.3
 """Light has to contradict the place for this long: an epoch may be spoiled by who walks by."""
+ELSEWHERE_S: Final = 0.04
+"""The same where lamps are received that cannot be received here, two epochs in a row: who walks by adds no light."""
 HELD: Final = (State.TRACKING, State.DEGRADED)
 """States in which a proved pose is held."""
 
@@ -45,10 +47,11 @@ def judge(memory: Memory, evidence: Evidence) -> Memory:
     lost = state is State.LOST or (memory.lost and state in (State.RELOCATING, State.AMBIGUOUS, State.NO_LIDAR))
     doubt = lost or evidence.places is not None or (memory.doubt and state is not State.TRACKING)
     recalled = memory.recalled and state is not State.TRACKING  # it has served
-    said = (state, reason, lost, doubt, recalled)
-    if said == (memory.state, memory.reason, memory.lost, memory.doubt, memory.recalled):
+    tracked = state is State.TRACKING or (memory.tracked and not (lost or doubt))
+    said = (state, reason, lost, doubt, recalled, tracked)
+    if said == (memory.state, memory.reason, memory.lost, memory.doubt, memory.recalled, memory.tracked):
         return memory  # making a new one costs more than looking whether it is one
-    return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt, recalled=recalled)
+    return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt, recalled=recalled, tracked=tracked)
 
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
@@ -159,7 +162,10 @@ def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
         return State.DEGRADED, Reason.UNCERTAIN
     if evidence.light is not None and not evidence.light.placed:
         return State.MAPPING, Reason.UNPLACED
-    if memory.state is State.TRACKING or _proved(memory, evidence) or _agreed(memory, evidence):
+    if memory.state is State.TRACKING:
+        return State.TRACKING, Reason.NONE
+    apart = evidence.light is not None and evidence.light.apart
+    if (memory.tracked or not apart) and (_proved(memory, evidence) or _agreed(memory, evidence)):
         return State.TRACKING, Reason.NONE
     return (State.DEGRADED, Reason.CONFIRMING) if memory.state is State.DEGRADED else (State.MAPPING, Reason.UNPROVED)
 
@@ -183,7 +189,10 @@ def _missing(memory: Memory, evidence: Evidence) -> Reason | None:
 
 
 def _contradicted(memory: Memory, evidence: Evidence) -> bool:
-    return memory.odd_since is not None and evidence.t_mono - memory.odd_since >= CONTRADICTED_S
+    if memory.odd_since is None:
+        return False
+    elsewhere = evidence.light is not None and evidence.light.elsewhere
+    return evidence.t_mono - memory.odd_since >= (ELSEWHERE_S if elsewhere else CONTRADICTED_S)
 
 
 def _clean(memory: Memory, evidence: Evidence) -> bool:

@@ -43,6 +43,8 @@ class Light:
         lost: what is received contradicts the place that light itself had told.
         agrees: whether the light's place and the pose are the same within what both may be wrong; None: cannot be said.
         moved: in this cycle the pose was moved to where light says, after the two had contradicted each other.
+        elsewhere: most of the lamps that are received cannot be received at the pose.
+        apart: they are the same within that, but one of the two is still on its way.
         known: (x, y, yaw) whether the pose knows the axis, with or without a laser.
     """
 
@@ -53,6 +55,8 @@ class Light:
     lost: bool = False
     agrees: bool | None = None
     moved: bool = False
+    elsewhere: bool = False
+    apart: bool = False
     known: tuple[bool, bool, bool] = (False, False, False)
 
 

@@ -59,6 +59,7 @@ class Memory:
         sure: the pose was proved when the laser fell silent. recalled: the laser is back, and has found it there.
         lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
         odd_since: since when light has contradicted the place; both None while it does not.
+        tracked: TRACKING has been said of this place before.
         led: light has moved the pose, and has not been sure of the place since.
         gone: the laser is silent. back: when it last came back, None: it has not been away. fitful: how often in a row
             it has fallen silent again soon after it was said to be back.
@@ -81,6 +82,7 @@ class Memory:
     lit_since: float | None = None
     lit_last: float | None = None
     odd_since: float | None = None
+    tracked: bool = False
     led: bool = False
     gone: bool = False
     back: float | None = None
@@ -147,6 +149,7 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
         lit_since=memory.lit_since,
         lit_last=memory.lit_last,
         odd_since=memory.odd_since,
+        tracked=memory.tracked,
         led=memory.led,
         gone=memory.gone,
         back=memory.back,

@@ -15,19 +15,21 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Virtual
+from estimator.lights_trust import TRUST, across_the_row, doubted, doubted_covariance, without_heading
 from estimator.linear3 import det3, invert3, largest_of, positive_part, symmetric
 from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
-from estimator.row import doubt, straighten, sure_part
+from estimator.row import straighten, sure_part
 from estimator.state import State
+from estimator.swing import Swing
 from estimator.trail import KEPT_S
 
 FRESH_M, FRESH_S = 0.7, 60.0
@@ -37,11 +39,6 @@ DRIFT = (5e-5, 5e-5, 2e-6)
 """Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of: some
 7 mm and 0.08 deg by the root of the way."""
 
-TRUST, YOUNG, YOUNG_M = 2.0, 4.0, 4.0
-"""By how much the variance of a position from light is raised: always, because errors of the light model hang together
-farther than it knows; and at the start, fading with the way driven, because gains and heading are being found."""
-UNGUIDED = 1.5
-"""By how much that variance is raised further where no wheels tell `lights` how the robot moves."""
 ASTRAY_RAD = 0.35
 """A heading from light that is off by so much, without wheels, has led its position astray too."""
 SURPRISE_S = 1.0
@@ -49,6 +46,10 @@ SURPRISE_S = 1.0
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 """What stamps and lever arms make of a moving robot."""
 
+APART = 1.5
+"""Squared Mahalanobis distance above which a pose is still on its way to where light is, or light to it. The errors of
+a pose that comes from light are mostly light's own: at 150 starts it was 0.1 (median), at one of fifty above 0.8, and
+not 3 as between two that know nothing of one another; of the four above 1.5 three were wrong."""
 FAR_M, FAR_RAD, CHECKED = 1.5, 0.5, 3
 """While the laser has held the pose without a break, light that is off by less is told, not followed: the laser does
 not lose so little, and light that reflects in an unusual place is off by as much; nor, where the pose is known, is
@@ -57,8 +58,6 @@ SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
-ANY_HEADING = math.pi**2 / 3.0
-"""Variance of a heading that may be any, rad^2."""
 BLIND_S, BLIND_PERIODS, SLOWEST_S = 0.5, 1.5, 3.0
 """Without a match for so long, or so many scan periods (of a slow laser), light and odometry are all there is."""
 KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
@@ -90,6 +89,7 @@ class Absolute:
         t_match: instant of the latest match; scan_s: what had passed since the scan before it.
         t_light: instant of the latest epoch, whatever was in it; light_s: what had passed since the one before it.
         poses: T_odom_base of the last second, each with its instant.
+        swing: the heading of the odom frame by light over the last stretch of way.
         mended: when light has mended the pose in the last seconds, and what part (3x3, odom axes) of its error is left.
     """
 
@@ -115,6 +115,7 @@ class Absolute:
     t_light: float = -math.inf
     light_s: float = 0.0
     poses: deque[tuple[float, Array]] = field(default_factory=deque)
+    swing: Swing = field(default_factory=Swing)
     mended: deque[tuple[float, Array]] = field(default_factory=deque)
 
 
@@ -173,7 +174,8 @@ def on_lights(state: State, lights: LightsResult) -> None:
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    lights = across_the_row(state, doubted(tie, lights, state.light.told))
+    catalogue, told = state.light.filter.catalogue, state.light.told
+    lights = across_the_row(catalogue, doubted(lights, tie.way - tie.way_young, told))
     held = holds_heading(state)
     if held:
         lights = without_heading(lights)
@@ -183,6 +185,10 @@ def on_lights(state: State, lights: LightsResult) -> None:
     off = lights.T_map_base - se2.compose(state.T_map_odom, T_odom_base)
     off[2] = se2.wrap(off[2])
     tie.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if tie.placed else None
+    if not tie.placed or tie.odd_since is not None:
+        tie.swing.forget()
+    elif lights.fix is Fix.GOOD:
+        tie.swing.take(tie.way, float(lights.T_map_base[2] - T_odom_base[2]))
     if not tie.placed:
         follow(state, lights, T_odom_base)
         tie.gap = 0.0
@@ -244,6 +250,12 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
         tie.since = state.next_key
 
 
+def apart(state: State) -> bool:
+    """Whether light and pose agree, but one of them is still on its way; False where light says nothing now."""
+    tie = state.absolute
+    return tie is not None and tie.gap is not None and (tie.gap > APART or not tie.swing.rests)
+
+
 def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     """Take the lights' pose as it is."""
     tie = state.absolute
@@ -296,8 +308,8 @@ def virtual(state: State) -> Virtual | None:
     if tie is None or state.light is None or state.light.result.fix is not Fix.GOOD:
         return None
     wheels = state.light.told
-    lights = across_the_row(state, state.light.result)
-    _, factor = doubted_covariance(tie, lights, wheels)
+    lights = across_the_row(state.light.filter.catalogue, state.light.result)
+    _, factor = doubted_covariance(lights, tie.way - tie.way_young, wheels)
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     T_map_base = lights.T_map_base.copy()
     if not wheels:  # the pose's heading is the better guess, by which the submap's origin is found from here
@@ -320,25 +332,6 @@ def begun_anew(state: State, lights: LightsResult) -> bool:
     return not (known and lights.covariance[0, 0] + lights.covariance[1, 1] < KNOWN[0] + KNOWN[1])
 
 
-def doubted(tie: Absolute, lights: LightsResult, wheels: bool = True) -> LightsResult:
-    """The lights' result with less trust in it; no heading is less certain than one that may be any."""
-    P, factor = doubted_covariance(tie, lights, wheels)
-    return replace(lights, covariance=P, gained=lights.gained / factor)
-
-
-def doubted_covariance(tie: Absolute, lights: LightsResult, wheels: bool = True) -> tuple[Array, float]:
-    """Its covariance alone, and by how much it has been raised."""
-    factor = TRUST + YOUNG * math.exp((tie.way_young - tie.way) / YOUNG_M)
-    factor *= 1.0 if wheels else UNGUIDED
-    P = lights.covariance * factor
-    heading = float(P[2, 2])
-    if heading > ANY_HEADING:
-        most = math.sqrt(ANY_HEADING / heading)
-        P[2] *= most
-        P[:, 2] *= most
-    return P, factor
-
-
 def holds_heading(state: State) -> bool:
     """Whether the laser holds a heading that light has proved, and light has nothing as good.
 
@@ -348,28 +341,6 @@ def holds_heading(state: State) -> bool:
     tie = state.absolute
     assert tie is not None
     return tie.proved and not tie.broken and not blind(state) and not (state.light is not None and state.light.told)
-
-
-def without_heading(lights: LightsResult) -> LightsResult:
-    """The lights' result with a heading that may be any: its position corrects the pose's heading by the way."""
-    P = lights.covariance.copy()
-    P[2, :2] = P[:2, 2] = 0.0
-    P[2, 2] = ANY_HEADING
-    keep = invert3(P) @ lights.covariance
-    made = np.array((lights.gained_by[0], lights.gained_by[1], 0.0))
-    return replace(lights, covariance=P, gained=symmetric(keep @ lights.gained @ keep.T), gained_by=made)
-
-
-def across_the_row(state: State, lights: LightsResult) -> LightsResult:
-    """The lights' result, trusted less across the row where all lamps in use stand in one."""
-    assert state.light is not None
-    more = doubt(state.light.filter.catalogue, lights.accepted)
-    if not more.any():
-        return lights
-    P = lights.covariance + more
-    keep = invert3(P) @ lights.covariance
-    made = keep.T @ lights.gained_by  # what is told must go with what it weighs: else each wander across adds up
-    return replace(lights, covariance=P, gained=symmetric(keep @ lights.gained @ keep.T), gained_by=made)
 
 
 def blind(state: State) -> bool:

@@ -235,6 +235,8 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
         places=adrift.places(state),
+        apart=absolute.apart(state),
+        misplaced=misplaced(state),
         aside=state.atlas.aside is not None,
         let_go=state.let_go,
         lag=state.lag.told,
@@ -242,6 +244,15 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         anew=state.anew,
         protection=protection.bound(state, P),
     )
+
+
+def misplaced(state: State) -> bool:
+    """Whether light receives what it cannot receive at the pose; see :func:`estimator.relocate_light.misplaced`."""
+    if state.light is None or state.absolute is None or not state.absolute.placed:
+        return False
+    from estimator import relocate_light  # costs nothing where there is no photodiode
+
+    return relocate_light.misplaced(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
 
 
 def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:

@@ -13,7 +13,7 @@ separation, Blanch et al., NAVIGATION 2010; docs/integrity.md has the derivation
 Where there is one witness only nothing can be separated, and the first bound is widened instead. Laser and light share
 the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself. Without wheels they share
 the laser's way (`guide`): a laser that slides leads light along until lamps have corrected it, for which the level
-believes its position less (`absolute.UNGUIDED`); and of the heading the laser is the only witness.
+believes its position less (`lights_trust.UNGUIDED`); and of the heading the laser is the only witness.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from typing import Final
 import numpy as np
 
 from estimator import se2
-from estimator.absolute import doubted_covariance, pose_at
+from estimator.absolute import pose_at
+from estimator.lights_trust import doubted_covariance
 from estimator.records import Array
 from estimator.result import Fix, Protection
 from estimator.state import State
@@ -102,7 +103,7 @@ def _without_laser(state: State) -> tuple[float, float]:
     assert tie is not None
     assert light is not None
     wheels = on_wheels(state)
-    said, (covered, _) = light.result, doubted_covariance(tie, light.result, wheels)
+    said, (covered, _) = light.result, doubted_covariance(light.result, tie.way - tie.way_young, wheels)
     here = se2.compose(state.T_map_odom, pose_at(state, max(said.t_mono, said.t_pose)))
     off = said.T_map_base - here
     far, turned = spread(covered, K_FAULT)

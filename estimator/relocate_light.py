@@ -53,6 +53,10 @@ HEADED_M: Final = 3.0
 it by how the robot moves, and with wheels that turn, or walls that reflect, young hypotheses of it go astray together.
 The laser sees it at once, and where it sees two it goes on looking."""
 
+UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING, LinkState.UNSURVEYED, LinkState.TWIN)
+"""States of a link that say nothing of where the receiver is."""
+MISPLACED: Final = 2
+"""So many lamps that cannot be received at a pose are no lamp that was moved, nor two that were exchanged."""
 NEARER_M: Final = 1.0
 STRONGER: Final = 2.0
 """A lamp that is received so many times stronger than it can be within the former of a place is not received there."""
@@ -136,6 +140,22 @@ def out_of_place(state: State, T_map_base: Array) -> bool:
     and not the heading, of which strengths know nothing. Of lamps of one code the nearest counts.
     """
     return any(received(state, T_map_base))
+
+
+def misplaced(state: State, T_map_base: Array) -> bool:
+    """Whether most of the lamps received, two at least, are stronger than they can be about a pose.
+
+    What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
+    not the most of them: so it is the robot that is elsewhere, whatever the `lights` filter has made of it so far.
+    """
+    if state.light is None:
+        return False
+    result = state.light.result
+    heard = sum(link.state not in UNHEARD for link in result.links)
+    if heard < MISPLACED or 2 * len(result.accepted) >= heard:
+        return False  # what is used fits where the filter is, and that this is here is asked of the pose: costs less
+    strong = received(state, T_map_base)
+    return sum(strong) >= MISPLACED and 2 * sum(strong) > len(strong)
 
 
 def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:

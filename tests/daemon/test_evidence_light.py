@@ -89,6 +89,19 @@ def test_a_contradiction_is_a_gap_or_lamps_that_do_not_fit(
     assert Watch().light(result(lights, gap=gap), EPOCH).agrees is agrees
 
 
+def test_pose_and_light_that_agree_may_be_apart_while_samples_arrive() -> None:
+    watch, apart = Watch(), replace(result(lit()), apart=True)
+    assert watch.light(apart, EPOCH).apart
+    assert not watch.light(result(lit()), EPOCH).apart
+    assert not watch.light(apart, dt=LIGHT_SILENT_S + 0.1).apart
+
+
+def test_lamps_that_cannot_be_received_at_the_pose_contradict_it_whatever_light_makes_of_them() -> None:
+    for gap in (None, 0.1):
+        seen = Watch().light(replace(result(lit(Fix.STARTING), gap=gap), misplaced=True), EPOCH)
+        assert (seen.elsewhere, seen.agrees) == (True, False)
+
+
 def test_lamps_that_fit_again_and_wait_to_be_used_do_not_contradict() -> None:
     fits = replace(links(LinkState.OCCLUDED)[0], residual=0.01, sigma=0.01)
     hidden, strange = replace(fits, residual=-0.5), replace(fits, state=LinkState.REJECTED)

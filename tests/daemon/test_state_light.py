@@ -9,7 +9,7 @@ from daemon.reasons import Reason
 from daemon.state import judge
 from daemon.state_evidence import Evidence, Light
 from daemon.state_memory import DARK_S, Memory
-from tests.daemon.judged import ALL, BAD, LIT, PERIOD, run, said, scans
+from tests.daemon.judged import ALL, BAD, LIT, PERIOD, run, said, scans, seen
 
 
 def lit(count: int = 40, light: Light = LIT, **more: object) -> Memory:
@@ -47,6 +47,35 @@ def test_a_pose_that_light_contradicts_is_not_tracked() -> None:
     memory = run(memory, scans(4.2, 3, light=odd))
     assert said(memory) == (State.DEGRADED, Reason.LIGHT_DISAGREES)
     assert run(memory, scans(4.5, 20, light=LIT)).state is State.TRACKING
+
+
+def test_lamps_that_cannot_be_received_here_end_tracking_after_two_epochs() -> None:
+    elsewhere = replace(LIT, used=False, agrees=False, elsewhere=True)
+    epochs = [seen(4.0 + 0.05 * i, light=elsewhere) for i in range(2)]
+    assert run(lit(), epochs[:1]).state is State.TRACKING
+    assert said(run(lit(), epochs)) == (State.DEGRADED, Reason.LIGHT_DISAGREES)
+    assert (
+        run(lit(), [replace(one, light=replace(elsewhere, elsewhere=False)) for one in epochs]).state is State.TRACKING
+    )
+
+
+def test_tracking_is_not_begun_while_pose_and_light_are_apart_and_goes_on() -> None:
+    apart = replace(LIT, apart=True)
+    assert said(lit(80, light=apart)) == (State.MAPPING, Reason.UNPROVED)
+    assert said(run(lit(80, light=apart), scans(8.0, 1, light=LIT))) == (State.TRACKING, Reason.NONE)
+    assert run(lit(), scans(4.0, 80, light=apart)).state is State.TRACKING
+    vague = lit(sigma_rad=0.1)
+    assert said(run(vague, scans(4.0, 80, light=apart))) == (State.DEGRADED, Reason.CONFIRMING)
+
+
+def test_tracking_of_a_place_that_was_tracked_before_waits_for_nobody() -> None:
+    apart = replace(LIT, apart=True)
+    for broken in ({"sigma_rad": 0.1}, {"silence": 5.0, "match": None}):
+        assert run(run(lit(), scans(4.0, 9, light=LIT, **broken)), scans(4.9, 80, light=apart)).state is State.TRACKING
+    doubted = run(lit(), scans(4.0, 10, light=replace(LIT, agrees=False)))
+    doubted = run(doubted, scans(5.0, 1, light=replace(LIT, moved=True)))
+    assert run(doubted, scans(5.1, 80, light=LIT)).state is State.TRACKING
+    assert run(doubted, scans(5.1, 80, light=apart)).state is State.DEGRADED, "another place, to be proved anew"
 
 
 def test_after_light_has_moved_the_pose_the_place_is_proved_for_longer() -> None:

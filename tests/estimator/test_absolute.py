@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from estimator import absolute, se2
+from estimator.lights_trust import across_the_row
 from estimator.pipeline import State, keyframe_poses, step
 from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
 from estimator.result import SURPRISE, Fix, LightsResult
 from estimator.row import doubt
+from estimator.swing import SWING_RAD
 from tests.estimator.lit import Log, Truth, lit_state, play, scans, together
 from tools.sim.buildings import building
 from tools.sim.ceiling import ceiling_of
@@ -293,19 +295,37 @@ def lights_at(T: Array, accepted: frozenset[int], state: State) -> LightsResult:
     return LightsResult(now, Fix.GOOD, T, P, (), accepted, nothing, np.zeros(3), t_pose=now)
 
 
+def test_pose_and_light_are_apart_where_they_agree_worse_than_by_chance_or_light_swings(
+    driven: tuple[State, Log],
+) -> None:
+    state = copy.deepcopy(driven[0])
+    tie = state.absolute
+    assert tie is not None
+    assert not absolute.apart(state), "after a whole drive in good light"
+    tie.gap = absolute.APART + 0.1
+    assert absolute.apart(state)
+    tie.gap = 0.0
+    tie.swing.take(tie.way, 0.0)
+    tie.swing.take(tie.way, SWING_RAD + 0.01)
+    assert absolute.apart(state)
+    tie.gap = None  # light says nothing now
+    assert not absolute.apart(state)
+
+
 def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> None:
     """Lamps 1 to 4 hang along x: y and heading are doubted, x is not; with lamp 16 as well nothing is."""
     state, T = driven[0], driven[1].results[-1].T_map_odom
-    lamps = state.light.filter.catalogue.by_id  # type: ignore[union-attr]  # lit
+    catalogue = state.light.filter.catalogue  # type: ignore[union-attr]  # lit
+    lamps = catalogue.by_id
     assert len({round(lamps[k].y, 2) for k in (1, 2, 3, 4)}) == 1
-    row = absolute.across_the_row(state, lights_at(T, frozenset((1, 2, 3, 4)), state))
+    row = across_the_row(catalogue, lights_at(T, frozenset((1, 2, 3, 4)), state))
     assert np.sqrt(np.diag(row.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
     told = lights_at(T, frozenset((1, 2, 3, 4)), state)
     told = replace(told, gained=0.5 * np.linalg.inv(told.covariance), gained_by=np.array((0.02, 0.1, 0.0)))
-    row = absolute.across_the_row(state, told)
+    row = across_the_row(catalogue, told)
     x, y, _ = (np.linalg.inv(row.covariance) @ row.gained_by / np.diag(row.gained)).tolist()
     assert (x, y) == pytest.approx((0.04, 0.2), rel=0.05), "a correction goes with what it weighs, along and across"
-    grid = absolute.across_the_row(state, lights_at(T, frozenset((1, 4, 13, 16)), state))
+    grid = across_the_row(catalogue, lights_at(T, frozenset((1, 4, 13, 16)), state))
     assert np.sqrt(np.diag(grid.covariance)) == pytest.approx((0.05, 0.05, 0.02), abs=0.005)
 
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from estimator import protection
-from estimator.absolute import Absolute, holds_heading, without_heading
+from estimator.absolute import Absolute, holds_heading
 from estimator.cdma_epoch import BlockFlag
 from estimator.frozen import FROZEN_M, Frozen
 from estimator.fusion import covariance
 from estimator.lamps import Survey
 from estimator.light import LightsSetup
+from estimator.lights_trust import without_heading
 from estimator.linear3 import invert3
 from estimator.protection import ALONE, FAULTY, K_FAULT, K_PLAIN, RISK, UNKNOWN_M, bound, spread
 from estimator.records import Array

@@ -19,13 +19,16 @@ from estimator.records import UNLIMITED, Array, LightEpoch, Odometry
 from estimator.relocate_light import (
     AGAINST,
     HEADED_M,
+    MISPLACED,
     Window,
     compatible,
     disputed,
     elsewhere,
     glimpsed,
     in_place,
+    misplaced,
     out_of_place,
+    received,
     told,
     windows,
     witness,
@@ -315,6 +318,37 @@ def test_lamps_that_cannot_be_received_here_say_that_the_robot_is_elsewhere(bear
     assert out_of_place(state, HERE + 5.0 * way)
     state.light.filter.course.t_mono += 5.0  # type: ignore[union-attr]  # what was received then
     assert not out_of_place(state, HERE + 5.0 * way)
+
+
+def unused(state: State) -> State:
+    """As after the robot was carried off: the filter uses none of the lamps that are received."""
+    light = state.light
+    assert light is not None
+    links = tuple(replace(link, state=LinkState.RIM) for link in light.result.links)
+    light.result = replace(light.result, links=links, accepted=frozenset())
+    return state
+
+
+def test_most_lamps_out_of_place_say_that_the_pose_is_wrong() -> None:
+    state, away = shown(robot()), HERE + np.array((5.0, 0.0, 0.0))
+    assert sum(received(state, away)) >= MISPLACED
+    assert not misplaced(state, away)  # the lamps in use fit where the filter is; the gap to the pose says the rest
+    assert misplaced(unused(state), away)
+    assert not misplaced(state, HERE)
+
+
+def test_lamps_exchanged_or_moved_are_not_most_of_them() -> None:
+    state = unused(shown(robot()))
+    assert state.light is not None
+    epoch = state.light.epoch
+    assert epoch is not None
+    strong = received(state, HERE)
+    for count in range(1, len(strong)):
+        amplitude = epoch.amplitude.copy()
+        amplitude[np.argsort(-amplitude)[:count]] *= 100.0
+        state.light.epoch = replace(epoch, amplitude=amplitude)
+        told = sum(received(state, HERE))
+        assert misplaced(state, HERE) == (told >= MISPLACED and 2 * told > len(strong))
 
 
 def test_a_lamp_that_was_hidden_while_it_was_learned_may_be_received_clearly_here() -> None:

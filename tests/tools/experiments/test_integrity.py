@@ -95,6 +95,24 @@ def test_every_kind_can_be_drawn_and_repeats(kind: str) -> None:
 
 
 @pytest.mark.jit
+@pytest.mark.parametrize(
+    ("kind", "seed", "until"),
+    [
+        ("kidnap_lit", 18, 29.0),  # carried off in no time to where an office looks alike
+        ("kidnap_lit", 46, 36.0),  # the same; for the lamps in use were one row, light took long to say so itself
+        ("false_lights", 59, 17.0),  # two codes exchanged from the start: the heading came 7 deg off, light found it
+    ],
+)
+def test_lamps_that_speak_against_the_pose_end_tracking_or_hold_it_back(kind: str, seed: int, until: float) -> None:
+    scene = draw(kind, seed)
+    scene.seconds = until
+    rows = run(scene)
+    found = judged(f"{kind}-{seed}", rows, np.zeros((0, 2)), (True, False, ""))
+    assert np.rad2deg(rows[rows[:, AT["t"]] > 12.0, AT["error_rad"]].max()) > 5.0, "nothing was wrong"
+    assert found.wrong_s <= 0.5
+
+
+@pytest.mark.jit
 def test_a_short_drive_tracks_and_is_kept(tmp_path: Path) -> None:
     scene = draw("clean_unlit", 0)
     scene.seconds = 8.0
