@@ -23,10 +23,10 @@ def bounded(memory: Memory, evidence: Evidence) -> bool:
 
     A bound assumes that the pose is about right and says how wrong it may be. Nothing of that kind can be said of a
     place that is being looked for, was lost, was laid upon a guess, that light contradicts or the latest scan does not
-    fit.
+    fit; nor while a heading that is still being found may be any, for where that leads no covariance says.
     """
     in_doubt = memory.doubt or memory.failed > 0 or evidence.guessed or evidence.places is not None
-    in_doubt = in_doubt or memory.odd_since is not None
+    in_doubt = in_doubt or memory.odd_since is not None or not (memory.tracked or memory.known[2])
     return memory.state in HELD and not in_doubt
 
 

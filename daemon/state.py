@@ -164,8 +164,7 @@ def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
         return State.MAPPING, Reason.UNPLACED
     if memory.state is State.TRACKING:
         return State.TRACKING, Reason.NONE
-    apart = evidence.light is not None and evidence.light.apart
-    if (memory.tracked or not apart) and (_proved(memory, evidence) or _agreed(memory, evidence)):
+    if _together(memory, evidence) and (_proved(memory, evidence) or _agreed(memory, evidence)):
         return State.TRACKING, Reason.NONE
     return (State.DEGRADED, Reason.CONFIRMING) if memory.state is State.DEGRADED else (State.MAPPING, Reason.UNPROVED)
 
@@ -193,6 +192,11 @@ def _contradicted(memory: Memory, evidence: Evidence) -> bool:
         return False
     elsewhere = evidence.light is not None and evidence.light.elsewhere
     return evidence.t_mono - memory.odd_since >= (ELSEWHERE_S if elsewhere else CONTRADICTED_S)
+
+
+def _together(memory: Memory, evidence: Evidence) -> bool:
+    """Whether pose and light have come to each other for good, or had when TRACKING was last said of this place."""
+    return memory.tracked or memory.apart_last is None or evidence.t_mono - memory.apart_last >= CLEAN_S
 
 
 def _clean(memory: Memory, evidence: Evidence) -> bool:

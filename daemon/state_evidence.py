@@ -44,7 +44,7 @@ class Light:
         agrees: whether the light's place and the pose are the same within what both may be wrong; None: cannot be said.
         moved: in this cycle the pose was moved to where light says, after the two had contradicted each other.
         elsewhere: most of the lamps that are received cannot be received at the pose.
-        apart: they are the same within that, but one of the two is still on its way.
+        apart: they are not, or are and one of the two is still on its way.
         known: (x, y, yaw) whether the pose knows the axis, with or without a laser.
     """
 

@@ -59,7 +59,7 @@ class Memory:
         sure: the pose was proved when the laser fell silent. recalled: the laser is back, and has found it there.
         lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
         odd_since: since when light has contradicted the place; both None while it does not.
-        tracked: TRACKING has been said of this place before.
+        tracked: TRACKING has been said of this place before. apart_last: when pose and light last were apart.
         led: light has moved the pose, and has not been sure of the place since.
         gone: the laser is silent. back: when it last came back, None: it has not been away. fitful: how often in a row
             it has fallen silent again soon after it was said to be back.
@@ -83,6 +83,7 @@ class Memory:
     lit_last: float | None = None
     odd_since: float | None = None
     tracked: bool = False
+    apart_last: float | None = None
     led: bool = False
     gone: bool = False
     back: float | None = None
@@ -150,6 +151,7 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
         lit_last=memory.lit_last,
         odd_since=memory.odd_since,
         tracked=memory.tracked,
+        apart_last=memory.apart_last,
         led=memory.led,
         gone=memory.gone,
         back=memory.back,
@@ -168,6 +170,8 @@ def _take_light(memory: Memory, light: Light, now: float) -> Memory:
     """Remember since when light has told the place, and since when it has contradicted the pose."""
     odd = light.agrees is False
     memory = _odd(memory, (now if memory.odd_since is None else memory.odd_since) if odd else None)
+    if light.apart:
+        memory = replace(memory, apart_last=now)
     if light.moved or light.lost:
         led = memory.led or light.moved
         memory = replace(memory, doubt=True, lit_since=None, good=0, sure=False, recalled=False, led=led)

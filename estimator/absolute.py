@@ -251,9 +251,14 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
 
 
 def apart(state: State) -> bool:
-    """Whether light and pose agree, but one of them is still on its way; False where light says nothing now."""
+    """Whether light and pose do not agree, or do and one of them is still on its way.
+
+    What light said last counts while it says nothing.
+    """
     tie = state.absolute
-    return tie is not None and tie.gap is not None and (tie.gap > APART or not tie.swing.rests)
+    if tie is None or tie.gap is None:
+        return tie is not None and tie.odd_since is not None
+    return tie.gap > APART or not tie.swing.rests
 
 
 def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:

@@ -83,12 +83,14 @@ def test_it_does_not_chatter() -> None:
     assert all(run(alarm, [0.51, 0.49] * 30, 2.0))
 
 
-HELD = Memory(State.TRACKING, Reason.NONE)
+HELD = Memory(State.TRACKING, Reason.NONE, tracked=True)
 
 
 def test_a_bound_stands_where_the_pose_is_held() -> None:
     assert bounded(HELD, Evidence(1.0))
     assert bounded(replace(HELD, state=State.DEGRADED), Evidence(1.0))
+    young = replace(HELD, state=State.DEGRADED, tracked=False)
+    assert bounded(replace(young, known=(False, False, True)), Evidence(1.0))
 
 
 @pytest.mark.parametrize("state", [s for s in State if s not in (State.TRACKING, State.DEGRADED)])
@@ -103,6 +105,7 @@ def test_no_bound_in_any_other_state(state: State) -> None:
         (HELD, Evidence(1.0, places=1)),
         (replace(HELD, doubt=True), Evidence(1.0)),
         (replace(HELD, odd_since=0.9), Evidence(1.0)),
+        (replace(HELD, tracked=False, known=(True, True, False)), Evidence(1.0)),
     ],
 )
 def test_no_bound_of_a_place_in_doubt(memory: Memory, evidence: Evidence) -> None:

@@ -62,7 +62,8 @@ def test_lamps_that_cannot_be_received_here_end_tracking_after_two_epochs() -> N
 def test_tracking_is_not_begun_while_pose_and_light_are_apart_and_goes_on() -> None:
     apart = replace(LIT, apart=True)
     assert said(lit(80, light=apart)) == (State.MAPPING, Reason.UNPROVED)
-    assert said(run(lit(80, light=apart), scans(8.0, 1, light=LIT))) == (State.TRACKING, Reason.NONE)
+    assert run(lit(80, light=apart), scans(8.0, 9, light=LIT)).state is State.MAPPING, "one epoch that fits is none"
+    assert said(run(lit(80, light=apart), scans(8.0, 11, light=LIT))) == (State.TRACKING, Reason.NONE)
     assert run(lit(), scans(4.0, 80, light=apart)).state is State.TRACKING
     vague = lit(sigma_rad=0.1)
     assert said(run(vague, scans(4.0, 80, light=apart))) == (State.DEGRADED, Reason.CONFIRMING)

@@ -310,6 +310,8 @@ def test_pose_and_light_are_apart_where_they_agree_worse_than_by_chance_or_light
     assert absolute.apart(state)
     tie.gap = None  # light says nothing now
     assert not absolute.apart(state)
+    tie.odd_since = state.fused.t_mono - 1.0  # and the last that it said was that the pose is wrong
+    assert absolute.apart(state)
 
 
 def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> None:
