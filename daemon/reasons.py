@@ -57,7 +57,10 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.NO_WITNESS: ("nothing has confirmed the pose for too long", "set the pose, or drive to where it was known"),
     Reason.SEVERAL_PLACES: ("several places fit", "drive on until one is left"),
     Reason.SEARCHING: ("looking for the place in the map", "wait; where it lasts, drive a metre or two"),
-    Reason.CONFIRMING: ("scans fit again; being confirmed", "wait a few seconds; where it lasts, drive a metre or two"),
+    Reason.CONFIRMING: (
+        "scans fit again, or light and pose draw together; being confirmed",
+        "wait a few seconds; where it lasts, drive a metre or two",
+    ),
     Reason.LIGHT_SILENT: (
         "the photodiode is configured and its samples do not arrive",
         "check its converter's power and bus; read the fault",

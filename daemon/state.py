@@ -133,7 +133,8 @@ def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[Sta
     if evidence.sigma_m > VAGUE_M or evidence.sigma_rad > VAGUE_RAD or not all(memory.known):
         return State.DEGRADED, Reason.UNCERTAIN
     proof = RELOCATED_PROOF_S if memory.doubt else PROOF_S
-    if memory.lit_since is not None and evidence.t_mono - memory.lit_since >= proof:
+    proved = memory.lit_since is not None and evidence.t_mono - memory.lit_since >= proof
+    if proved and (memory.state is State.TRACKING or _together(memory, evidence)):
         return State.TRACKING, Reason.NONE
     return State.DEGRADED, Reason.CONFIRMING
 
