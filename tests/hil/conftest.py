@@ -167,10 +167,16 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     title = (inspect.getdoc(getattr(item, "obj", None)) or item.name).splitlines()[0].rstrip(".")
     skipped = report.longrepr[2].removeprefix("Skipped: ") if report.skipped else ""
     said = "\n".join([*telling.lines, *([report.longreprtext[-3000:]] if report.failed else [])])
-    name = item.nodeid.rpartition("/")[2]
+    name = result_name(item.nodeid)
     item.config.stash[RESULTS][name] = Result(
         name, title, report.passed, report.duration, said, skipped, tuple(telling.figures), tuple(telling.plots)
     )
+
+
+def result_name(nodeid: str) -> str:
+    """Of a test: its file without the folders, and all of what follows, slashes of a parameter too."""
+    file, *rest = nodeid.split("::", 1)
+    return "::".join([file.rpartition("/")[2], *rest])
 
 
 @pytest.hookimpl(trylast=True)

@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from tests.hil.conftest import result_name
 from tests.hil.ends import AdcEnd, operator_for, where_on_a_bus
 from tests.hil.programs import ROOT, free_port, program, served_lidar, served_receiver
 
@@ -182,6 +183,14 @@ def test_a_report_that_cannot_be_is_refused_before_anything_is_tried(options: li
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/hil", "-k", "light_levels"]
     done = subprocess.run([*words, *options], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, says in done.stderr) == (4, True), done.stderr
+
+
+def test_a_result_is_named_with_all_of_its_parameters() -> None:
+    """Two that differ behind a slash are two, in the report and to what a later run is compared with."""
+    for parameter in ("tcp://h/1", "a::/dev/ttyACM0"):
+        name = f"test_lidar.py::test_line[{parameter}]"
+        assert result_name(f"tests/hil/{name}") == name
+    assert result_name("tests/hil/test_lidar.py") == "test_lidar.py"
 
 
 STARTS = """
