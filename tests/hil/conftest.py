@@ -14,6 +14,7 @@ import pytest
 
 from hal.errors import HalError
 from tests.hil.ends import FAKE, AdcEnd, LidarEnd, Operator, operator_for, where_on_a_bus
+from tests.hil.presence import Presence
 from tests.hil.programs import Served, program, served_lidar
 from tests.hil.walking import Walked, walk_real, walk_simulated
 from tools.bench.plots import Plot
@@ -21,6 +22,7 @@ from tools.bench.report import About, CannotCompare, Figure, Result, facts, read
 
 KINDS = ("motion", "light", "operator")
 TELLING = pytest.StashKey["Telling"]()
+PRESENCE = pytest.StashKey[Presence]()
 RESULTS = pytest.StashKey[dict[str, Result]]()
 
 
@@ -54,23 +56,20 @@ def told(request: pytest.FixtureRequest) -> Telling:
 
 @pytest.fixture
 def lidar(request: pytest.FixtureRequest) -> LidarEnd:
-    name = str(request.config.getoption("--lidar"))
-    _needs(request, name)
+    name = _device(request, "lidar")
     return LidarEnd(name, _operator(request))
 
 
 @pytest.fixture
 def adc(request: pytest.FixtureRequest) -> AdcEnd:
-    name = str(request.config.getoption("--adc"))
-    _needs(request, name)
+    name = _device(request, "adc")
     return AdcEnd(name, _operator(request))
 
 
 @pytest.fixture
 def served(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Served]:
     """The lidar as other programs open it: the real one's name, or the fake as a process with a pty."""
-    name = str(request.config.getoption("--lidar"))
-    _needs(request, name)
+    name = _device(request, "lidar")
     if name != FAKE:
         yield Served(name, _operator(request), tmp_path)
         return
@@ -81,8 +80,7 @@ def served(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Served]:
 @pytest.fixture
 def walk(request: pytest.FixtureRequest, lumiloop: list[str], tmp_path: Path) -> Walked:
     """A walk with odometry, recorded by the program under test."""
-    name = str(request.config.getoption("--lidar"))
-    _needs(request, name)
+    name = _device(request, "lidar")
     if name == FAKE:
         return walk_simulated(lumiloop, tmp_path)
     port, seconds = request.config.getoption("--odometry-port"), request.config.getoption("--walk-s")
@@ -97,6 +95,15 @@ def lumiloop(request: pytest.FixtureRequest) -> list[str]:
 
 def _operator(request: pytest.FixtureRequest) -> Operator | None:
     return operator_for(str(request.config.getoption("--operator")))
+
+
+def _device(request: pytest.FixtureRequest, option: str) -> str:
+    """The device that an option names, where this test can be tried on it; else the test fails or is skipped."""
+    name = str(request.config.getoption(f"--{option}"))
+    _needs(request, name)
+    if name != FAKE:
+        request.config.stash[PRESENCE].demand(option, name)
+    return name
 
 
 def _needs(request: pytest.FixtureRequest, device: str) -> None:
@@ -138,6 +145,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 def pytest_configure(config: pytest.Config) -> None:
     """See early that options say something, that the run to compare with can be read, and the report be written."""
     config.stash[RESULTS] = {}
+    config.stash[PRESENCE] = Presence()
     where_on_a_bus(str(config.getoption("--adc")))
     _there(config)
     folder = config.getoption("--hil-report")
@@ -163,6 +171,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     report = (yield).get_result()
     if report.when != "call" and report.passed:
         return
+    if report.failed:
+        item.config.stash[PRESENCE].doubt()
     telling = item.stash.get(TELLING, Telling())
     title = (inspect.getdoc(getattr(item, "obj", None)) or item.name).splitlines()[0].rstrip(".")
     skipped = report.longrepr[2].removeprefix("Skipped: ") if report.skipped else ""

@@ -17,6 +17,9 @@ from xml.etree import ElementTree
 
 import pytest
 
+from hal.errors import DeviceMissing, HalError
+from hal.photodiode.probe import BusFinding, Chip
+from tests.hil import presence
 from tests.hil.conftest import result_name
 from tests.hil.ends import AdcEnd, operator_for, where_on_a_bus
 from tests.hil.programs import ROOT, free_port, program, served_lidar, served_receiver
@@ -150,6 +153,54 @@ def test_what_cannot_be_is_said_or_skipped_with_its_reason(tmp_path: Path) -> No
     assert len(skipped) == 3
     assert skipped["test_photodiode.py::test_light_levels"].startswith("needs light on unix:")
     assert "--operator terminal" in skipped["test_lidar.py::test_is_unplugged_and_plugged_in_again"]
+
+
+def test_a_device_that_is_not_there_is_said_once_and_no_other_test_of_it_is_run(tmp_path: Path) -> None:
+    """In the reports, too: one failure with its remedy; what was not run says for what reason."""
+    missing = ["--lidar", "/dev/ttyNOPE", "--adc", "/dev/i2c-NOPE@0x4d", "--have", "light"]
+    code, said, results = suite(tmp_path, *missing, "-k", "lidar or photodiode")
+    assert (code, said.count("ERROR at setup")) == (1, 2), said
+    for option, problem, remedy in (
+        ("lidar", "/dev/ttyNOPE: no such device", "plug the sensor in"),
+        ("adc", "/dev/i2c-NOPE: no such bus", "enable I2C"),
+    ):
+        (failed,) = [one for one in results.values() if one["said"].startswith(f"--{option}=/dev/")]
+        assert f"no test of it is run: {problem} ({remedy}" in failed["said"]
+        assert sum(one["skipped"] == f"not run: {problem}" for one in results.values()) >= 2
+        assert said.count(remedy) == 1, said
+    root = ElementTree.parse(tmp_path / "report" / "junit.xml").getroot()
+    assert root.get("failures") == "2"
+    assert "not run: /dev/ttyNOPE: no such device" in {case.get("message") for case in root.iter("skipped")}
+    assert "not run: /dev/ttyNOPE: no such device" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_a_device_that_has_gone_in_the_middle_is_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers: list[HalError | None] = [None, DeviceMissing("line", "gone")]
+    monkeypatch.setitem(presence.LACKS, "lidar", lambda name: answers.pop(0))
+    seen = presence.Presence()
+    seen.demand("lidar", "line")
+    seen.demand("lidar", "line")
+    seen.doubt()
+    with pytest.raises(pytest.fail.Exception, match="line: gone"):
+        seen.demand("lidar", "line")
+    with pytest.raises(pytest.skip.Exception, match="not run: line: gone"):
+        seen.demand("lidar", "line")
+
+
+@pytest.mark.parametrize(
+    ("there", "says"), [((), "check power"), ((Chip(0x4E, "MCP3221"),), "name one of 0x4e with --adc")]
+)
+def test_a_converter_that_is_not_at_its_address_is_missing(
+    there: tuple[Chip, ...], says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def probe(opener: object, bus: str) -> BusFinding:
+        return BusFinding(bus, chips=there)
+
+    monkeypatch.setattr(presence, "probe_bus", probe)
+    error = presence.adc_lacks("unix:/bus@0x4d")
+    assert "nothing answers at 0x4d" in str(error)
+    assert says in str(error)
+    assert presence.adc_lacks("unix:/bus@0x4e") is None or not there
 
 
 def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Path) -> None:
