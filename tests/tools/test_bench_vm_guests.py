@@ -177,6 +177,16 @@ def test_a_computer_that_has_ended_leaves_what_was_seen(tmp_path: Path, monkeypa
     assert "seen QEMU has ended with -9" in said
 
 
+def test_a_computer_without_a_folder_to_work_in_says_what_was_not_run(tmp_path: Path) -> None:
+    """A share that is not in the results would be taken for one that has passed."""
+    guest, told = Guest(1, [like(passes), passes]), []
+    with pytest.raises(FileNotFoundError):
+        guest.run(kept(tmp_path), tmp_path / "gone" / "1", tmp_path, told.append)
+    assert [one.outcome for one in guest.results] == ["skipped", "skipped"]
+    assert all("the bench has met an error of its own" in text for text in told)
+    assert len(told) == 2
+
+
 def test_what_takes_time_to_ask_for_is_asked_for_where_it_is_told() -> None:
     asked: list[int] = []
     common.need(True, lambda: f"{asked.append(1)}")

@@ -79,9 +79,9 @@ class Guest:
 
     def run(self, booted: Booted, folder: Path, out: Path, say: Say) -> None:
         """Try them, until it ends or is broken off; its console and its journal stay in ``out``."""
-        folder.mkdir()
         why = "the bench has met an error of its own, which it has written"
         try:
+            folder.mkdir()
             with bench(booted, folder, self.broken_off, BEHIND.get(self.number, 0)) as whole:
                 for scenario in self.share:
                     before = whole.machine.worked_s()
