@@ -81,8 +81,9 @@ def judged(blessed: Golden, trajectory: Trajectory, loops: Sequence[Loop], every
     wrong = []
     if blessed.facts["poses"] != str(len(trajectory.stamps)):
         wrong.append(f"{len(trajectory.stamps)} poses, {blessed.facts['poses']} when blessed")
-    if not off <= (TIGHT_M if here else LOOSE_M):
-        wrong.append(f"moved by {off:.6f} m")
+    limit = TIGHT_M if here else LOOSE_M
+    if not off <= limit:
+        wrong.append(f"moved by up to {off:.6f} m, {begun(blessed, trajectory, every, limit)}")
     if blessed.facts["loops"] != loops_of(loops):
         wrong.append(f"loops {loops_of(loops)}, {blessed.facts['loops']} when blessed")
     if here and blessed.facts["digest"] != digest(trajectory):
@@ -150,11 +151,41 @@ def largest_difference(golden: Golden, trajectory: Trajectory, every: int, motio
     ``motion``: between the motions from each kept pose to the next, which forget what was long ago.
     """
     stamps, poses = thinned(trajectory, every)
-    if len(stamps) != len(golden.stamps) or np.abs(stamps - golden.stamps).max() > 2e-6:
+    if _other_stamp(golden, stamps) is not None:
         return float("inf")
     off = _motion(poses) - _motion(golden.poses) if motion else poses - golden.poses
+    return float(_metres(off).max(initial=0.0))
+
+
+def begun(golden: Golden, trajectory: Trajectory, every: int, limit: float) -> str:
+    """In words: the first kept pose that is off by more than ``limit`` m, or the first stamp that is another one.
+
+    These are poses as they are at the end: a loop moves what was before it, too.
+    """
+    stamps, poses = thinned(trajectory, every)
+    other = _other_stamp(golden, stamps)
+    if other is not None:
+        now, then = (f"{of[other]:.6f}" if other < len(of) else "no more" for of in (stamps, golden.stamps))
+        return f"kept stamp {other} is the first that differs: {now}, {then} when blessed"
+    metres = _metres(poses - golden.poses)
+    first = int(np.argmax(~(metres <= limit)))  # what is no number is off, too
+    after = f", {stamps[first - 1]:.6f} was the last as blessed" if first else ""
+    return f"first at stamp {stamps[first]:.6f} by {metres[first]:.6f} m{after}"
+
+
+def _other_stamp(golden: Golden, stamps: Array) -> int | None:
+    """The first kept stamp that is not the blessed one; None: all are the same."""
+    both = min(len(stamps), len(golden.stamps))
+    differ = np.flatnonzero(np.abs(stamps[:both] - golden.stamps[:both]) > 2e-6)
+    if differ.size:
+        return int(differ[0])
+    return None if len(stamps) == len(golden.stamps) else both
+
+
+def _metres(off: Array) -> Array:
+    """Of each difference of two poses, a radian for a metre."""
     turn = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    return float(np.maximum(np.hypot(off[:, 0], off[:, 1]), np.abs(turn)).max(initial=0.0))
+    return np.asarray(np.maximum(np.hypot(off[:, 0], off[:, 1]), np.abs(turn)))
 
 
 def _motion(poses: Array) -> Array:

@@ -60,7 +60,9 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
         moved = replace(blessed, facts=facts, poses=blessed.poses + np.array((off_m, 0.0, 0.0)))
         monkeypatch.setattr(golden, "load", lambda name, moved=moved: moved)
         assert main(["room"]) == 1
-        assert "MOVED" in capsys.readouterr().out
+        told = capsys.readouterr().out
+        assert "MOVED" in told
+        assert f"first at stamp {blessed.stamps[0]:.6f} by {off_m:.6f} m" in told
     near = replace(moved, poses=blessed.poses + np.array((0.9e-3, 0.0, 0.0)))
     monkeypatch.setattr(golden, "load", lambda name: near)
     assert main(["room"]) == 0
@@ -147,7 +149,8 @@ def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pyte
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same, "another loop"
     away = golden.judged(blessed, Trajectory(np.arange(25.0), moved), [], 10)
     assert not away.same
-    assert "same machine: moved by 0.000002 m" in away.said
+    assert "same machine: moved by up to 0.000002 m, first at stamp 20.000000 by 0.000002 m" in away.said
+    assert "10.000000 was the last as blessed" in away.said
     monkeypatch.setattr(golden, "environment", lambda: "another processor")
     assert golden.judged(blessed, Trajectory(np.arange(25.0), between), [], 10).same
     near, far = (poses + np.array((0.0, off, 0.0)) for off in (0.9e-3, 1.1e-3))
@@ -155,3 +158,26 @@ def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pyte
     assert not golden.judged(blessed, Trajectory(np.arange(25.0), far), [], 10).same
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same
     assert golden.largest_difference(blessed, Trajectory(np.arange(24.0), poses[:24]), 10) == float("inf")
+
+
+def test_what_moved_says_where_that_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(golden, "FOLDER", tmp_path)
+    stamps, poses = np.arange(100.0, 150.0), np.zeros((50, 3))
+    trajectory = Trajectory(stamps, poses)
+    golden.save("x", trajectory, 10, golden.facts_of(trajectory, [], "a log", "a test"))
+    blessed = golden.load("x")
+
+    def said(stamps: np.ndarray, poses: np.ndarray) -> str:
+        return golden.judged(blessed, Trajectory(stamps, poses), [], 10).said
+
+    moved = poses.copy()
+    moved[20:] = (0.0, 0.0, -0.01)  # a turn alone moves the pose, too
+    moved[40:] = (0.0, 0.5, 0.0)
+    assert "moved by up to 0.500000 m, first at stamp 120.000000 by 0.010000 m" in said(stamps, moved)
+    late = stamps + np.where(np.arange(50) < 30, 0.0, 0.1)
+    assert "kept stamp 3 is the first that differs: 130.100000, 130.000000 when blessed" in said(late, poses)
+    longer = np.arange(100.0, 161.0)
+    assert "kept stamp 5 is the first that differs: 150.000000, 149.000000 when" in said(longer, np.zeros((61, 3)))
+    assert "kept stamp 5 is the first that differs: no more, 149.000000 when" in said(stamps[:41], poses[:41])
+    moved[30, 0] = np.nan
+    assert "first at stamp 120.000000" in said(stamps, moved)
