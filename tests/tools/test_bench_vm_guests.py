@@ -179,7 +179,8 @@ def test_a_computer_that_has_ended_leaves_what_was_seen(tmp_path: Path, monkeypa
 
 def test_a_computer_without_a_folder_to_work_in_says_what_was_not_run(tmp_path: Path) -> None:
     """A share that is not in the results would be taken for one that has passed."""
-    guest, told = Guest(1, [like(passes), passes]), []
+    told: list[str] = []
+    guest = Guest(1, [like(passes), passes])
     with pytest.raises(FileNotFoundError):
         guest.run(kept(tmp_path), tmp_path / "gone" / "1", tmp_path, told.append)
     assert [one.outcome for one in guest.results] == ["skipped", "skipped"]
