@@ -1,6 +1,7 @@
 #!/bin/sh
 # Installs lumiloop into a virtual environment of its own, with its units, rules and example configuration; or removes
-# exactly that. `make install` and `make uninstall` call it, and the Debian package is what it yields.
+# exactly that. `make install` and `make uninstall` call it, and the Debian package is what it yields. `install.sh files`
+# lays down all but the environment, which stays as it is.
 #
 #   DESTDIR   put everything below this directory (a package's root); empty: into the system
 #   PREFIX    the virtual environment, default /opt/lumiloop
@@ -72,6 +73,7 @@ files() {
     put 644 systemd/lumiloop.sysusers /usr/lib/sysusers.d/lumiloop.conf
     put 644 README.md /usr/share/doc/lumiloop/README.md
     put 644 LICENSE /usr/share/doc/lumiloop/copyright
+    ln -sfn copyright "$DESTDIR/usr/share/doc/lumiloop/LICENSE" # as README.md names it
     for example in port-502 stream-group; do
         put 644 systemd/drop-ins/$example.conf /usr/share/doc/lumiloop/examples/$example.conf
     done
@@ -88,6 +90,9 @@ files() {
         if [ -f "$program" ]; then put 644 "${program#"$SOURCE/"}" "/usr/share/doc/lumiloop/${program#"$SOURCE/"}"; fi
     done
     ln -sfn examples "$DESTDIR/usr/share/doc/lumiloop/systemd" # as the pages name them
+    for code in "$ROOT"/lib/python3*/site-packages/estimator; do # relative: it holds below DESTDIR, too
+        if [ -d "$code" ]; then ln -sfnr "$code" "$DESTDIR/usr/share/doc/lumiloop/estimator"; fi
+    done
     if [ ! -e "$DESTDIR/etc/lumiloop/lumiloop.toml" ]; then
         put 644 systemd/lumiloop.toml /etc/lumiloop/lumiloop.toml
     fi
@@ -116,6 +121,9 @@ case "${1:-}" in
             say "installed; edit /etc/lumiloop/lumiloop.toml, then: systemctl enable --now lumiloop"
         fi
         ;;
+    files)
+        files
+        ;;
     uninstall)
         ours
         if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
@@ -138,5 +146,5 @@ case "${1:-}" in
             say "removed; configuration, maps and recordings stay (PURGE=1 removes them too)"
         fi
         ;;
-    *) fail "usage: $0 install | uninstall" ;;
+    *) fail "usage: $0 install | files | uninstall" ;;
 esac

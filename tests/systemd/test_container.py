@@ -19,6 +19,7 @@ import pytest
 from daemon import logs
 from tests.systemd import container, kernels
 from tests.systemd.container import Container
+from tests.systemd.pages import dead_links
 from tools.bench.vm.places import workspace
 
 ROOT = Path(__file__).parents[2]
@@ -135,6 +136,10 @@ def test_nothing_installed_names_the_place_where_it_was_built(tree: Path) -> Non
     for path in [*(tree / "opt/lumiloop/bin").iterdir(), tree / "opt/lumiloop/pyvenv.cfg"]:
         if path.is_file() and not path.is_symlink():
             assert str(tree) not in path.read_text(errors="replace"), path
+
+
+def test_links_of_the_pages_lead_somewhere(tree: Path) -> None:
+    assert dead_links(tree) == []
 
 
 def test_the_installation_stays_below_its_bound(tree: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from daemon import cli
 from daemon.cli import USAGE
+from tests.systemd import pages
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "lumiloop.service"
@@ -229,6 +230,25 @@ def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
     assert not list(unit.parent.iterdir())
     (stopped,) = re.findall(r"disable --now (.*) \|\|", (SYSTEMD / "package.sh").read_text())
     assert sorted(stopped.replace("TAPS", taps).split()) == UNITS
+
+
+def test_links_of_the_installed_pages_lead_somewhere(tmp_path: Path) -> None:
+    """Pages lie beside other things there than in the tree; the environment is stood for by the code they name."""
+    code = tmp_path / "opt/lumiloop/lib/python3.11/site-packages/estimator"
+    code.mkdir(parents=True)
+    for path in (SYSTEMD.parent / "estimator").glob("*.py"):
+        (code / path.name).touch()
+    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
+    for _ in range(2):  # an installation over an older one
+        subprocess.run([SYSTEMD / "install.sh", "files"], env=environment, check=True, capture_output=True)
+    assert len(list((tmp_path / pages.DOCUMENTS).rglob("*.md"))) > 40
+    assert pages.dead_links(tmp_path) == []
+    assert (tmp_path / pages.DOCUMENTS / "LICENSE").read_text() == (SYSTEMD.parent / "LICENSE").read_text()
+    (tmp_path / pages.DOCUMENTS / "LICENSE").unlink()
+    shutil.rmtree(code)
+    dead = pages.dead_links(tmp_path)
+    assert "README.md: LICENSE" in dead
+    assert "docs/theory.md: ../estimator/optics.py" in dead
 
 
 def test_a_purge_leaves_nothing_that_a_unit_has_written(tmp_path: Path) -> None:
