@@ -6,14 +6,18 @@ import asyncio
 import os
 import shutil
 import signal
-from collections.abc import Callable
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hal.beside import beside
-from tools.bench import _readers, latency
+from tools.bench import _children, _readers, latency
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
 
@@ -104,10 +108,11 @@ def test_the_load_asks_only_while_it_is_served(tmp_path: Path) -> None:
         asked = asyncio.Event()
         transport, echo, port = await echoing(lambda number: asked.set())
         server = await asyncio.start_unix_server(lambda reader, writer: writer.close(), path)
-        load = latency.Load(port, path)
-        load.turn(True)
-        await asyncio.wait_for(asked.wait(), 20.0)
-        counts = await beside(load.end, "end")
+        with ExitStack() as undo:
+            load = latency.Load(port, path, undo)
+            load.turn(True)
+            await asyncio.wait_for(asked.wait(), 20.0)
+            counts = await beside(load.end, "end")
         transport.close()
         server.close()
         await server.wait_closed()
@@ -115,3 +120,96 @@ def test_the_load_asks_only_while_it_is_served(tmp_path: Path) -> None:
 
     (asked, answered), requests = asyncio.run(run())
     assert asked == answered == requests > 0
+
+
+HANGS = "import os, sys, time; open(sys.argv[1], 'a').write(f'{os.getpid()} '); "
+"""What stands for a program: it writes its number down, and what follows."""
+
+
+@pytest.fixture
+def stands(tmp_path: Path) -> Iterator[Callable[[str], tuple[str, ...]]]:
+    """Makes words that start a program of some Python; whatever becomes of it, none of them may stay."""
+    numbers = tmp_path / "numbers"
+    yield lambda code: (sys.executable, "-c", HANGS + code, str(numbers))
+    end = time.monotonic() + 5.0
+    while any(_lives(number) for number in numbers.read_text().split()):
+        assert time.monotonic() < end, "it goes on"
+        time.sleep(0.02)
+
+
+def _lives(number: str) -> bool:
+    try:
+        return "Z" not in Path("/proc", number, "stat").read_text().rpartition(")")[2]
+    except OSError:
+        return False
+
+
+def played(folder: Path, monkeypatch: pytest.MonkeyPatch, daemon: tuple[str, ...], readers: tuple[str, ...]) -> float:
+    """Seconds that the daemon's part took until it could not run."""
+    monkeypatch.setattr(latency, "DAEMON", daemon)
+    monkeypatch.setattr(latency, "READERS", readers)
+    monkeypatch.setattr(_children, "SILENT_S", 1.0)
+    monkeypatch.setattr(_children, "END_S", 1.0)
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory(dir="/tmp") as short, pytest.raises(latency.CannotRun) as reason:
+        latency.paced(Path(short), folder / "drive", False, 1, lambda on: None)
+    (folder / "said").write_text(str(reason.value))
+    return time.monotonic() - begun
+
+
+@pytest.mark.parametrize(
+    ("daemon", "says"),
+    [
+        ("time.sleep(60)", "the daemon has said nothing for 1 s"),
+        ("print('quiet', flush=True); time.sleep(60)", "the daemon has said nothing for 1 s"),
+        ("print('told {}', flush=True); time.sleep(60)", "the daemon has not ended within 1 s"),
+        ("print('ended', flush=True); time.sleep(60)", "the readers ended before their time, with code "),
+        ("print('loaded', flush=True); time.sleep(60)", "the daemon's stream takes no client"),
+        ("print('quiet')", "the daemon ended before its time"),
+    ],
+)
+def test_a_daemon_that_hangs_is_said_and_nothing_of_it_stays(
+    daemon: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stands: Callable[[str], tuple[str, ...]]
+) -> None:
+    seconds = played(tmp_path, monkeypatch, stands(daemon), stands("time.sleep(60)"))
+    assert says in (tmp_path / "said").read_text()
+    assert seconds < 10.0
+
+
+def test_who_does_not_end_when_told_to_is_killed(
+    monkeypatch: pytest.MonkeyPatch, stands: Callable[[str], tuple[str, ...]]
+) -> None:
+    monkeypatch.setattr(_children, "END_S", 0.5)
+    deaf = "import signal; signal.signal(15, signal.SIG_IGN); print('on', flush=True); time.sleep(60)"
+    with _children.child(*stands(deaf), hear=True) as readers:
+        assert next(_children.lines(readers, "the readers")) == "on"
+        with pytest.raises(latency.CannotRun, match=r"the readers were told to end and have not within 0\.5 s"):
+            _children.two_counts(readers, "the readers")
+
+
+def test_a_program_that_does_not_end_is_killed_with_what_it_has_started(
+    stands: Callable[[str], tuple[str, ...]],
+) -> None:
+    """As a compiler's parts, which would keep its output open."""
+    part = stands("time.sleep(60)")
+    words = stands(f"import subprocess; subprocess.run({part!r})")
+    begun = time.monotonic()
+    with pytest.raises(latency.CannotRun, match="the compiler has not ended within 1 s: it was killed"):
+        _children.finished(words, "the compiler", 1.0)
+    assert len(Path(words[-1]).read_text().split()) == 2
+    assert time.monotonic() - begun < 10.0
+
+
+def test_a_compiler_that_does_not_work_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: "/bin/false")
+    with pytest.raises(latency.CannotRun, match=r"/bin/false _timerloop\.c: "):
+        latency.compiled(tmp_path)
+
+
+def test_the_loop_in_c_has_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "timerloop"
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(latency, "LATE_S", 0.3)
+    with pytest.raises(latency.CannotRun, match=r"the loop in C has not ended within 0\.4 s"):
+        latency.bare(program, False, 0.1)

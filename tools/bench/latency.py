@@ -19,7 +19,6 @@ import pickle
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -34,41 +33,45 @@ from daemon.lights import Lights
 from daemon.realtime import PRIORITY
 from daemon.warmup import load
 from estimator.cdma_profile import PROFILE_A
+from tools.bench._children import CannotRun, child, ended, finished, lines, two_counts
 from tools.bench._drive import PERIOD_S, EndlessDrive
 from tools.bench._paced import SETTLE_S
 from tools.figures import Figure, bounded, save, table
 
 COMMAND: Final = "python -m tools.bench.latency"
-ROOT: Final = Path(__file__).parents[2]
 STRETCH_S: Final = 10.0
 BARE_S: Final = 10.0
 BURNERS: Final = 2
 TELLING: Final = ("pose", "lights", "scan", "state", "loop")
-
-
-class CannotRun(RuntimeError):
-    """What is needed is not there."""
+COMPILE_S: Final = 60.0
+LATE_S: Final = 60.0
+"""By so much a bare loop may be later than its turns take."""
+CONNECT_S: Final = 10.0
+DAEMON: Final = (sys.executable, "-m", "tools.bench._paced")
+READERS: Final = (sys.executable, "-m", "tools.bench._readers")
 
 
 def compiled(folder: Path) -> Path:
     """The C program.
 
     Raises:
-        CannotRun: no compiler.
+        CannotRun: no compiler, or none that works.
     """
     compiler, program = shutil.which("cc") or shutil.which("gcc"), folder / "timerloop"
     if compiler is None:
         raise CannotRun("no C compiler: apt-get install gcc")
-    subprocess.run([compiler, "-O2", "-o", str(program), str(Path(__file__).with_name("_timerloop.c"))], check=True)
+    words = [compiler, "-O2", "-o", str(program), str(Path(__file__).with_name("_timerloop.c"))]
+    done = finished(words, f"{compiler} _timerloop.c", COMPILE_S)
+    if done.returncode:
+        raise CannotRun(f"{compiler} _timerloop.c: {done.stderr.strip()}")
     return program
 
 
 def bare(program: Path, fifo: bool, seconds: float = BARE_S) -> list[float]:
     """Microseconds by which each turn of the C program was late."""
     count, priority = round(seconds / PERIOD_S), PRIORITY if fifo else 0
-    done = subprocess.run(
-        [str(program), "wait", str(round(1e6 * PERIOD_S)), str(count), str(priority)], capture_output=True, text=True
-    )
+    words = [str(program), "wait", str(round(1e6 * PERIOD_S)), str(count), str(priority)]
+    done = finished(words, "the loop in C", seconds + LATE_S)
     if done.returncode:
         raise CannotRun(f"the loop in C: {done.stderr.strip()}; SCHED_FIFO needs root or CAP_SYS_NICE")
     return [float(line) for line in done.stdout.split()]
@@ -77,18 +80,14 @@ def bare(program: Path, fifo: bool, seconds: float = BARE_S) -> list[float]:
 @contextmanager
 def burning(program: Path) -> Iterator[Callable[[bool], None]]:
     """Both cores busy, or not for a while: what is yielded is called with which of the two."""
-    burners = [subprocess.Popen([str(program), "burn"]) for _ in range(BURNERS)]
+    with ExitStack() as undo:
+        burners = [undo.enter_context(child(str(program), "burn")) for _ in range(BURNERS)]
 
-    def turn(on: bool) -> None:
-        for burner in burners:
-            burner.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
+        def turn(on: bool) -> None:
+            for burner in burners:
+                burner.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
 
-    try:
         yield turn
-    finally:
-        for burner in burners:
-            burner.kill()
-            burner.wait()
 
 
 def prepared(folder: Path, seconds: float) -> Path:
@@ -103,32 +102,37 @@ def prepared(folder: Path, seconds: float) -> Path:
 class Load:
     """The readers and the stuck client, on and off."""
 
-    def __init__(self, modbus: int, stream: str) -> None:
+    def __init__(self, modbus: int, stream: str, undo: ExitStack) -> None:
         self._stream = stream
         self._stuck: socket.socket | None = None
-        command = [sys.executable, "-m", "tools.bench._readers", str(modbus)]
-        self._readers = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        undo.callback(self._let_go)
+        self._readers = undo.enter_context(child(*READERS, str(modbus), hear=True))
         self._readers.send_signal(signal.SIGSTOP)
 
     def turn(self, on: bool) -> None:
         """On or off."""
         self._readers.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
+        self._let_go()
+        if on:
+            self._stuck = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            self._stuck.settimeout(CONNECT_S)
+            want = msgspec.msgpack.encode({"want": list(TELLING)})
+            try:
+                self._stuck.connect(self._stream)
+                self._stuck.sendall(len(want).to_bytes(4, "little") + want)
+            except OSError as error:
+                raise CannotRun(f"the daemon's stream takes no client: {error}") from error
+
+    def _let_go(self) -> None:
         if self._stuck is not None:
             self._stuck.close()
             self._stuck = None
-        if on:
-            self._stuck = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            self._stuck.connect(self._stream)
-            want = msgspec.msgpack.encode({"want": list(TELLING)})
-            self._stuck.sendall(len(want).to_bytes(4, "little") + want)
 
     def end(self) -> tuple[int, int]:
         """Requests asked and answered."""
-        self.turn(False)
+        self._let_go()
         self._readers.send_signal(signal.SIGCONT)
-        self._readers.terminate()
-        asked, answered = self._readers.communicate(timeout=30.0)[0].split()
-        return int(asked), int(answered)
+        return two_counts(self._readers, "the readers")
 
 
 def paced(folder: Path, drive: Path, fifo: bool, turns: int, burn: Callable[[bool], None]) -> dict[str, Any]:
@@ -145,23 +149,19 @@ def paced(folder: Path, drive: Path, fifo: bool, turns: int, burn: Callable[[boo
             "receiver": f"127.0.0.1:{sink.getsockname()[1]}", "stretch_s": STRETCH_S,
             "quiet": True,
         }  # fmt: skip
-        command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes, text=True))
-        undo.callback(child.kill)
-        load = Load(modbus, stream)
-        undo.callback(load._readers.kill)
-        assert child.stdin is not None
-        assert child.stdout is not None
+        daemon = undo.enter_context(child(*DAEMON, json.dumps(wanted), ask=True, hear=True))
+        load = Load(modbus, stream, undo)
+        assert daemon.stdin is not None
         asked = answered = 0
-        for line in child.stdout:
+        for line in lines(daemon, "the daemon"):
             if line.startswith("told "):
-                if child.wait(30.0):
+                if ended(daemon, "the daemon"):
                     break
-                return json.loads(line[5:]) | {"asked": asked, "answered": answered}
+                outcome: dict[str, Any] = json.loads(line[5:])
+                return outcome | {"asked": asked, "answered": answered}
             if line.strip() == "ended":  # it still serves: what is asked until now is answered
                 asked, answered = load.end()
-                child.stdin.close()
+                daemon.stdin.close()
             else:
                 load.turn(line.strip() == "loaded")
                 burn(line.strip() != "quiet")
@@ -258,7 +258,10 @@ def long_form(name: str, prog: str, other: str, run: Callable[[int], list[Figure
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # daemon, readers and burners must not outlive this one
-    rows = run(options.turns)
+    try:
+        rows = run(options.turns)
+    except CannotRun as reason:
+        sys.exit(f"{name} could not run: {reason}")
     print(table(rows))
     print(f"written: {save(name, rows, options.out)}")
 

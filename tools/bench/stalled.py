@@ -19,9 +19,10 @@ from daemon.lights import Lights
 from daemon.publish.stream import TOPICS, framed
 from daemon.warmup import load
 from estimator.cdma_profile import PROFILE_A
+from tools.bench._children import ROOT
 from tools.bench._drive import EndlessDrive
 from tools.bench.latency import long_form
-from tools.bench.viewers import ROOT, compared, paced
+from tools.bench.viewers import compared, paced
 from tools.figures import Figure
 
 COMMAND: Final = "python -m tools.bench stalled"

@@ -17,7 +17,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -30,13 +29,13 @@ import numpy as np
 from daemon.lights import Lights
 from daemon.warmup import load
 from estimator.cdma_profile import PROFILE_A
+from tools.bench._children import CannotRun, child, ended, lines, two_counts
 from tools.bench._drive import EndlessDrive
 from tools.bench._paced import SETTLE_S
-from tools.bench.latency import CannotRun, long_form, prepared
+from tools.bench.latency import DAEMON, long_form, prepared
 from tools.figures import Figure, bounded
 
 COMMAND: Final = "python -m tools.bench viewers"
-ROOT: Final = Path(__file__).parents[2]
 STRETCH_S: Final = 10.0
 TURNS: Final = 6
 LEAST_HZ: Final = 15.0
@@ -72,10 +71,12 @@ class Page:
         port = str(free_port())
         words = (["serve", stream, port], ["watch", port, str(BROWSERS)])
         module = [sys.executable, "-m", "tools.bench._viewers"]
-        self._both = [subprocess.Popen([*module, *w], cwd=ROOT, stdout=subprocess.PIPE, text=True) for w in words]
-        for one in self._both:
-            assert one.stdout is not None
-            one.stdout.readline()
+        with ExitStack() as undo:
+            self._both = [undo.enter_context(child(*module, *w, hear=True)) for w in words]
+            for one in self._both:
+                if next(lines(one, "the page's server, or a browser"), "") != "ready":
+                    raise CannotRun("the page's server, or the browsers, ended before their time; they say why above")
+            self._undo = undo.pop_all()
 
     def turn(self, on: bool) -> None:
         """On or off."""
@@ -84,17 +85,15 @@ class Page:
 
     def end(self) -> tuple[int, int]:
         """Messages and bytes that the browsers were told."""
-        for one in self._both:
-            one.terminate()
-        told = [one.communicate(timeout=30.0)[0] for one in self._both]
-        messages, size = told[1].split()
-        return int(messages), int(size)
+        server, browsers = self._both
+        told = two_counts(browsers, "the browsers")
+        server.terminate()
+        ended(server, "the page's server")
+        return told
 
     def kill(self) -> None:
         """Whatever has become of them."""
-        for one in self._both:
-            one.kill()
-            one.wait()
+        self._undo.close()
 
 
 def paced(folder: Path, turns: int, make: Callable[[str], Others] = Page) -> dict[str, Any]:
@@ -108,17 +107,15 @@ def paced(folder: Path, turns: int, make: Callable[[str], Others] = Page) -> dic
     with ExitStack() as undo:
         page = make(stream)
         undo.callback(page.kill)
-        command = [sys.executable, "-m", "tools.bench._paced", json.dumps(wanted)]
-        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE}
-        child = undo.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes, text=True))
-        undo.callback(child.kill)
-        assert child.stdout is not None
+        daemon = undo.enter_context(child(*DAEMON, json.dumps(wanted), hear=True))
         on = False
-        for line in child.stdout:
+        for line in lines(daemon, "the daemon"):
             if line.startswith("told "):
                 messages, size = page.end()
-                child.wait(30.0)
-                return json.loads(line[5:]) | {"messages": messages, "size": size}
+                if ended(daemon, "the daemon"):
+                    break
+                told: dict[str, Any] = json.loads(line[5:])
+                return told | {"messages": messages, "size": size}
             if (wanted_on := line.strip() == "loaded") != on:
                 on = wanted_on
                 page.turn(on)
