@@ -149,6 +149,8 @@ def pytest_configure(config: pytest.Config) -> None:
     where_on_a_bus(str(config.getoption("--adc")))
     _there(config)
     folder = config.getoption("--hil-report")
+    if folder and config.getoption("numprocesses", None):
+        raise pytest.UsageError("--hil-report tells of one process: leave -n out; a device has one user, too")
     if folder:
         try:
             Path(folder).mkdir(parents=True, exist_ok=True)

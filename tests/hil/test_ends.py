@@ -228,6 +228,7 @@ def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Pat
         (["--against", "old.json"], "say with --hil-report where it goes"),
         (["--hil-report", "/proc/here"], "--hil-report /proc/here: No such file or directory; name a folder"),
         (["--hil-report", "/dev/null"], "--hil-report /dev/null: File exists"),
+        (["--hil-report", "/dev/null", "-n", "2"], "--hil-report tells of one process: leave -n out"),
     ],
 )
 def test_a_report_that_cannot_be_is_refused_before_anything_is_tried(options: list[str], says: str) -> None:
