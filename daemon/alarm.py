@@ -26,8 +26,14 @@ def bounded(memory: Memory, evidence: Evidence) -> bool:
     fit; nor while a heading that is still being found may be any, for where that leads no covariance says.
     """
     in_doubt = memory.doubt or memory.failed > 0 or evidence.guessed or evidence.places is not None
-    in_doubt = in_doubt or memory.odd_since is not None or not (memory.tracked or memory.known[2])
+    in_doubt = in_doubt or memory.odd_since is not None or _turning(memory, evidence)
     return memory.state in HELD and not in_doubt
+
+
+def _turning(memory: Memory, evidence: Evidence) -> bool:
+    """Whether the heading in the building is still being found from lamps, and something carries the pose by it."""
+    light, carried = evidence.light, evidence.lidar or evidence.odometry is not None
+    return carried and light is not None and light.placed and not (light.known[2] or memory.tracked)
 
 
 class Alarm:

@@ -50,6 +50,7 @@ class Observer:
         self._t_samples = t_mono
         self._jumps = 0
         self._odd = self._placed = False
+        self._t_misplaced: float | None = None
         self._known = (False, False, False)
         self._t_start = t_mono
         self._odometry = odometry
@@ -158,10 +159,18 @@ class Observer:
             lost=lights.fix is Fix.LOST,
             agrees=None if not alive or (gap is None and not against) else not self._odd,
             moved=moved,
-            elsewhere=alive and result.misplaced,
+            elsewhere=alive and self._elsewhere(result.misplaced, lights.t_mono),
             apart=alive and result.apart,
             known=self._known,
         )
+
+    def _elsewhere(self, misplaced: bool, t_epoch: float) -> bool:
+        """Whether a second epoch in a row has what cannot be received at the pose: who walks by adds no light."""
+        if not misplaced:
+            self._t_misplaced = None
+        elif self._t_misplaced is None:
+            self._t_misplaced = t_epoch
+        return self._t_misplaced is not None and t_epoch > self._t_misplaced
 
     def _match(self, result: StepResult | None) -> Match | None:
         if result is None or result.match is None:

@@ -32,8 +32,6 @@ RECALLED_S: Final = 0.3
 """The same where the pose was proved before a gap, or before the daemon ended, and is found again where it was."""
 CONTRADICTED_S: Final = 0.3
 """Light has to contradict the place for this long: an epoch may be spoiled by who walks by."""
-ELSEWHERE_S: Final = 0.04
-"""The same where lamps are received that cannot be received here, two epochs in a row: who walks by adds no light."""
 HELD: Final = (State.TRACKING, State.DEGRADED)
 """States in which a proved pose is held."""
 
@@ -189,10 +187,9 @@ def _missing(memory: Memory, evidence: Evidence) -> Reason | None:
 
 
 def _contradicted(memory: Memory, evidence: Evidence) -> bool:
-    if memory.odd_since is None:
-        return False
-    elsewhere = evidence.light is not None and evidence.light.elsewhere
-    return evidence.t_mono - memory.odd_since >= (ELSEWHERE_S if elsewhere else CONTRADICTED_S)
+    if evidence.light is not None and evidence.light.elsewhere:
+        return True
+    return memory.odd_since is not None and evidence.t_mono - memory.odd_since >= CONTRADICTED_S
 
 
 def _together(memory: Memory, evidence: Evidence) -> bool:

@@ -43,7 +43,7 @@ class Light:
         lost: what is received contradicts the place that light itself had told.
         agrees: whether the light's place and the pose are the same within what both may be wrong; None: cannot be said.
         moved: in this cycle the pose was moved to where light says, after the two had contradicted each other.
-        elsewhere: most of the lamps that are received cannot be received at the pose.
+        elsewhere: most of the lamps that are received cannot be received at the pose, in two epochs in a row.
         apart: they are not, or are and one of the two is still on its way.
         known: (x, y, yaw) whether the pose knows the axis, with or without a laser.
     """

@@ -79,6 +79,8 @@ class Absolute:
         P, X: see above, both 3x3, odom-aligned axes. kept: T_map_base, and P in map axes, at the latest match, or
             when light or a person said where the map lies; what P has grown by since is of the way, not of the map.
         gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None: either is unknown.
+        apart: at the latest epoch that told the place they did not agree, or one was on its way to the other.
+        by_map: the pose comes from the map that the robot was found in, not from light.
         odd_since: since when they disagree. doubted_at: when that was last no reason to follow light. unheard: the
             laser has found the place while the `lights` filter held another one, and they have not agreed since.
         elsewhere_since: since when what is received does not fit the place. aside_since: nor each epoch alone.
@@ -100,6 +102,8 @@ class Absolute:
     X: Array = field(default_factory=lambda: np.zeros((3, 3)))
     kept: tuple[Array, Array] = field(default_factory=lambda: (se2.identity(), np.zeros((3, 3))))
     gap: float | None = None
+    apart: bool = False
+    by_map: bool = False
     odd_since: float | None = None
     doubted_at: float = -math.inf
     elsewhere_since: float | None = None
@@ -185,17 +189,20 @@ def on_lights(state: State, lights: LightsResult) -> None:
     off = lights.T_map_base - se2.compose(state.T_map_odom, T_odom_base)
     off[2] = se2.wrap(off[2])
     tie.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if tie.placed else None
-    if not tie.placed or tie.odd_since is not None:
+    if not tie.placed or tie.odd_since is not None or held:  # held: what light says of the heading is not used
         tie.swing.forget()
     elif lights.fix is Fix.GOOD:
         tie.swing.take(tie.way, float(lights.T_map_base[2] - T_odom_base[2]))
+    tie.apart = False
     if not tie.placed:
         follow(state, lights, T_odom_base)
         tie.gap = 0.0
     elif _contradicted(state, lights, off) or _surer(tie, lights):
         follow(state, lights, T_odom_base)
-    elif lights.fix is Fix.GOOD and tie.odd_since is None and not (held and abs(off[2]) > ASTRAY_RAD):
-        gain(state, lights, T_odom_base, off)
+    else:
+        tie.apart = _apart(tie)
+        if lights.fix is Fix.GOOD and tie.odd_since is None and not (held and abs(off[2]) > ASTRAY_RAD):
+            gain(state, lights, T_odom_base, off)
     if lights.fix is Fix.GOOD and tie.odd_since is None:
         tie.proved, tie.broken = True, False
         tie.way_start = state.light.filter.way_start
@@ -209,6 +216,7 @@ def on_order(state: State, command: Command) -> None:
     if command.order is Order.RESET:
         state.light.reset()
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.since = False, False, None, None, 0
+        told_anew(tie, False)
     if T_map_base is not None and np.isfinite(T_map_base).all():
         state.light.place(T_map_base, SAID)
         state.frozen.forget()
@@ -217,7 +225,14 @@ def on_order(state: State, command: Command) -> None:
         leave(state, np.zeros((3, 3)))
         tie.placed, tie.proved, tie.gap, tie.odd_since, tie.fresh = True, True, None, None, 0.0
         tie.broken, tie.way_start = False, state.light.filter.way_start
+        told_anew(tie, False)
         keep_tie(state)
+
+
+def told_anew(tie: Absolute, by_map: bool) -> None:
+    """A person, or the map, has told the place: what light and pose were to each other before is no matter."""
+    tie.apart, tie.by_map = False, by_map
+    tie.swing.forget()
 
 
 def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> None:
@@ -250,17 +265,6 @@ def gain(state: State, lights: LightsResult, T_odom_base: Array, off: Array) -> 
         tie.since = state.next_key
 
 
-def apart(state: State) -> bool:
-    """Whether light and pose do not agree, or do and one of them is still on its way.
-
-    What light said last counts while it says nothing.
-    """
-    tie = state.absolute
-    if tie is None or tie.gap is None:
-        return tie is not None and tie.odd_since is not None
-    return tie.gap > APART or not tie.swing.rests
-
-
 def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     """Take the lights' pose as it is."""
     tie = state.absolute
@@ -270,7 +274,7 @@ def follow(state: State, lights: LightsResult, T_odom_base: Array) -> None:
     R = se2.rotation(state.T_map_odom[2])
     tie.P = R.T @ lights.covariance @ R
     leave(state, np.zeros((3, 3)))
-    tie.placed, tie.odd_since, tie.fresh = True, None, 0.0
+    tie.placed, tie.odd_since, tie.fresh, tie.by_map = True, None, 0.0, False
     keep_tie(state)
 
 
@@ -404,6 +408,17 @@ def _contradicted(state: State, lights: LightsResult, off: Array) -> bool:
     if held and not (far and lights.fix is Fix.GOOD and checked):
         tie.doubted_at = lights.t_mono
     return lights.t_mono - max(tie.odd_since, tie.doubted_at) >= SURPRISE_S
+
+
+def _apart(tie: Absolute) -> bool:
+    """Whether pose and light do not agree, or do and one of them is still on its way to the other.
+
+    A pose that the map has told shares nothing with light, and they are as far apart as chance will have it.
+    """
+    assert tie.gap is not None
+    if tie.odd_since is not None or tie.by_map:
+        return tie.odd_since is not None
+    return tie.gap > APART or not tie.swing.rests
 
 
 def _elsewhere(state: State) -> bool:

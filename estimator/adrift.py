@@ -422,6 +422,6 @@ def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> 
         tie.P = tie.P + R @ askew @ R.T  # no surer in the survey's frame than the map is
         tie.placed, tie.proved, tie.broken = True, True, False
         tie.gap, tie.odd_since, tie.since = None, None, state.next_key
-        tie.swing.forget()
+        absolute.told_anew(tie, True)
         tie.way_start = -math.inf if state.light is None else state.light.filter.way_start
         tie.unheard, tie.t_match = disputed(state), state.fused.t_mono  # the laser has just told the place

@@ -235,7 +235,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
         places=adrift.places(state),
-        apart=absolute.apart(state),
+        apart=state.absolute is not None and state.absolute.apart,
         misplaced=misplaced(state),
         aside=state.atlas.aside is not None,
         let_go=state.let_go,

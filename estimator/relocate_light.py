@@ -148,12 +148,12 @@ def misplaced(state: State, T_map_base: Array) -> bool:
     What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
     not the most of them: so it is the robot that is elsewhere, whatever the `lights` filter has made of it so far.
     """
-    if state.light is None:
+    if state.light is None or state.absolute is None:
         return False
-    result = state.light.result
+    result, compared = state.light.result, state.absolute.gap is not None
     heard = sum(link.state not in UNHEARD for link in result.links)
-    if heard < MISPLACED or 2 * len(result.accepted) >= heard:
-        return False  # what is used fits where the filter is, and that this is here is asked of the pose: costs less
+    if heard < MISPLACED or (compared and 2 * len(result.accepted) >= heard):
+        return False  # what is used fits where the filter is, and where that is, is held against the pose: costs less
     strong = received(state, T_map_base)
     return sum(strong) >= MISPLACED and 2 * sum(strong) > len(strong)
 

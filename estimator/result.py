@@ -261,7 +261,7 @@ class StepResult:
         lights: of the `lights` filter, None where there is no photodiode. placed: light has told where the map lies;
             before that the map frame is the start pose's. gap: squared Mahalanobis distance (3 degrees of freedom)
             between T_map_base and the lights' own at the latest epoch, None where that cannot be said.
-        apart: the two do not agree, or one of them is still on its way (`absolute.apart`).
+        apart: the two do not agree, or one of them is still on its way (`Absolute.apart`).
         misplaced: most of the lamps that are received cannot be received at T_map_base.
         anew: how often the local map has been begun anew because nothing fitted the old one: since then the place in
             the map is a guess.

@@ -11,7 +11,7 @@ import pytest
 from daemon.alarm import CLEAR_S, SETTLE_S, Alarm, bounded
 from daemon.publish.snapshot import State
 from daemon.reasons import Reason
-from daemon.state_evidence import Evidence
+from daemon.state_evidence import Evidence, Light
 from daemon.state_memory import Memory
 
 
@@ -84,13 +84,21 @@ def test_it_does_not_chatter() -> None:
 
 
 HELD = Memory(State.TRACKING, Reason.NONE, tracked=True)
+TURNING = Light(alive=True, used=True, placed=True, agrees=True, known=(True, True, False))
 
 
 def test_a_bound_stands_where_the_pose_is_held() -> None:
     assert bounded(HELD, Evidence(1.0))
     assert bounded(replace(HELD, state=State.DEGRADED), Evidence(1.0))
+
+
+def test_a_bound_waits_for_the_heading_only_where_lamps_find_it_and_the_pose_goes_by_it() -> None:
     young = replace(HELD, state=State.DEGRADED, tracked=False)
-    assert bounded(replace(young, known=(False, False, True)), Evidence(1.0))
+    assert not bounded(young, Evidence(1.0, light=TURNING))
+    assert bounded(young, Evidence(1.0)), "laser alone: a turn in the map is none in the world"
+    assert bounded(young, Evidence(1.0, light=replace(TURNING, known=(True, True, True))))
+    assert bounded(young, Evidence(1.0, light=TURNING, lidar=False)), "each epoch tells the place anew"
+    assert not bounded(young, Evidence(1.0, light=TURNING, lidar=False, odometry=True))
 
 
 @pytest.mark.parametrize("state", [s for s in State if s not in (State.TRACKING, State.DEGRADED)])
@@ -105,7 +113,7 @@ def test_no_bound_in_any_other_state(state: State) -> None:
         (HELD, Evidence(1.0, places=1)),
         (replace(HELD, doubt=True), Evidence(1.0)),
         (replace(HELD, odd_since=0.9), Evidence(1.0)),
-        (replace(HELD, tracked=False, known=(True, True, False)), Evidence(1.0)),
+        (replace(HELD, tracked=False), Evidence(1.0, light=TURNING)),
     ],
 )
 def test_no_bound_of_a_place_in_doubt(memory: Memory, evidence: Evidence) -> None:

@@ -96,10 +96,17 @@ def test_pose_and_light_that_agree_may_be_apart_while_samples_arrive() -> None:
     assert not watch.light(apart, dt=LIGHT_SILENT_S + 0.1).apart
 
 
-def test_lamps_that_cannot_be_received_at_the_pose_contradict_it_whatever_light_makes_of_them() -> None:
-    for gap in (None, 0.1):
-        seen = Watch().light(replace(result(lit(Fix.STARTING), gap=gap), misplaced=True), EPOCH)
-        assert (seen.elsewhere, seen.agrees) == (True, False)
+def test_lamps_that_cannot_be_received_at_the_pose_contradict_it_and_two_epochs_of_them_for_good() -> None:
+    watch, epochs = Watch(), [replace(lit(Fix.STARTING), t_mono=0.05 * k) for k in range(1, 5)]
+
+    def seen(epoch: LightsResult, misplaced: bool = True) -> tuple[bool | None, bool]:
+        light = watch.light(replace(result(epoch, gap=0.1), misplaced=misplaced), EPOCH)
+        return light.agrees, light.elsewhere
+
+    assert [seen(epochs[0]) for _ in range(3)] == [(False, False)] * 3, "the same epoch, cycle after cycle"
+    assert seen(epochs[1]) == (False, True)
+    assert seen(epochs[2], False) == (True, False)
+    assert seen(epochs[3]) == (False, False)
 
 
 def test_lamps_that_fit_again_and_wait_to_be_used_do_not_contradict() -> None:

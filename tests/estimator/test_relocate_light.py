@@ -332,6 +332,9 @@ def unused(state: State) -> State:
 def test_most_lamps_out_of_place_say_that_the_pose_is_wrong() -> None:
     state, away = shown(robot()), HERE + np.array((5.0, 0.0, 0.0))
     assert sum(received(state, away)) >= MISPLACED
+    state.absolute.gap = None  # type: ignore[union-attr]
+    assert misplaced(state, away), "light has several places, and holds none of them against the pose"
+    state.absolute.gap = 1.0  # type: ignore[union-attr]
     assert not misplaced(state, away)  # the lamps in use fit where the filter is; the gap to the pose says the rest
     assert misplaced(unused(state), away)
     assert not misplaced(state, HERE)
