@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,28 @@ def test_lamps_that_speak_against_the_pose_end_tracking_or_hold_it_back(kind: st
     found = judged(f"{kind}-{seed}", rows, np.zeros((0, 2)), (True, False, ""))
     assert np.rad2deg(rows[rows[:, AT["t"]] > 12.0, AT["error_rad"]].max()) > 5.0, "nothing was wrong"
     assert found.wrong_s <= 0.5
+
+
+@pytest.mark.jit
+def test_a_start_that_light_holds_back_is_not_tracking_once_the_lamps_are_out() -> None:
+    scene = draw("false_lights", 59)
+    scene.seconds, scene.dark = 16.0, ((8.0, 16.0),)
+    rows = run(scene)
+    assert np.rad2deg(rows[rows[:, AT["t"]] > 12.0, AT["error_rad"]].min()) > 5.0, "nothing was wrong"
+    assert not np.any(rows[:, AT["state"]] == State.TRACKING)
+
+
+@pytest.mark.jit
+def test_a_robot_that_stands_where_its_map_was_found_again_is_tracking() -> None:
+    """Light is off by what walls reflect, for as long as it stands; the map knows nothing of that."""
+    scene = draw("restart_lit", 6)
+    (off,) = scene.restarts
+    scene.seconds, scene.legs = off + 25.0, (*scene.legs[:-1], replace(scene.legs[-1], end=off + 4.0))
+    rows = run(scene)
+    after = rows[rows[:, AT["t"]] > off + 15.0]
+    assert after[:, AT["gap"]].mean() > 1.0, "light was not off"
+    assert np.all(after[:, AT["state"]] == State.TRACKING)
+    assert np.isfinite(after[:, AT["bound_m"]]).all()
 
 
 @pytest.mark.jit
