@@ -241,9 +241,13 @@ def where_on_a_bus(name: str) -> tuple[str, int, str]:
     if number is None:
         raise pytest.UsageError(f"--adc {name}: expected BUS@ADDRESS[,CHIP], as /dev/i2c-1@0x4d")
     try:
-        return bus, number, chip_named(chip or "mcp3221").name
+        kind = chip_named(chip or "mcp3221")
     except ValueError as error:
         raise pytest.UsageError(f"--adc {name}: {error}") from error
+    if number not in kind.addresses:
+        possible = ", ".join(f"{one:#04x}" for one in sorted(kind.addresses))
+        raise pytest.UsageError(f"--adc {name}: an {kind.name} answers at one of {possible}")
+    return bus, number, kind.name
 
 
 @dataclass

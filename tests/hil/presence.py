@@ -8,7 +8,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from hal.errors import DeviceMissing, HalError
+from hal.i2c import NACKS, AsyncBus, BusOpener, read
+from hal.opening import open_bus
 from hal.photodiode.probe import probe_bus
+from hal.photodiode.trouble import explain, policy_for
 from hal.probe import identify_at
 from tests.hil.ends import AdcEnd, LidarEnd
 
@@ -19,15 +22,43 @@ def lidar_lacks(name: str) -> HalError | None:
     return asyncio.run(identify_at(end.opener, end.device)).error
 
 
-def adc_lacks(name: str) -> HalError | None:
+def adc_lacks(name: str, opener: BusOpener = open_bus) -> HalError | None:
     """Why nothing can be tried on this converter; None: something answers at its address."""
-    end = AdcEnd(name)
-    finding = asyncio.run(probe_bus(end.opener, end.bus))
-    there = {chip.address for chip in finding.chips}
-    if finding.error is not None or end.address in there:
-        return finding.error
-    remedy = f"name one of {', '.join(map(hex, sorted(there)))} with --adc" if there else "check power, SDA and SCL"
-    return DeviceMissing(end.bus, f"nothing answers at {end.address:#04x}", remedy)
+    return asyncio.run(_adc_lacks(AdcEnd(name, opener=opener)))
+
+
+async def _adc_lacks(end: AdcEnd) -> HalError | None:
+    """Its own address alone is asked: what else is on the bus, and may be at fault, is no reason to try nothing."""
+    try:
+        bus = await end.opener(end.bus)
+    except HalError as error:
+        return error
+    try:
+        wrong = await _answers(bus, end.address)
+    finally:
+        await bus.close()
+    if wrong is None:
+        return None
+    if wrong.errno in NACKS:
+        there = [hex(chip.address) for chip in (await probe_bus(end.opener, end.bus)).chips]
+        remedy = f"name one of {', '.join(there)} with --adc" if there else "check power, SDA and SCL"
+        return DeviceMissing(end.bus, f"nothing answers at {end.address:#04x}", remedy)
+    return explain(wrong, end.bus, end.chip, end.address)
+
+
+async def _answers(bus: AsyncBus, address: int) -> OSError | None:
+    """What is wrong with a read of two bytes; tried again as often, and after such pauses, as the driver does it."""
+    tries = 0
+    while True:
+        try:
+            await bus.transfer((read(address, 2),))
+            return None
+        except OSError as error:
+            policy = policy_for(error)
+            if tries >= policy.retries:
+                return error
+            tries += 1
+            await asyncio.sleep(policy.pause_s)
 
 
 LACKS = {"lidar": lidar_lacks, "adc": adc_lacks}

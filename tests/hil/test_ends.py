@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import errno
 import json
 import os
 import select
@@ -9,16 +11,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import pytest
 
 from hal.errors import DeviceMissing, HalError
-from hal.photodiode.probe import BusFinding, Chip
+from hal.i2c import AsyncBus, Message, Transferred
 from tests.hil import presence
 from tests.hil.conftest import result_name
 from tests.hil.ends import AdcEnd, operator_for, where_on_a_bus
@@ -187,20 +190,50 @@ def test_a_device_that_has_gone_in_the_middle_is_looked_for_again(monkeypatch: p
         seen.demand("lidar", "line")
 
 
-@pytest.mark.parametrize(
-    ("there", "says"), [((), "check power"), ((Chip(0x4E, "MCP3221"),), "name one of 0x4e with --adc")]
-)
-def test_a_converter_that_is_not_at_its_address_is_missing(
-    there: tuple[Chip, ...], says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def probe(opener: object, bus: str) -> BusFinding:
-        return BusFinding(bus, chips=there)
+@dataclass
+class OneBus:
+    """A bus at which some addresses answer (0) or fail in their way; at all others nothing is."""
 
-    monkeypatch.setattr(presence, "probe_bus", probe)
-    error = presence.adc_lacks("unix:/bus@0x4d")
-    assert "nothing answers at 0x4d" in str(error)
-    assert says in str(error)
-    assert presence.adc_lacks("unix:/bus@0x4e") is None or not there
+    at: dict[int, int]
+    name: str = "unix:/bus"
+    about: str = ""
+
+    async def open(self, name: str) -> AsyncBus:
+        return cast("AsyncBus", self)
+
+    async def transfer(self, messages: Sequence[Message]) -> Transferred:
+        if number := self.at.get(messages[0].address, errno.ENXIO):
+            raise OSError(number, os.strerror(number))
+        return Transferred(0.0, 0.0, tuple(bytes(one.length) for one in messages))
+
+    async def close(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("at", "says"),
+    [
+        ({}, "nothing answers at 0x4d (check power"),
+        ({0x4E: 0}, "nothing answers at 0x4d (name one of 0x4e with --adc)"),
+        ({0x4D: errno.EBUSY}, "address 0x4d is in use by another program"),
+        ({0x4D: errno.ETIMEDOUT}, "the bus is stuck"),
+        ({0x4D: errno.EIO}, "transactions fail"),
+        ({0x48: errno.ETIMEDOUT, 0x4D: 0}, "None"),
+    ],
+)
+def test_a_converter_is_looked_for_at_its_own_address(at: dict[int, int], says: str) -> None:
+    """What is wrong there is said; what is wrong at another one is not its fault."""
+    assert says in str(presence.adc_lacks("unix:/bus@0x4d", OneBus(at).open))
+
+
+def test_a_converter_that_is_asked_for_too_soon_is_asked_again() -> None:
+    """`lumiloop probe` has an address for some hundredths of a second."""
+    bus = OneBus({0x4D: errno.EBUSY})
+
+    async def later(name: str) -> AsyncBus:
+        asyncio.get_running_loop().call_later(0.02, bus.at.update, {0x4D: 0})
+        return await bus.open(name)
+
+    assert presence.adc_lacks("unix:/bus@0x4d", later) is None
 
 
 def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Path) -> None:
@@ -286,6 +319,8 @@ def test_a_converter_is_named_by_bus_address_and_chip() -> None:
     assert where_on_a_bus("unix:/a@b@0x54,adc121c021") == ("unix:/a@b", 0x54, "ADC121C021")
     with pytest.raises(pytest.UsageError, match="chip foo: not known"):
         where_on_a_bus("/dev/i2c-1@0x4d,foo")
+    with pytest.raises(pytest.UsageError, match="0x60: an MCP3221 answers at one of 0x48, "):
+        where_on_a_bus("/dev/i2c-1@0x60")
 
 
 def test_programs_and_operators_that_are_not_there(tmp_path: Path) -> None:
