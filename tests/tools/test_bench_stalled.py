@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 from tests.daemon.publish.test_stream import serve, until
 from tests.tools.test_bench_viewers import told
+from tools.bench._children import ROOT
 from tools.bench.stalled import TAPS, Taps, figures
+
+STARTS = "import sys, time; from tools.bench.stalled import Taps; t = Taps(sys.argv[1]); t.turn(True); time.sleep(60)"
 
 
 def test_rows_say_what_hanging_taps_cost() -> None:
@@ -38,3 +44,20 @@ def test_taps_come_hang_and_go(tmp_path: Path) -> None:
             await asyncio.gather(serving, return_exceptions=True)
 
     asyncio.run(body())
+
+
+def test_taps_do_not_outlive_a_benchmark_that_is_killed(tmp_path: Path) -> None:
+    """They would keep their connections, and wait for ever."""
+    with socket.socket(socket.AF_UNIX) as stream:
+        stream.bind(str(tmp_path / "s"))
+        stream.listen(TAPS)
+        stream.settimeout(60.0)
+        with subprocess.Popen([sys.executable, "-c", STARTS, str(tmp_path / "s")], cwd=ROOT) as benchmark:
+            try:
+                tap = stream.accept()[0]
+            finally:
+                benchmark.kill()
+        with tap:
+            tap.settimeout(10.0)
+            while tap.recv(1 << 16):
+                pass

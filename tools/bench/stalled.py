@@ -8,10 +8,10 @@ killed.
 from __future__ import annotations
 
 import socket
-import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from daemon.lights import Lights
 from daemon.publish.stream import TOPICS, framed
 from daemon.warmup import load
 from estimator.cdma_profile import PROFILE_A
-from tools.bench._children import ROOT
+from tools.bench._children import child
 from tools.bench._drive import EndlessDrive
 from tools.bench.latency import long_form
 from tools.bench.viewers import compared, paced
@@ -34,15 +34,14 @@ class Taps:
     """They ask, and take nothing."""
 
     def __init__(self, stream: str) -> None:
-        self._command = [sys.executable, "-m", "tools.bench.stalled", "--hang", stream]
-        self._child: subprocess.Popen[bytes] | None = None
+        self._command = sys.executable, "-m", "tools.bench.stalled", "--hang", stream
+        self._undo = ExitStack()
 
     def turn(self, on: bool) -> None:
         """On, or killed."""
+        self.kill()
         if on:
-            self._child = subprocess.Popen(self._command, cwd=ROOT)
-        else:
-            self.kill()
+            self._undo.enter_context(child(*self._command))
 
     def end(self) -> tuple[int, int]:
         """They were told nothing that they have taken."""
@@ -51,10 +50,7 @@ class Taps:
 
     def kill(self) -> None:
         """As a crash would."""
-        if self._child is not None:
-            self._child.kill()
-            self._child.wait()
-            self._child = None
+        self._undo.close()
 
 
 def hang(stream: str) -> None:
