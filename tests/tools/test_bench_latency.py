@@ -185,6 +185,8 @@ def test_who_does_not_end_when_told_to_is_killed(
         assert next(_children.lines(readers, "the readers")) == "on"
         with pytest.raises(latency.CannotRun, match=r"the readers were told to end and have not within 0\.5 s"):
             _children.two_counts(readers, "the readers")
+        begun = time.monotonic()
+    assert time.monotonic() - begun < 10.0, "it was waited for, not killed"
 
 
 def test_a_program_that_does_not_end_is_killed_with_what_it_has_started(
