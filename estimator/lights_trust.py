@@ -27,13 +27,16 @@ ANY_HEADING = math.pi**2 / 3.0
 
 
 def doubted(lights: LightsResult, known_m: float, wheels: bool = True) -> LightsResult:
-    """The lights' result with less trust in it; no heading is less certain than one that may be any."""
+    """The lights' result with less trust in it; no heading is less certain than one that may be any.
+
+    ``known_m``: way since light last began to find its place. ``wheels``: it is told how the robot moves.
+    """
     P, factor = doubted_covariance(lights, known_m, wheels)
     return replace(lights, covariance=P, gained=lights.gained / factor)
 
 
 def doubted_covariance(lights: LightsResult, known_m: float, wheels: bool = True) -> tuple[Array, float]:
-    """Its covariance alone, and by how much it has been raised."""
+    """Its covariance alone (3x3; m^2, rad^2; map axes), and by how much it has been raised."""
     factor = TRUST + YOUNG * math.exp(-known_m / YOUNG_M)
     factor *= 1.0 if wheels else UNGUIDED
     P = lights.covariance * factor

@@ -56,7 +56,7 @@ The laser sees it at once, and where it sees two it goes on looking."""
 UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING, LinkState.UNSURVEYED, LinkState.TWIN)
 """States of a link that say nothing of where the receiver is."""
 MISPLACED: Final = 2
-"""So many lamps that cannot be received at a pose are no lamp that was moved, nor two that were exchanged."""
+"""So many lamps at least have to be received that cannot be at a pose: a single one may be a lamp that was moved."""
 NEARER_M: Final = 1.0
 STRONGER: Final = 2.0
 """A lamp that is received so many times stronger than it can be within the former of a place is not received there."""

@@ -34,7 +34,7 @@ class Swing:
     seen: deque[tuple[float, float, float]] = field(default_factory=deque)
 
     def take(self, way: float, yaw_map_odom: float) -> None:
-        """Take in what an epoch says of the odom frame's heading in the survey, after so much way."""
+        """Take in what an epoch says of the odom frame's heading in the survey (rad), after so much way (m)."""
         while self.seen and way - self.seen[0][0] > LOOK_M:
             self.seen.popleft()
         if not self.seen:

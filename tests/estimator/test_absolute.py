@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 
 from estimator import absolute, se2
-from estimator.absolute import APART
 from estimator.lights_trust import across_the_row
 from estimator.pipeline import State, keyframe_poses, step
 from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
-from estimator.result import SURPRISE, Fix, LightsResult
+from estimator.result import SURPRISE, Fix
 from estimator.row import doubt
-from estimator.swing import SWING_RAD
-from tests.estimator.lit import Log, Truth, lit_state, play, scans, together
+from tests.estimator.lit import Log, Truth, lights_at, lit_state, play, scans, together
 from tools.sim.buildings import building
 from tools.sim.ceiling import ceiling_of
 from tools.sim.ceiling_links import Reception
@@ -286,78 +284,6 @@ def test_reset_forgets_where_the_map_lies() -> None:
     result = step(state, [Command(3.0, Order.RESET)], UNLIMITED)
     assert not result.placed
     assert result.gap is None
-
-
-def lights_at(T: Array, accepted: frozenset[int], state: State) -> LightsResult:
-    """Sure of a place, by these lamps."""
-    P = np.diag((0.05**2, 0.05**2, 0.02**2))
-    now = state.fused.t_mono
-    nothing = np.zeros((3, 3))
-    return LightsResult(now, Fix.GOOD, T, P, (), accepted, nothing, np.zeros(3), t_pose=now)
-
-
-def epoch_of(state: State, off: Array, fix: Fix = Fix.GOOD) -> LightsResult:
-    """The next epoch, which finds the robot by so much beside the pose, its heading to 5 deg, and adds nothing."""
-    assert state.absolute is not None
-    here = se2.compose(state.T_map_odom, state.fused.T_odom_base) + off
-    P = np.diag((0.05**2, 0.05**2, 0.09**2))
-    return replace(lights_at(here, frozenset((1, 4, 13, 16)), state), fix=fix, covariance=P)
-
-
-def test_pose_and_light_are_apart_where_they_agree_no_better_than_by_chance(driven: tuple[State, Log]) -> None:
-    state = copy.deepcopy(driven[0])
-    tie = state.absolute
-    assert tie is not None
-    assert not tie.apart, "after a whole drive in good light"
-    absolute.on_lights(state, epoch_of(state, np.array((0.0, 0.2, 0.0))))
-    assert tie.gap is not None
-    assert APART < tie.gap < SURPRISE
-    assert tie.apart
-    absolute.on_lights(state, epoch_of(state, np.zeros(3), Fix.HELD))
-    assert tie.gap is None
-    assert tie.apart, "what light said last counts while it says nothing"
-    absolute.on_lights(state, epoch_of(state, np.zeros(3)))
-    assert not tie.apart
-
-
-def test_pose_and_light_are_apart_while_light_swings_and_that_ends_with_an_order(driven: tuple[State, Log]) -> None:
-    state = copy.deepcopy(driven[0])
-    tie = state.absolute
-    assert tie is not None
-    assert state.light is not None
-    for turn in (0.0, SWING_RAD + 0.01, 0.0):
-        absolute.on_lights(state, epoch_of(state, np.array((0.0, 0.0, turn))))
-    assert tie.apart
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    absolute.on_order(state, Command(state.fused.t_mono, Order.SET_POSE, T))
-    assert not tie.apart
-    absolute.on_lights(state, epoch_of(state, np.zeros(3)))
-    assert not tie.apart
-
-
-def test_a_pose_that_the_map_has_told_may_be_as_far_from_light_as_chance_will_have_it(
-    driven: tuple[State, Log],
-) -> None:
-    state = copy.deepcopy(driven[0])
-    tie = state.absolute
-    assert tie is not None
-    absolute.told_anew(tie, by_map=True)
-    absolute.on_lights(state, epoch_of(state, np.array((0.0, 0.2, 0.0))))
-    assert not tie.apart
-    absolute.on_lights(state, epoch_of(state, np.array((0.0, 1.0, 0.0))))
-    assert tie.apart, "no chance"
-
-
-def test_a_heading_from_light_that_is_not_used_swings_in_vain(driven: tuple[State, Log]) -> None:
-    state = copy.deepcopy(driven[0])
-    tie = state.absolute
-    assert tie is not None
-    assert state.light is not None
-    state.light.filter.course.wheels = False
-    assert absolute.holds_heading(state)
-    for turn in (0.0, SWING_RAD + 0.01, 0.0):
-        absolute.on_lights(state, epoch_of(state, np.array((0.0, 0.0, turn))))
-    assert not tie.apart
 
 
 def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> None:
