@@ -13,6 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAIR = '''
+import numpy as np
 from estimator.kernel import kernel
 
 @kernel("f8(f8[::1])")
@@ -26,11 +27,21 @@ def total(values):
 @kernel("f8(f8[::1])")
 def mean(values):
     return total(values) / values.size
+
+@kernel("f8[::1](f8[::1])")
+def twice(values):
+    """What it returns is memory that it has taken."""
+    both = np.empty(2 * values.size)
+    for k in range(both.size):
+        both[k] = values[k % values.size]
+    return both
 '''
 ASK = """
 import json, sys
 import llvmlite.binding, numpy as np
 from numba.core import event
+from numba.core.runtime import _nrt_python
+from numba.core.runtime.nrt import rtsys
 import estimator.kernel_kept
 seen = {"compiled": 0, "read": 0}
 class Count(event.Listener):
@@ -45,6 +56,13 @@ llvmlite.binding.parse_bitcode = counted
 BEFORE
 import pair
 seen["ready to compile"] = "numba.np.arraymath" in sys.modules
+seen["ready to count"] = rtsys._init
+for _ in range(100):
+    assert pair.twice(np.arange(3.0)).tolist() == [0.0, 1.0, 2.0] * 2
+_nrt_python.memsys_enable_stats()
+given = [pair.twice(np.arange(3.0)) for _ in range(10)]
+del given
+seen["kept memory"] = _nrt_python.memsys_get_stats_alloc() - _nrt_python.memsys_get_stats_free()
 seen["values"] = pair.total(np.arange(4.0)), pair.mean(np.arange(4.0))
 try:
     pair.mean(np.arange(4))
@@ -63,13 +81,14 @@ def ask(folder: Path, before: str = "") -> dict[str, Any]:
     seen: dict[str, Any] = json.loads(done.stdout)
     assert seen.pop("values") == [6.0, 1.5]
     assert seen.pop("refused").startswith("No matching definition")
+    assert seen.pop("kept memory") == 0
     return seen
 
 
 @pytest.mark.jit
 def test_a_start_without_anything_to_compile_neither_gets_ready_to_nor_reads_bitcode(tmp_path: Path) -> None:
-    assert ask(tmp_path)["compiled"] == 2
-    assert ask(tmp_path) == {"compiled": 0, "read": 0, "ready to compile": False}
+    assert ask(tmp_path)["compiled"] == 3 + 2  # numba's own, of ``empty``
+    assert ask(tmp_path) == {"compiled": 0, "read": 0, "ready to compile": False, "ready to count": False}
 
 
 @pytest.mark.jit
@@ -77,8 +96,8 @@ def test_who_is_compiled_later_takes_what_was_kept_into_itself(tmp_path: Path) -
     ask(tmp_path)
     (left,) = (tmp_path / "cache").rglob("pair.mean-*.nbi")
     left.unlink()
-    assert ask(tmp_path) == {"compiled": 1, "read": 1, "ready to compile": True}
-    assert ask(tmp_path) == {"compiled": 0, "read": 0, "ready to compile": False}
+    assert ask(tmp_path) == {"compiled": 1, "read": 1, "ready to compile": True, "ready to count": True}
+    assert ask(tmp_path) == {"compiled": 0, "read": 0, "ready to compile": False, "ready to count": False}
 
 
 @pytest.mark.jit
