@@ -8,8 +8,9 @@ Every other state comes with a reason, and a reason comes with a remedy. Bad new
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from daemon.publish.snapshot import State
 from daemon.reasons import Reason

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from typing import Final
+
+import msgspec
+from msgspec.structs import replace
 
 from daemon.publish.snapshot import State
 from daemon.reasons import Reason
@@ -44,9 +46,8 @@ Streak = tuple[int, float]
 """How many in a row, and when it began."""
 
 
-@dataclass(frozen=True, slots=True)
-class Memory:
-    """What the machine remembers between cycles; start with ``Memory()``.
+class Memory(msgspec.Struct, frozen=True):
+    """What the machine remembers between cycles; start with ``Memory()``. A struct: every cycle makes new ones.
 
     Attributes:
         good, good_since: good scans in a row and when the first of them was. failed: failed scans in a row.

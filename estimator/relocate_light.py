@@ -21,7 +21,7 @@ from estimator.cdma_epoch import UNUSABLE, LightEpoch
 from estimator.ekf_start import CAP
 from estimator.lamps import Lamp
 from estimator.light import Light
-from estimator.lights_links import remembered, sights
+from estimator.lights_links import sights
 from estimator.lights_start import RIVAL, Place, direct, places, probabilities, straight
 from estimator.lights_state import Lights, Track
 from estimator.linear3 import invert3
@@ -147,10 +147,21 @@ def misplaced(state: State, T_map_base: Array) -> bool:
 
     What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
     not the most of them: so it is the robot that is elsewhere, whatever the `lights` filter has made of it so far.
+    An epoch is asked once, about the pose with which it came.
     """
-    if state.light is None or state.absolute is None:
+    if state.light is None or state.absolute is None or silent(state.light):
         return False
-    result, compared = state.light.result, state.absolute.gap is not None
+    epoch, answer = state.light.asked or (None, False)
+    if epoch is not state.light.epoch:
+        answer = _misplaced(state, T_map_base, compared=state.absolute.gap is not None)
+        assert state.light.epoch is not None
+        state.light.asked = state.light.epoch, answer
+    return answer
+
+
+def _misplaced(state: State, T_map_base: Array, compared: bool) -> bool:
+    assert state.light is not None
+    result = state.light.result
     heard = sum(link.state not in UNHEARD for link in result.links)
     if heard < MISPLACED or (compared and 2 * len(result.accepted) >= heard):
         return False  # what is used fits where the filter is, and where that is, is held against the pose: costs less
@@ -179,14 +190,19 @@ def in_place(state: State, T_map_base: Array) -> bool:
 
 def received(state: State, T_map_base: Array) -> list[bool]:
     """Of each lamp that is received, whether it is stronger than it can be about a pose."""
-    if state.light is None or state.light.epoch is None:
+    if state.light is None or silent(state.light):
         return []
     lights, epoch = state.light.filter, state.light.epoch
-    if lights.course.t_mono - epoch.t_end > SILENT_S or epoch.block & UNUSABLE:
-        return []
+    assert epoch is not None
     rx = lights.survey.receiver
     (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
     return strong_at(lights, epoch, x, y)
+
+
+def silent(light: Light) -> bool:
+    """Whether there is no epoch of now that is of any use."""
+    epoch = light.epoch
+    return epoch is None or light.filter.course.t_mono - epoch.t_end > SILENT_S or bool(epoch.block & UNUSABLE)
 
 
 def strong_at(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[bool]:
@@ -207,7 +223,8 @@ def too_strong(lights: Lights, lamp: Lamp, amplitude: float, x: float, y: float)
     h = max(lamp.z - rx.z, 0.1)
     away = max(math.hypot(lamp.x - x, lamp.y - y) - NEARER_M, 0.0)
     fall = h / math.hypot(h, away) / math.cos(min(rx.half_fov_rad, 1.5))
-    rim = lights.catalogue.rims[lamp.lamp_id] * math.exp(max(float(remembered(lights, lamp)[0][0]), 0.0))
+    known = lights.gains.get(lamp.lamp_id)
+    rim = lights.catalogue.rims[lamp.lamp_id] * (1.0 if known is None else math.exp(max(float(known[0][0]), 0.0)))
     return amplitude > rim * max(1.0, STRONGER * math.pow(fall, lamp.order + rx.order + 2.0))
 
 
