@@ -39,7 +39,7 @@ class Light:
         setup: as given. decoder: of the photodiode's blocks. filter: see estimator/lights.py. result: after the latest
             epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself. guided:
             instant and pose (odom frame) of the latest scan, if its match may tell how the robot moves; see `guide`.
-        asked: the epoch of which `relocate_light.misplaced` was asked last, and what it said.
+        asked: the epoch, and the pose, of which `relocate_light.misplaced` was asked last, and what it said.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
@@ -53,7 +53,7 @@ class Light:
         self.epoch: LightEpoch | None = None
         self.glimpse: tuple[LightEpoch, tuple[Place, ...]] | None = None
         self.guided: tuple[float, Array] | None = None
-        self.asked: tuple[LightEpoch, bool] | None = None
+        self.asked: tuple[LightEpoch, Array, bool] | None = None
         self._decoded = self._decoded_before = False
         self._spared = 0
 

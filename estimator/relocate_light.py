@@ -55,6 +55,8 @@ The laser sees it at once, and where it sees two it goes on looking."""
 
 UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING, LinkState.UNSURVEYED, LinkState.TWIN)
 """States of a link that say nothing of where the receiver is."""
+ASKED_M: Final = 0.1
+"""Within that far of each other two poses receive the same lamps: a robot drives less from one epoch to the next."""
 MISPLACED: Final = 2
 """So many lamps at least have to be received that cannot be at a pose: a single one may be a lamp that was moved."""
 NEARER_M: Final = 1.0
@@ -147,16 +149,16 @@ def misplaced(state: State, T_map_base: Array) -> bool:
 
     What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
     not the most of them: so it is the robot that is elsewhere, whatever the `lights` filter has made of it so far.
-    An epoch is asked once, about the pose with which it came.
+    An epoch is asked once, unless the pose is moved meanwhile.
     """
     if state.light is None or state.absolute is None or silent(state.light):
         return False
-    epoch, answer = state.light.asked or (None, False)
-    if epoch is not state.light.epoch:
+    asked, epoch = state.light.asked, state.light.epoch
+    if asked is None or asked[0] is not epoch or np.hypot(*(T_map_base - asked[1])[:2]) > ASKED_M:
+        assert epoch is not None
         answer = _misplaced(state, T_map_base, compared=state.absolute.gap is not None)
-        assert state.light.epoch is not None
-        state.light.asked = state.light.epoch, answer
-    return answer
+        state.light.asked = asked = epoch, T_map_base, answer
+    return asked[2]
 
 
 def _misplaced(state: State, T_map_base: Array, compared: bool) -> bool:

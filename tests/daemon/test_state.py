@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from random import Random
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -318,7 +319,7 @@ def test_a_laser_that_is_left_out_degrades_and_says_why(why: Reason) -> None:
 def test_a_pause_without_odometry_leaves_a_place_in_doubt() -> None:
     paused = run(tracking(), scans(3.0, 30, None, unused=Reason.PAUSED))
     assert paused.doubt
-    lost = replace(tracking(), lost=True, doubt=True)
+    lost = msgspec.structs.replace(tracking(), lost=True, doubt=True)
     assert said(judge(lost, seen(3.0, None, unused=Reason.PAUSED))) == (State.LOST, Reason.PAUSED)
 
 

@@ -329,15 +329,40 @@ def unused(state: State) -> State:
     return state
 
 
+def anew(state: State, T_map_base: Array) -> bool:
+    """Whether an epoch that has not been asked yet says that it is misplaced."""
+    assert state.light is not None
+    state.light.asked = None
+    return misplaced(state, T_map_base)
+
+
+def test_an_epoch_is_asked_again_only_about_another_place() -> None:
+    state, away = unused(shown(robot())), HERE + np.array((5.0, 0.0, 0.0))
+    beside = away + np.array((0.03, 0.0, 1.0))
+    light = state.light
+    assert light is not None
+    assert not misplaced(state, HERE)
+    assert misplaced(state, away), "a person has said where it is, or the laser has found it there"
+    strong, light.filter.catalogue.rims = light.filter.catalogue.rims, dict.fromkeys(light.filter.catalogue.rims, 1e9)
+    assert misplaced(state, beside)
+    light.epoch = replace(light.epoch)
+    assert not misplaced(state, beside), "nothing is stronger than that"
+    light.filter.catalogue.rims = strong
+    light.epoch = replace(light.epoch)
+    assert misplaced(state, away)
+    light.filter.course.t_mono += 10.0
+    assert not misplaced(state, away), "nothing is received any more"
+
+
 def test_most_lamps_out_of_place_say_that_the_pose_is_wrong() -> None:
     state, away = shown(robot()), HERE + np.array((5.0, 0.0, 0.0))
     assert sum(received(state, away)) >= MISPLACED
     state.absolute.gap = None  # type: ignore[union-attr]
-    assert misplaced(state, away), "light has several places, and holds none of them against the pose"
+    assert anew(state, away), "light has several places, and holds none of them against the pose"
     state.absolute.gap = 1.0  # type: ignore[union-attr]
-    assert not misplaced(state, away)  # the lamps in use fit where the filter is; the gap to the pose says the rest
-    assert misplaced(unused(state), away)
-    assert not misplaced(state, HERE)
+    assert not anew(state, away)  # the lamps in use fit where the filter is; the gap to the pose says the rest
+    assert anew(unused(state), away)
+    assert not anew(state, HERE)
 
 
 def test_lamps_exchanged_or_moved_are_not_most_of_them() -> None:
@@ -351,7 +376,7 @@ def test_lamps_exchanged_or_moved_are_not_most_of_them() -> None:
         amplitude[np.argsort(-amplitude)[:count]] *= 100.0
         state.light.epoch = replace(epoch, amplitude=amplitude)
         told = sum(received(state, HERE))
-        assert misplaced(state, HERE) == (told >= MISPLACED and 2 * told > len(strong))
+        assert anew(state, HERE) == (told >= MISPLACED and 2 * told > len(strong))
 
 
 def test_a_lamp_that_was_hidden_while_it_was_learned_may_be_received_clearly_here() -> None:
