@@ -65,9 +65,13 @@ class Observer:
         self._begun = False
         self._remembered: Array | None = None
 
-    def odometry_ok(self, t_mono: float) -> bool | None:
-        """Whether odometry is arriving; None where none is configured."""
-        return t_mono - self._t_odometry <= ODOMETRY_SILENT_S if self._odometry else None
+    def odometry_ok(self, t_mono: float, waiting: tuple[float, ...] = ()) -> bool | None:
+        """Whether odometry is arriving; None where none is configured.
+
+        ``waiting``: when readings arrived that no cycle has taken yet.
+        """
+        latest = max((self._t_odometry, *waiting))
+        return t_mono - latest <= ODOMETRY_SILENT_S if self._odometry else None
 
     def silence(self, t_mono: float, period: float) -> float | None:
         """Scan periods since the last scan was taken; None before the first."""

@@ -84,6 +84,11 @@ class Inbox:
         if len(self._odometry) > DEEPEST:
             self._odometry = self._odometry[::2]
 
+    @property
+    def odometry_waiting(self) -> tuple[float, ...]:
+        """When the readings that no cycle has taken yet arrived: with a slow lidar they wait for a second and more."""
+        return tuple([reading.t_rx for reading in self._odometry])
+
     def put_imu(self, reading: RawImu) -> None:
         """Hold a gyro reading."""
         self._imu_total += 1

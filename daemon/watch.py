@@ -78,13 +78,14 @@ class Watch:
         self.old += reading.t_rx - reading.t_mono > LATE_S
         self._arrived.append(reading.t_rx)
 
-    def seldom(self, t_mono: float, period: float) -> bool:
+    def seldom(self, t_mono: float, period: float, waiting: tuple[float, ...] = ()) -> bool:
         """Whether odometry readings come more seldom than they used to, or than is asked for; asked for once a second.
 
         What is asked for goes by the lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
+        ``waiting``: when readings arrived that no cycle has taken yet.
         """
         window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
-        recent = sum(t_mono - t <= window for t in self._arrived)
+        recent = sum(t_mono - t <= window for t in (*self._arrived, *waiting))
         if not recent or t_mono - self._arrived[0] < window or window > 10.0 * WINDOW_S:
             return False
         hz = recent / window

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -176,6 +176,23 @@ def test_with_odometry_two_witnesses_agree() -> None:
         assert (bench.last.state, bench.last.odometry_ok) == (State.TRACKING, True)
 
     run_daemon(scenario)
+
+
+def test_a_slow_lidar_that_loses_a_scan_does_not_make_odometry_silent(caplog: pytest.LogCaptureFixture) -> None:
+    """Once a second: readings wait for over a second for a cycle that takes them, and have arrived all the same."""
+
+    async def scenario(bench: Bench) -> None:
+        sender = asyncio.create_task(bench.send_odometry(60.0))
+        await bench.until(State.TRACKING, 30.0)
+        bench.faults.load('[[fault]]\nwhat = "intermittent"\nshare = 0.4')
+        await asyncio.sleep(20.0)
+        sender.cancel()
+        assert bench.daemon.cycle.parts.status.missed > 0
+        assert "fault 201" not in caplog.text
+        await asyncio.sleep(5.0)
+        assert "fault 201" in caplog.text
+
+    run_daemon(scenario, model=replace(URG_04LX_UG01, rpm=60, true_period_s=1.0), world=Parked)
 
 
 def test_odometry_with_a_wrong_scale_is_not_called_tracking() -> None:

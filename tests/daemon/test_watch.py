@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import pytest
 
 from daemon.publish.snapshot import State
@@ -151,5 +152,5 @@ def test_disagreement_counts_whatever_else_is_said() -> None:
     assert not watch.disagree
     watch.on_verdict(6.1, memory, scans=True)
     assert watch.disagree
-    watch.on_verdict(6.2, replace(memory, disagree_since=None), scans=True)
+    watch.on_verdict(6.2, msgspec.structs.replace(memory, disagree_since=None), scans=True)
     assert not watch.disagree
