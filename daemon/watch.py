@@ -85,8 +85,10 @@ class Watch:
         ``waiting``: when readings arrived that no cycle has taken yet.
         """
         window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
-        recent = sum(t_mono - t <= window for t in (*self._arrived, *waiting))
-        if not recent or t_mono - self._arrived[0] < window or window > 10.0 * WINDOW_S:
+        silent = waiting and self._arrived and waiting[0] - self._arrived[-1] > SILENT_S
+        arrived = waiting if silent else (*self._arrived, *waiting)
+        recent = sum(t_mono - t <= window for t in arrived)
+        if not recent or t_mono - arrived[0] < window or window > 10.0 * WINDOW_S:
             return False
         hz = recent / window
         if self._usual_hz == 0.0:

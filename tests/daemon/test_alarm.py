@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from daemon.alarm import CLEAR_S, SETTLE_S, Alarm, bounded
 from daemon.publish.snapshot import State
@@ -89,11 +90,11 @@ TURNING = Light(alive=True, used=True, placed=True, agrees=True, known=(True, Tr
 
 def test_a_bound_stands_where_the_pose_is_held() -> None:
     assert bounded(HELD, Evidence(1.0))
-    assert bounded(replace(HELD, state=State.DEGRADED), Evidence(1.0))
+    assert bounded(structs.replace(HELD, state=State.DEGRADED), Evidence(1.0))
 
 
 def test_a_bound_waits_for_the_heading_only_where_lamps_find_it_and_the_pose_goes_by_it() -> None:
-    young = replace(HELD, state=State.DEGRADED, tracked=False)
+    young = structs.replace(HELD, state=State.DEGRADED, tracked=False)
     assert not bounded(young, Evidence(1.0, light=TURNING))
     assert bounded(young, Evidence(1.0)), "laser alone: a turn in the map is none in the world"
     assert bounded(young, Evidence(1.0, light=replace(TURNING, known=(True, True, True))))
@@ -103,7 +104,7 @@ def test_a_bound_waits_for_the_heading_only_where_lamps_find_it_and_the_pose_goe
 
 @pytest.mark.parametrize("state", [s for s in State if s not in (State.TRACKING, State.DEGRADED)])
 def test_no_bound_in_any_other_state(state: State) -> None:
-    assert not bounded(replace(HELD, state=state), Evidence(1.0))
+    assert not bounded(structs.replace(HELD, state=state), Evidence(1.0))
 
 
 @pytest.mark.parametrize(
@@ -111,9 +112,9 @@ def test_no_bound_in_any_other_state(state: State) -> None:
     [
         (HELD, Evidence(1.0, guessed=True)),
         (HELD, Evidence(1.0, places=1)),
-        (replace(HELD, doubt=True), Evidence(1.0)),
-        (replace(HELD, odd_since=0.9), Evidence(1.0)),
-        (replace(HELD, tracked=False), Evidence(1.0, light=TURNING)),
+        (structs.replace(HELD, doubt=True), Evidence(1.0)),
+        (structs.replace(HELD, odd_since=0.9), Evidence(1.0)),
+        (structs.replace(HELD, tracked=False), Evidence(1.0, light=TURNING)),
     ],
 )
 def test_no_bound_of_a_place_in_doubt(memory: Memory, evidence: Evidence) -> None:

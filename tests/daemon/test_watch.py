@@ -62,6 +62,14 @@ def test_wheels_need_not_be_faster_than_a_slow_lidar() -> None:
     assert not fed((30.0, 5.0)).seldom(30.0, 0.2)
 
 
+def test_readings_that_no_cycle_has_taken_yet_have_come() -> None:
+    watch, waiting = fed((30.0, 10.0)), tuple(30.0 + 0.1 * k for k in range(15))
+    assert not watch.seldom(31.5, 1.0, waiting)
+    assert watch.seldom(31.5, 1.0), "as it would be without them"
+    assert not watch.seldom(41.0, 1.0, (40.9,)), "what came before a silence says nothing of the rate now"
+    assert not Watch().seldom(0.1, 1.0, (0.05,))
+
+
 def test_lost_and_late_readings_are_counted_but_not_those_of_a_silence() -> None:
     watch = Watch()
     watch.on_odometry(reading(0.0))
