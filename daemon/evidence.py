@@ -65,12 +65,12 @@ class Observer:
         self._begun = False
         self._remembered: Array | None = None
 
-    def odometry_ok(self, t_mono: float, waiting: tuple[float, ...] = ()) -> bool | None:
+    def odometry_ok(self, t_mono: float, latest: float | None = None) -> bool | None:
         """Whether odometry is arriving; None where none is configured.
 
-        ``waiting``: when readings arrived that no cycle has taken yet.
+        ``latest``: when the latest reading arrived, which no cycle may have taken yet.
         """
-        latest = max((self._t_odometry, *waiting))
+        latest = self._t_odometry if latest is None else max(self._t_odometry, latest)
         return t_mono - latest <= ODOMETRY_SILENT_S if self._odometry else None
 
     def silence(self, t_mono: float, period: float) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from daemon.arrivals import Arrivals
 from estimator.records import Command
 from hal.adc import RawSamples
 from hal.imu import RawImu
@@ -44,10 +45,12 @@ class Inbox:
 
     Attributes:
         dropped, blocks_dropped: scans, and sample blocks, that no cycle took.
+        wheels: when odometry readings arrived.
     """
 
     def __init__(self) -> None:
         self.dropped = self.blocks_dropped = 0
+        self.wheels = Arrivals()
         self._scan: RawScan | None = None
         self._dropped: list[int] = []
         self._odometry: list[RawOdometry] = []
@@ -80,14 +83,10 @@ class Inbox:
     def put_odometry(self, reading: RawOdometry) -> None:
         """Hold a cumulative reading."""
         self._odometry_total += 1
+        self.wheels.take(reading.t_rx)
         self._odometry.append(reading)
         if len(self._odometry) > DEEPEST:
             self._odometry = self._odometry[::2]
-
-    @property
-    def odometry_waiting(self) -> tuple[float, ...]:
-        """When the readings that no cycle has taken yet arrived: with a slow lidar they wait for a second and more."""
-        return tuple([reading.t_rx for reading in self._odometry])
 
     def put_imu(self, reading: RawImu) -> None:
         """Hold a gyro reading."""

@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import Any, ClassVar, Final, NamedTuple
 from weakref import WeakSet
 
+import msgspec
 import numpy as np
 
 from estimator.keyframe import Keyframe, Submap
@@ -42,7 +43,18 @@ PARTS: Final = frozenset(
     (
         *(
             f"daemon.{name}"
-            for name in ("alarm", "bridge", "evidence", "faults", "inbox", "lampwatch", "leftout", "pace", "picture")
+            for name in (
+                "alarm",
+                "arrivals",
+                "bridge",
+                "evidence",
+                "faults",
+                "inbox",
+                "lampwatch",
+                "leftout",
+                "pace",
+                "picture",
+            )
         ),
         *(f"daemon.{name}" for name in ("publish.snapshot", "reasons", "state", "state_evidence", "state_memory")),
         *("daemon.watch", "daemon.witness", "hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),
@@ -241,6 +253,9 @@ class _Reader(pickle._Unpickler):
         called = self.stack[-1]
         if not (_makes(called) or id(called) in self._makers):
             raise pickle.UnpicklingError(f"{called!r} is not called by a state")
+        struct = isinstance(called, type) and issubclass(called, msgspec.Struct)
+        if struct and len(given) != len(called.__struct_fields__):  # by position: those left out would be made up
+            raise pickle.UnpicklingError(f"{called.__name__}: not all of its fields, or more")
         self.stack[-1] = called(*given)
 
     def newobj(self) -> None:

@@ -15,7 +15,6 @@ from daemon.health import Vitals
 def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
     """The vitals of this moment; ``failed``: names of parts that are down, ``lateness``: of the loop, seconds."""
     parts, status, t_mono = cycle.parts, cycle.parts.status, cycle.parts.clock.now()
-    waiting = cycle.inbox.odometry_waiting
     lag = None if cycle.result is None else cycle.result.lag
     return Vitals(
         t_mono=t_mono,
@@ -26,7 +25,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         missed=status.missed + (cycle.inbox.dropped if cycle.cycles else 0),
         invalid=status.invalid,
         period=cycle.period.seconds,
-        odometry=cycle.observer.odometry_ok(t_mono, waiting),
+        odometry=cycle.observer.odometry_ok(t_mono, cycle.inbox.wheels.latest),
         odometry_jumps=cycle.odometry.jumps,
         disagree=cycle.watch.disagree,
         late=cycle.watch.late,
@@ -35,7 +34,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         readings=cycle.watch.readings,
         readings_missed=cycle.watch.missed,
         readings_old=cycle.watch.old,
-        readings_seldom=cycle.watch.seldom(t_mono, cycle.period.seconds, waiting),
+        readings_seldom=cycle.inbox.wheels.seldom(t_mono, cycle.period.seconds),
         **_photodiode(cycle, t_mono),
         cycles=cycle.cycles,
         overruns=cycle.overruns,

@@ -1,14 +1,14 @@
-"""What the data say of their devices beyond coming or not: too late, too few, and at odds with everything else.
+"""What the data say of their devices beyond coming or not: too late, lost, and at odds with everything else.
 
 Counters and facts for the vitals, fed by the cycle; nothing here changes what is done with the data.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from typing import Final
 
+from daemon.arrivals import SILENT_S
 from daemon.publish.snapshot import State
 from daemon.reasons import Reason
 from daemon.state_memory import Memory
@@ -19,18 +19,6 @@ LATE_PERIODS: Final = 2.5
 """Scan periods from a scan's first beam to its arrival: a revolution takes one, the line less than another."""
 LATE_S: Final = 0.15
 """Age of an odometry reading at its arrival, where sender and daemon share a clock."""
-SILENT_S: Final = 1.0
-WINDOW_S: Final = 2.0
-ENOUGH: Final = 20
-"""Readings that a rate is judged by."""
-READINGS: Final = 2560
-"""Readings whose arrival is kept: of a window and more at 1 kHz."""
-FEWER: Final = 0.6
-"""Part of the usual rate of readings below which they come more seldom than before."""
-LEAST_HZ: Final = 10.0
-"""Rate of readings that is asked for; less will do for a lidar that turns more slowly."""
-LEARNING: Final = 0.03
-"""Weight of a window of readings in the usual rate: what lasts for a minute has become usual."""
 MISFIT_S: Final = 2.0
 """A laser that is at odds with the map for this long is told, once the place had been known."""
 NOWHERE_S: Final = 5.0
@@ -56,9 +44,7 @@ class Watch:
     def __init__(self) -> None:
         self.late = self.readings = self.missed = self.old = 0
         self.misfit = self.disagree = False
-        self._arrived: deque[float] = deque(maxlen=READINGS)
-        self._usual_hz = 0.0
-        self._t_learned = 0.0
+        self._t_reading: float | None = None
         self._known = False
         self._odd_since: float | None = None
         self._odd_last = 0.0
@@ -70,33 +56,12 @@ class Watch:
 
     def on_odometry(self, reading: RawOdometry) -> None:
         """A reading has been taken; what was lost while none came at all is told as silence."""
-        if self._arrived and reading.t_rx - self._arrived[-1] > SILENT_S:
-            self._arrived.clear()
+        if self._t_reading is not None and reading.t_rx - self._t_reading > SILENT_S:
             reading = replace(reading, missed=0)
         self.readings += 1
         self.missed += reading.missed
         self.old += reading.t_rx - reading.t_mono > LATE_S
-        self._arrived.append(reading.t_rx)
-
-    def seldom(self, t_mono: float, period: float, waiting: tuple[float, ...] = ()) -> bool:
-        """Whether odometry readings come more seldom than they used to, or than is asked for; asked for once a second.
-
-        What is asked for goes by the lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
-        ``waiting``: when readings arrived that no cycle has taken yet.
-        """
-        window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
-        silent = waiting and self._arrived and waiting[0] - self._arrived[-1] > SILENT_S
-        arrived = waiting if silent else (*self._arrived, *waiting)
-        recent = sum(t_mono - t <= window for t in arrived)
-        if not recent or t_mono - arrived[0] < window or window > 10.0 * WINDOW_S:
-            return False
-        hz = recent / window
-        if self._usual_hz == 0.0:
-            self._usual_hz = hz
-        elif t_mono - self._t_learned >= 0.5 * window:
-            self._usual_hz += LEARNING * (hz - self._usual_hz)
-            self._t_learned = t_mono
-        return hz < FEWER * max(self._usual_hz, min(LEAST_HZ, 1.0 / period))
+        self._t_reading = reading.t_rx
 
     def on_verdict(self, t_mono: float, memory: Memory, scans: bool) -> None:
         """A cycle has judged; ``scans``: they arrive and are compared with the map."""

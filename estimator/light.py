@@ -32,6 +32,16 @@ class LightsSetup:
     residuals: ResidualMap | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """What an epoch has said of a pose, and whether that was with the pose compared with the `lights` filter's."""
+
+    epoch: LightEpoch
+    T_map_base: Array
+    compared: bool
+    misplaced: bool
+
+
 class Light:
     """What is known from light, without a place by the laser.
 
@@ -39,7 +49,7 @@ class Light:
         setup: as given. decoder: of the photodiode's blocks. filter: see estimator/lights.py. result: after the latest
             epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself. guided:
             instant and pose (odom frame) of the latest scan, if its match may tell how the robot moves; see `guide`.
-        asked: the epoch, and the pose, of which `relocate_light.misplaced` was asked last, and what it said.
+        asked: what `relocate_light.misplaced` was asked last.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
@@ -53,7 +63,7 @@ class Light:
         self.epoch: LightEpoch | None = None
         self.glimpse: tuple[LightEpoch, tuple[Place, ...]] | None = None
         self.guided: tuple[float, Array] | None = None
-        self.asked: tuple[LightEpoch, Array, bool] | None = None
+        self.asked: Asked | None = None
         self._decoded = self._decoded_before = False
         self._spared = 0
 

@@ -20,7 +20,7 @@ from estimator.absolute import SILENT_S
 from estimator.cdma_epoch import UNUSABLE, LightEpoch
 from estimator.ekf_start import CAP
 from estimator.lamps import Lamp
-from estimator.light import Light
+from estimator.light import Asked, Light
 from estimator.lights_links import sights
 from estimator.lights_start import RIVAL, Place, direct, places, probabilities, straight
 from estimator.lights_state import Lights, Track
@@ -153,12 +153,12 @@ def misplaced(state: State, T_map_base: Array) -> bool:
     """
     if state.light is None or state.absolute is None or silent(state.light):
         return False
-    asked, epoch = state.light.asked, state.light.epoch
-    if asked is None or asked[0] is not epoch or np.hypot(*(T_map_base - asked[1])[:2]) > ASKED_M:
+    asked, epoch, compared = state.light.asked, state.light.epoch, state.absolute.gap is not None
+    same = asked is not None and asked.epoch is epoch and asked.compared == compared
+    if asked is None or not same or math.hypot(*(T_map_base - asked.T_map_base)[:2].tolist()) > ASKED_M:
         assert epoch is not None
-        answer = _misplaced(state, T_map_base, compared=state.absolute.gap is not None)
-        state.light.asked = asked = epoch, T_map_base, answer
-    return asked[2]
+        state.light.asked = asked = Asked(epoch, T_map_base, compared, _misplaced(state, T_map_base, compared))
+    return asked.misplaced
 
 
 def _misplaced(state: State, T_map_base: Array, compared: bool) -> bool:

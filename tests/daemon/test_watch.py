@@ -21,55 +21,6 @@ def reading(t_rx: float, age: float = 0.0, missed: int = 0) -> RawOdometry:
     return RawOdometry(t_rx, t_rx - age, 0.0, 0.0, 0.0, missed)
 
 
-def fed(*spells: tuple[float, float]) -> Watch:
-    """A watch that is asked once a second; spells of (seconds, readings per second)."""
-    watch, t = Watch(), 0.0
-    for seconds, hz in spells:
-        for k in range(round(seconds * hz)):
-            watch.on_odometry(reading(t + k / hz))
-            if k % round(hz) == 0:
-                watch.seldom(t + k / hz, PERIOD)
-        t += seconds
-    return watch
-
-
-@pytest.mark.parametrize(
-    ("spells", "seldom"),
-    [
-        (((20.0, 50.0),), False),
-        (((20.0, 10.0),), False),
-        (((20.0, 50.0), (4.0, 12.5)), True),
-        (((20.0, 50.0), (120.0, 12.5)), False),  # it has become usual
-        (((20.0, 12.5), (4.0, 50.0)), False),
-        (((30.0, 4.0),), True),  # fewer than scans
-        (((1.0, 50.0),), False),  # too early to say
-    ],
-)
-def test_readings_that_come_more_seldom_than_before(spells: tuple[tuple[float, float], ...], seldom: bool) -> None:
-    assert fed(*spells).seldom(sum(seconds for seconds, _ in spells), PERIOD) is seldom
-
-
-@pytest.mark.parametrize(("hz", "period", "seldom"), [(20.0, 0.025, False), (10.0, 0.025, False), (5.0, 0.025, True)])
-def test_wheels_that_are_slower_than_a_fast_lidar_are_no_fault(hz: float, period: float, seldom: bool) -> None:
-    watch = Watch()
-    for k in range(round(60.0 * hz)):
-        watch.on_odometry(reading(k / hz))
-        if k % round(hz) == 0 and k > 10.0 * hz:
-            assert watch.seldom(k / hz, period) is seldom
-
-
-def test_wheels_need_not_be_faster_than_a_slow_lidar() -> None:
-    assert not fed((30.0, 5.0)).seldom(30.0, 0.2)
-
-
-def test_readings_that_no_cycle_has_taken_yet_have_come() -> None:
-    watch, waiting = fed((30.0, 10.0)), tuple(30.0 + 0.1 * k for k in range(15))
-    assert not watch.seldom(31.5, 1.0, waiting)
-    assert watch.seldom(31.5, 1.0), "as it would be without them"
-    assert not watch.seldom(41.0, 1.0, (40.9,)), "what came before a silence says nothing of the rate now"
-    assert not Watch().seldom(0.1, 1.0, (0.05,))
-
-
 def test_lost_and_late_readings_are_counted_but_not_those_of_a_silence() -> None:
     watch = Watch()
     watch.on_odometry(reading(0.0))
@@ -79,7 +30,6 @@ def test_lost_and_late_readings_are_counted_but_not_those_of_a_silence() -> None
     assert (watch.readings, watch.missed, watch.old) == (4, 1, 1)
     watch.on_odometry(reading(9.0, missed=400))
     assert (watch.readings, watch.missed) == (5, 1), "silence has a fault of its own"
-    assert not watch.seldom(9.5, PERIOD), "and what came before it says nothing of the rate now"
 
 
 def test_late_scans_are_counted() -> None:
@@ -147,10 +97,6 @@ def test_scans_that_have_not_fitted_once_are_no_fault_for_ever() -> None:
     for k in range(1, 150):
         watch.on_verdict(0.1 + 0.1 * k, Memory(State.DEGRADED, Reason.LIGHT_DARK), scans=True)
     assert not watch.misfit
-
-
-def test_a_fast_sender_that_becomes_slow_is_noticed() -> None:
-    assert fed((20.0, 1000.0), (4.0, 100.0)).seldom(24.0, PERIOD)
 
 
 def test_disagreement_counts_whatever_else_is_said() -> None:

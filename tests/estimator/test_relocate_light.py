@@ -350,6 +350,11 @@ def test_an_epoch_is_asked_again_only_about_another_place() -> None:
     light.filter.catalogue.rims = strong
     light.epoch = replace(light.epoch)
     assert misplaced(state, away)
+    light.result, state.absolute.gap = shown(robot()).light.result, 1.0  # type: ignore[union-attr]
+    light.epoch = replace(light.epoch)
+    assert not misplaced(state, away), "what is used fits, and is held against the pose"
+    state.absolute.gap = None  # type: ignore[union-attr]
+    assert misplaced(state, away), "it is not any more"
     light.filter.course.t_mono += 10.0
     assert not misplaced(state, away), "nothing is received any more"
 

@@ -16,6 +16,7 @@ from daemon.checkpoint import Taken
 from daemon.faults import Fault
 from daemon.publish.snapshot import State as Said
 from daemon.restore import ROOT, CannotRestore, Piece, function_within, restore
+from daemon.state_memory import Memory
 from daemon.watch import Watch
 from estimator import se2
 from estimator.records import Limits, Rung
@@ -121,6 +122,7 @@ FORGED = {
     "a call with nobody to call": Call("text", 1),
     "an object of a class elsewhere": Call(reading.blank, dict),
     "a partial's attributes": Build(Call(functools.partial, Watch), (Watch, (), None, {"x": 1})),
+    "a struct with fewer fields": Call(Memory, 3, 0),
     "memory by numpy": Call(np.ndarray, (1 << 20,), "O", b"12345678"),
     "objects by numpy": Call(np.dtype, "O"),
     "a dtype that all share": Build(Call(np.dtype, "f8"), (3, ">", None, None, None, -1, -1, 0)),
@@ -177,3 +179,5 @@ def test_what_other_software_has_written_with_fewer_fields_is_refused_by_name() 
     """Else it would fail in the middle of a replay, for want of an attribute."""
     with pytest.raises(pickle.UnpicklingError, match="Limits lacks 'icp_iterations': other software"):
         reading.fill(reading.blank(Limits), {"points": 1})
+    with pytest.raises(CannotRestore, match="Memory: not all of its fields, or more"):
+        taken(forged(Call(Memory, 3, 0)))

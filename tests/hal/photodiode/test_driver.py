@@ -114,7 +114,9 @@ def test_first_word_after_a_pause_is_left_out() -> None:
     [(FT260, 30, "60 bytes"), (CP2112, 30, "61 bytes"), (CH341, 30, "32 bytes"), (I2C_GPIO, 278, "bit by bit")],
     ids=["FT260", "CP2112", "CH341", "i2c-gpio"],
 )
-def test_adapters_that_pause_are_named(adapter: Adapter, samples: int, why: str) -> None:
+def test_adapters_that_pause_are_named(
+    adapter: Adapter, samples: int, why: str, caplog: pytest.LogCaptureFixture
+) -> None:
     async def body(bench: Bench) -> None:
         driver = bench.driver()
         async with bench.running(driver):
@@ -123,6 +125,17 @@ def test_adapters_that_pause_are_named(adapter: Adapter, samples: int, why: str)
         assert abs(blocks[-1].words.size - samples) <= 4
 
     on_fake(body, adapter=adapter)
+    assert [why in one.getMessage() for one in caplog.records if "not fit for decoding" in one.getMessage()] == [True]
+
+
+def test_nothing_is_said_of_an_adapter_that_does_not_pause(caplog: pytest.LogCaptureFixture) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(5, 10.0, driver)
+
+    on_fake(body)
+    assert not caplog.records
 
 
 def test_an_adapter_that_cannot_read_blocks_is_refused() -> None:
