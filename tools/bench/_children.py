@@ -26,11 +26,16 @@ class CannotRun(RuntimeError):
 
 
 @contextmanager
-def child(*words: str, ask: bool = False, hear: bool = False) -> Iterator[subprocess.Popen[bytes]]:
-    """A program beside this one, killed with the block, or with this process; ``ask``, ``hear``: pipes to and from."""
+def child(*words: str, ask: bool = False, hear: bool = False, mute: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+    """A program beside this one, killed with the block, or with this process.
+
+    ``ask``, ``hear``: pipes to it and from it. ``mute``: nobody hears it at all.
+    """
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
-    words = (*LEASH, *words)
-    with subprocess.Popen(words, cwd=ROOT, stdin=pipe if ask else none, stdout=pipe if hear else None) as started:
+    words, said = (*LEASH, *words), none if mute else None
+    with subprocess.Popen(
+        words, cwd=ROOT, stdin=pipe if ask else none, stdout=pipe if hear else said, stderr=said
+    ) as started:
         try:
             yield started
         finally:

@@ -9,7 +9,6 @@ import selectors
 import socket
 import statistics
 import struct
-import subprocess
 import sys
 import time
 import timeit
@@ -25,6 +24,7 @@ from daemon.publish import registers
 from daemon.publish.modbus import ModbusPublisher
 from daemon.publish.snapshot import Snapshot, State
 from hal.clock import SystemClock
+from tools.bench._children import child, ended, lines
 from tools.figures import Figure, bounded, table
 
 COMMAND: Final = "python -m tools.bench.modbus"
@@ -92,14 +92,11 @@ def free_port() -> int:
 def servers() -> Iterator[dict[str, int]]:
     """Ports of both servers by name, in a process of their own."""
     command = [sys.executable, "-m", "tools.bench.modbus", "--serve"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            yield json.loads(process.stdout.readline())
-        finally:
-            assert process.stdin is not None
-            process.stdin.close()
-            process.wait(10)
+    with child(*command, ask=True, hear=True) as process:
+        yield json.loads(next(lines(process, "the servers")))
+        assert process.stdin is not None
+        process.stdin.close()
+        ended(process, "the servers")
 
 
 def connected(port: int, kind: socket.SocketKind) -> socket.socket:

@@ -14,7 +14,6 @@ import multiprocessing
 import os
 import selectors
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -26,6 +25,7 @@ import numpy as np
 from daemon.publish import registers
 from daemon.publish.modbus import ModbusPublisher
 from hal.clock import SystemClock
+from tools.bench._children import child, ended, lines
 from tools.bench.modbus import connected, example, request
 from tools.figures import Figure, bounded
 
@@ -81,22 +81,19 @@ async def serve() -> None:
 def server() -> Iterator[tuple[int, bool, Callable[[], list[float]]]]:
     """Port of a server in its own process, whether it runs under FIFO, and what asks for its lateness."""
     command = [sys.executable, "-m", "tools.bench.modbus_load", "--serve"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with child(*command, ask=True, hear=True) as process:
         assert process.stdin is not None
-        assert process.stdout is not None
-        stdin, stdout = process.stdin, process.stdout
+        stdin, said = process.stdin, lines(process, "the server")
 
         def late() -> list[float]:
             stdin.write(b"\n")
             stdin.flush()
-            return [float(value) for value in json.loads(stdout.readline())]
+            return [float(value) for value in json.loads(next(said))]
 
-        try:
-            facts = json.loads(stdout.readline())
-            yield facts["port"], facts["fifo"], late
-        finally:
-            stdin.close()
-            process.wait(10)
+        facts = json.loads(next(said))
+        yield facts["port"], facts["fifo"], late
+        stdin.close()
+        ended(process, "the server")
 
 
 def reads(port: int, total: int) -> tuple[int, int, float]:

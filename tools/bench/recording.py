@@ -15,6 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from tools.bench._children import child, ended
 from tools.figures import Figure, bounded
 
 COMMAND = "make bench ARGS=recording"
@@ -33,26 +34,26 @@ def share(lidar: Path, *more: str) -> float:
     """Share of a core that a daemon takes that has run for a while."""
     settings = [f"lidar.device={lidar}", "modbus.port=0", "map.folder=none"]
     command = [sys.executable, "-m", "daemon", "run", *(w for s in settings for w in ("--set", s)), *more]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as daemon:
-        try:
-            time.sleep(SETTLE_S)
-            _alive(daemon, "the daemon")
-            begun, before = time.monotonic(), processor_s(daemon.pid)
-            time.sleep(SPAN_S)
-            _alive(daemon, "the daemon")
-            return (processor_s(daemon.pid) - before) / (time.monotonic() - begun)
-        finally:
-            daemon.send_signal(signal.SIGTERM)
+    with child(*command, mute=True) as daemon:
+        time.sleep(SETTLE_S)
+        _alive(daemon, "the daemon")
+        begun, before = time.monotonic(), processor_s(daemon.pid)
+        time.sleep(SPAN_S)
+        _alive(daemon, "the daemon")
+        took = (processor_s(daemon.pid) - before) / (time.monotonic() - begun)
+        daemon.send_signal(signal.SIGTERM)
+        ended(daemon, "the daemon")
+        return took
 
 
-def _alive(child: subprocess.Popen[bytes], name: str) -> None:
+def _alive(started: subprocess.Popen[bytes], name: str) -> None:
     """A process that has ended takes no processor time, and would look good.
 
     Raises:
         RuntimeError: it has.
     """
-    if child.poll() is not None:
-        raise RuntimeError(f"{name} ended with {child.returncode}: nothing can be measured")
+    if started.poll() is not None:
+        raise RuntimeError(f"{name} ended with {started.returncode}: nothing can be measured")
 
 
 def run() -> list[Figure]:
@@ -61,17 +62,14 @@ def run() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         link, ring = Path(folder, "lidar"), Path(folder, "ring")
         fake = [sys.executable, "-m", "hal.fake", "--model", "UTM-30LX", "--pty", str(link)]
-        with subprocess.Popen(fake, stdout=subprocess.DEVNULL) as sensor:
-            try:
-                while not os.path.lexists(link):
-                    _alive(sensor, "the fake sensor")
-                    time.sleep(0.02)
-                share(link)  # it may compile
-                for _ in range(PAIRS):
-                    alone.append(share(link))
-                    added.append(share(link, "--record", str(ring), "--last", "10") - alone[-1])
-            finally:
-                sensor.send_signal(signal.SIGINT)
+        with child(*fake, mute=True) as sensor:
+            while not os.path.lexists(link):
+                _alive(sensor, "the fake sensor")
+                time.sleep(0.02)
+            share(link)  # it may compile
+            for _ in range(PAIRS):
+                alone.append(share(link))
+                added.append(share(link, "--record", str(ring), "--last", "10") - alone[-1])
     return [
         Figure("a daemon that does not record, of a core", 100.0 * statistics.median(alone), "%", command=COMMAND),
         bounded("recording adds, of a core", 100.0 * statistics.median(added), "%", "<= 2", COMMAND),

@@ -6,13 +6,13 @@ import os
 import signal
 import socket
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
 from daemon.publish import registers
+from tools.bench._children import child, ended
 from tools.figures import Figure, bounded
 
 COMMAND = "make bench ARGS=start"
@@ -40,16 +40,16 @@ def _started(lidar: Path, poses: socket.socket) -> tuple[float, float]:
     settings = [f"lidar.device={lidar}", "modbus.port=0", "map.folder=none", f'pose.receivers=["{receiver}"]']
     command = [sys.executable, "-m", "daemon", "run", *(w for s in settings for w in ("--set", s))]
     begun = time.monotonic()
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as daemon:
-        try:
-            poses.settimeout(120.0)
-            while registers.decode_datagram(poses.recv(2000))["map_x"] is None:
-                pass
-            seconds = time.monotonic() - begun
-            time.sleep(SETTLE_S)
-            return seconds, resident_mb(daemon.pid)
-        finally:
-            daemon.send_signal(signal.SIGTERM)
+    with child(*command, mute=True) as daemon:
+        poses.settimeout(120.0)
+        while registers.decode_datagram(poses.recv(2000))["map_x"] is None:
+            pass
+        seconds = time.monotonic() - begun
+        time.sleep(SETTLE_S)
+        resident = resident_mb(daemon.pid)
+        daemon.send_signal(signal.SIGTERM)
+        ended(daemon, "the daemon")
+        return seconds, resident
 
 
 def run() -> list[Figure]:
@@ -58,17 +58,14 @@ def run() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder) / "lidar"
         fake = [sys.executable, "-m", "hal.fake", "--model", "UTM-30LX", "--pty", str(link)]
-        with subprocess.Popen(fake, stdout=subprocess.DEVNULL) as sensor:
-            try:
-                while not os.path.lexists(link):
-                    time.sleep(0.02)
-                for attempt in range(RUNS + 1):
-                    took, resident = started(link)
-                    if attempt:
-                        seconds.append(took)
-                        memory.append(resident)
-            finally:
-                sensor.send_signal(signal.SIGINT)
+        with child(*fake, mute=True):
+            while not os.path.lexists(link):
+                time.sleep(0.02)
+            for attempt in range(RUNS + 1):
+                took, resident = started(link)
+                if attempt:
+                    seconds.append(took)
+                    memory.append(resident)
     return [
         bounded("process start to first pose, warm", statistics.median(seconds), "s", "<= 1.5", COMMAND),
         bounded("resident memory, 1081 beams at 40 Hz", statistics.median(memory), "MB", "<= 260", COMMAND),
