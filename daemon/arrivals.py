@@ -6,6 +6,7 @@ from collections import deque
 from typing import Final
 
 SILENT_S: Final = 1.0
+"""Between two readings: what came before says nothing of now."""
 WINDOW_S: Final = 2.0
 ENOUGH: Final = 20
 """Readings that a rate is judged by."""

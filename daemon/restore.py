@@ -41,21 +41,8 @@ ESTIMATOR: Final = "estimator."
 """Numbers only: nothing in there knows the operating system."""
 PARTS: Final = frozenset(
     (
-        *(
-            f"daemon.{name}"
-            for name in (
-                "alarm",
-                "arrivals",
-                "bridge",
-                "evidence",
-                "faults",
-                "inbox",
-                "lampwatch",
-                "leftout",
-                "pace",
-                "picture",
-            )
-        ),
+        *(f"daemon.{name}" for name in ("alarm", "arrivals", "bridge", "evidence", "faults", "inbox", "lampwatch")),
+        *(f"daemon.{name}" for name in ("leftout", "pace", "picture")),
         *(f"daemon.{name}" for name in ("publish.snapshot", "reasons", "state", "state_evidence", "state_memory")),
         *("daemon.watch", "daemon.witness", "hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),
     )
