@@ -18,8 +18,9 @@ sender stand in one file. An unknown word, a wrong key or a value out of range i
 
 from __future__ import annotations
 
+import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -104,11 +105,17 @@ def _check(path: str, value: Any, rule: Parameter) -> Value:
     if type(value) is not kind:
         raise FaultError(path, f"expected a {kind.__name__}, got {value!r}")
     if rule.choices and value not in rule.choices:
-        raise FaultError(path, f"{value!r} is none of {', '.join(rule.choices)}")
+        raise FaultError(path, f"{value!r} is none of {', '.join(rule.choices)}{_near(value, rule.choices)}")
     if isinstance(value, (int, float)) and not rule.low <= value <= rule.high:
         raise FaultError(path, f"{value!r} is outside {rule.low:g}...{rule.high:g}")
     checked: Value = kind(value)
     return checked
+
+
+def _near(word: Any, known: Iterable[str]) -> str:
+    """What may have been meant by a word that is not known."""
+    close = difflib.get_close_matches(str(word), list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 def read_fault(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocabulary]) -> Fault:
@@ -119,18 +126,29 @@ def read_fault(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, V
     """
     able = [name for name, words in vocabularies.items() if len(vocabularies) == 1 or table.get("what") in words]
     where = table.get("where", able[0] if len(able) == 1 else None)
-    if where not in vocabularies:
-        raise FaultError(f"{path}.where", f"{where!r} is no device here; there are: {', '.join(sorted(vocabularies))}")
     what = table.get("what")
+    if where is None:  # not named, and the word does not tell, either
+        every = sorted({word for words in vocabularies.values() for word in words})
+        problem = f"name one of {', '.join(able)}" if able else f"{what!r} is no fault of any device here"
+        raise FaultError(f"{path}.{'where' if able else 'what'}", problem + ("" if able else _near(what, every)))
+    if where not in vocabularies:
+        there = sorted(vocabularies)
+        raise FaultError(
+            f"{path}.where", f"{where!r} is no device here; there are: {', '.join(there)}{_near(where, there)}"
+        )
     word = vocabularies[where].get(what) if isinstance(what, str) else None
     if word is None:
-        known = ", ".join(sorted(vocabularies[where]))
-        raise FaultError(f"{path}.what", f"{what!r} is no fault of {where!r}; known: {known}")
+        known = sorted(vocabularies[where])
+        raise FaultError(
+            f"{path}.what", f"{what!r} is no fault of {where!r}; known: {', '.join(known)}{_near(what, known)}"
+        )
     common = COMMON[word.kind]
     rules = {**common, **word.parameters}
     unknown = sorted(set(table) - set(rules) - {"what", "where"})
     if unknown:
-        raise FaultError(f"{path}.{unknown[0]}", f"{what!r} takes: what, where, {', '.join(rules)}")
+        raise FaultError(
+            f"{path}.{unknown[0]}", f"{what!r} takes: what, where, {', '.join(rules)}{_near(unknown[0], rules)}"
+        )
     given = {key: _check(f"{path}.{key}", value, rules[key]) for key, value in table.items() if key in rules}
     values = {key: given.get(key, rule.default) for key, rule in word.parameters.items()}
     return Fault(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -11,8 +12,9 @@ from xml.etree import ElementTree
 import pytest
 
 from daemon.versions import versions
+from tools.bench.against import CannotCompare, Compared, read, regressions
 from tools.bench.plots import Plot, Series, histogram, svg
-from tools.bench.report import About, CannotCompare, Figure, Result, facts, junit, page, read, regressions, write
+from tools.bench.report import About, CannotReport, Figure, Result, demand_room, facts, junit, page, write
 
 NOISE = Figure("noise", 10.0, "mm", "more")
 GOOD = Result("boots", "Debian boots", True, 20.0, "up after 20 s", figures=(NOISE,))
@@ -22,7 +24,7 @@ ABOUT = About("bench-vm", "Virtual bench", {"version": "1", "configuration": "[l
 
 
 def kept(tmp_path: Path, *results: Result) -> Path:
-    write(tmp_path, list(results), ABOUT, None)
+    write(tmp_path, list(results), ABOUT)
     return tmp_path / "results.json"
 
 
@@ -32,11 +34,11 @@ def test_the_report_names_what_failed_and_what_was_not_tried(tmp_path: Path) -> 
     assert [case.get("name") for case in suite if case.find("failure") is not None] == ["drives"]
     assert [case.get("name") for case in suite if case.find("skipped") is not None] == ["walks"]
     assert suite.find(".//property[@name='noise']").get("value") == "10 mm"  # type: ignore[union-attr]  # it is there
-    text = page([GOOD, BAD, LEFT], ABOUT, [])
+    text = page([GOOD, BAD, LEFT], ABOUT, Compared())
     assert "Virtual bench: 1 of 3 passed, 1 not tried" in text
     assert "log &lt;of&gt; the daemon" in text
     assert "[lidar]\n&lt;x&gt;" in text
-    assert write(tmp_path, [GOOD, BAD, LEFT], ABOUT, None) == []
+    assert write(tmp_path, [GOOD, BAD, LEFT], ABOUT) == Compared()
     assert json.loads((tmp_path / "results.json").read_text())["results"][0]["name"] == "boots"
 
 
@@ -47,13 +49,15 @@ def test_what_a_device_says_cannot_break_the_xml() -> None:
 def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
     slow = replace(GOOD, seconds=60.0)
     fine = replace(BAD, passed=True)
-    before = read(kept(tmp_path, GOOD, fine))
+    before = read(kept(tmp_path, GOOD, fine), "bench-vm").results
     assert regressions([slow, BAD], before) == ["drives passed then"], "the machine may be to blame for seconds"
     assert regressions([GOOD, fine], before) == []
     assert regressions([replace(LEFT, name="boots")], before) == [
         "boots passed then, and was not tried now: needs motion"
     ]
-    assert write(tmp_path / "now", [slow, BAD], ABOUT, tmp_path) == ["drives passed then"]
+    compared = write(tmp_path / "now", [slow, BAD], ABOUT, read(tmp_path, "bench-vm"))
+    assert compared.worse == ["drives passed then"]
+    assert compared.closing()[-1] == "FAILED: 1 worse than before"
     written = (tmp_path / "now" / "report.html").read_text()
     assert "drives passed then" in written
     assert "60.0 (20.0 then)" in written
@@ -61,7 +65,7 @@ def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
 
 def test_a_figure_that_is_not_measured_any_more_is_worse(tmp_path: Path) -> None:
     told = Figure("temperature", 31.0, "deg C")
-    before = read(kept(tmp_path, replace(GOOD, figures=(NOISE, told))))
+    before = read(kept(tmp_path, replace(GOOD, figures=(NOISE, told))), "bench-vm").results
     assert regressions([replace(GOOD, figures=())], before) == ["boots: noise is not measured any more, 10 then"]
     assert regressions([replace(GOOD, figures=(NOISE,))], before) == []
     failed = replace(GOOD, figures=(), passed=False)
@@ -82,10 +86,10 @@ def test_a_figure_that_is_not_measured_any_more_is_worse(tmp_path: Path) -> None
     ],
 )
 def test_a_figure_is_worse_in_its_own_direction(worse: str, value: float, lost: bool, tmp_path: Path) -> None:
-    before = read(kept(tmp_path, GOOD))
+    before = read(kept(tmp_path, GOOD), "bench-vm").results
     now = replace(GOOD, figures=(replace(NOISE, value=value, worse=worse),))
     assert bool(regressions([now], before)) is lost
-    assert f"({10:.4g} then)" in page([now], ABOUT, [], before)
+    assert f"({10:.4g} then)" in page([now], ABOUT, Compared(), read(tmp_path, "bench-vm"))
 
 
 def test_what_was_not_measured_then_is_not_worse_now() -> None:
@@ -95,19 +99,79 @@ def test_what_was_not_measured_then_is_not_worse_now() -> None:
 
 def test_room_allows_what_is_small(tmp_path: Path) -> None:
     figure = Figure("lost scans", 0.0, worse="more", room=2.0)
-    before = read(kept(tmp_path, replace(GOOD, figures=(figure,))))
+    before = read(kept(tmp_path, replace(GOOD, figures=(figure,))), "bench-vm").results
     assert not regressions([replace(GOOD, figures=(replace(figure, value=2.0),))], before)
     assert regressions([replace(GOOD, figures=(replace(figure, value=3.0),))], before)
 
 
-@pytest.mark.parametrize("text", ["{}", "[1]", "x"])
-def test_what_cannot_be_compared_with_is_refused_before_anything_is_written(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["{}", "[1]", "x", '{"results": [], "about": 3}'])
+def test_what_cannot_be_compared_with_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "old.json").write_text(text)
     with pytest.raises(CannotCompare, match="no results of a bench"):
-        write(tmp_path / "out", [GOOD], ABOUT, tmp_path / "old.json")
+        read(tmp_path / "old.json", "bench-vm")
     with pytest.raises(CannotCompare, match=r"name the results\.json"):
-        write(tmp_path / "out", [GOOD], ABOUT, tmp_path / "none.json")
-    assert not (tmp_path / "out").exists()
+        read(tmp_path / "none.json", "bench-vm")
+
+
+def test_another_benchs_report_is_refused(tmp_path: Path) -> None:
+    kept(tmp_path, GOOD)
+    with pytest.raises(CannotCompare, match="is a report of bench-vm, and this is hil"):
+        read(tmp_path, "hil")
+    before = read(tmp_path, "bench-vm")
+    before.demand(["boots", "drives"])
+    before.demand([])
+    with pytest.raises(CannotCompare, match=r"nothing of what is to be tried now \(drives\); it has boots"):
+        before.demand(["drives"])
+
+
+def test_an_older_report_that_names_no_bench_is_taken_and_that_is_said(tmp_path: Path) -> None:
+    old = json.loads(kept(tmp_path, GOOD).read_text())
+    del old["bench"]
+    (tmp_path / "results.json").write_text(json.dumps(old))
+    compared = write(tmp_path / "now", [GOOD], ABOUT, read(tmp_path, "bench-vm"))
+    assert "does not say of which bench it is" in compared.told[1]
+
+
+def test_what_could_be_compared_is_said_and_what_could_not(tmp_path: Path) -> None:
+    """In the terminal and in the page; where another device or computer may be the reason for a difference, too."""
+    write(tmp_path, [GOOD, LEFT], replace(ABOUT, facts={"lidar": "/dev/ttyACM0", "adc": "fake", "load": "1"}))
+    more = replace(GOOD, figures=(NOISE, replace(NOISE, name="drift")))
+    about = replace(ABOUT, facts={"lidar": "tcp://h", "adc": "fake", "load": "9"})
+    compared = write(tmp_path / "now", [more, BAD], about, read(tmp_path, "bench-vm"))
+    assert compared.told == (
+        f"compared with {tmp_path}/results.json: 1 of 2 outcomes, 1 of 2 figures; not in the other: drives, "
+        "boots: drift; only in the other: walks",
+        "lidar differs, and so may figures: tcp://h; /dev/ttyACM0 then",
+    )
+    assert compared.closing() == list(compared.told)
+    text = (tmp_path / "now" / "report.html").read_text()
+    assert all(line in text for line in compared.told)
+
+
+def test_where_no_report_can_be_written_is_said_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    demand_room(tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
+    (tmp_path / "file").touch()
+    for place in (tmp_path / "file", tmp_path / "file" / "out", Path("/proc/out")):
+        with pytest.raises(CannotReport, match=f"nothing can be written to {place}; name another folder with --out"):
+            demand_room(place)
+    kept(tmp_path, GOOD)
+    demand_room(tmp_path)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "junit.xml")
+    with pytest.raises(CannotReport):
+        demand_room(tmp_path)
+
+
+def test_what_was_tried_on_a_fake_is_marked(tmp_path: Path) -> None:
+    """It is no device that has passed."""
+    compared = write(tmp_path, [replace(GOOD, fake=True), replace(GOOD, name="starts")], ABOUT)
+    assert compared == Compared()
+    text = (tmp_path / "report.html").read_text()
+    assert "2 of 2 passed (1 of them on fakes)" in text
+    assert text.count("passed (fake)") == 1
+    marked = ElementTree.parse(tmp_path / "junit.xml").findall(".//property[@name='device'][@value='fake']")
+    assert len(marked) == 1
+    assert [one["fake"] for one in json.loads((tmp_path / "results.json").read_text())["results"]] == [True, False]
 
 
 def test_facts_say_which_software_on_which_computer() -> None:
@@ -139,4 +203,4 @@ def test_pictures_are_well_formed_whatever_is_drawn() -> None:
         assert len(text) < 60_000
         ElementTree.fromstring(text)
     with_plots = replace(GOOD, plots=(plots[1],))
-    assert "<svg" in page([with_plots], ABOUT, [])
+    assert "<svg" in page([with_plots], ABOUT, Compared())

@@ -38,6 +38,7 @@ from tools.sim.scene_light import SceneLight
 ROOT = Path(__file__).parents[2]
 Floats = np.ndarray
 """4.7 kOhm and 10 nF."""
+SILENCE = "[[fault]]\nwhat='silence'\nwhere='lidar'\n"
 LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
 
 
@@ -73,6 +74,12 @@ def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
         ("[[expect]]\nwhat = 'never'\nis = 'LOST'\nby = 3", r"expect\[0\]\.by: known are what"),
         ("[[expect]]\nwhat = 'lamps'\nat_least = 0.5", "lamps = false"),
         ("=", "not TOML"),
+        ("[[fault]]\nwhat='silense'\nwhere='lidar'\n" + LEAST, r"\[\[fault\]\] number 1: .*did you mean silence\?"),
+        ("[[fault]]\nwhat='silense'\n" + LEAST, r"'silense' is no fault of any device here; did you mean silence\?"),
+        (SILENCE + "[[fault]]\nwhat='carry'\nahed=3.0\n" + LEAST, r"number 2: fault\[1\]\.ahed: .*mean ahead\?"),
+        ("[[fault]]\nwhat='carry'\nahead=0.0\n" + LEAST, r"ahead: 0\.0 is outside 1\.\.\."),
+        ("[[fault]]\nwhat='baud'\nrate=19200\n" + LEAST, "it has no line rate"),
+        ("[[fault]]\nwhat='dark'\nwhere='adc'\n" + LEAST, "'adc' is no device here"),
     ],
 )
 def test_a_scenario_that_is_wrong_is_refused_by_file_and_place(text: str, says: str, tmp_path: Path) -> None:
@@ -214,7 +221,10 @@ def test_a_pose_is_compared_with_the_truth_where_the_robot_said_it_was() -> None
     assert errors_of(played()).metres.max() < 1e-9
     found = errors_of(played(lambda t: 0.2 if t > 5.0 else 0.0))
     assert found.metres.max() == pytest.approx(0.2)
-    assert judged(Expectation("error", at_most=0.1), played(lambda t: 0.2))[0] is False
+    holds, seen = judged(Expectation("error", at_most=0.1), played(lambda t: 0.2))
+    assert not holds
+    assert "[lidar] mount = { x = 0.15 }" in seen.said
+    assert "mount" not in judged(Expectation("error", at_most=0.15), played(lambda t: 0.2))[1].said
     assert judged(Expectation("error", at_most=0.1, until=4.0), played(lambda t: 0.2 if t > 5.0 else 0.0))[0]
     assert judged(Expectation("error", at_most=0.1, sigmas=11.0), played(lambda t: 0.2))[0]
     assert judged(Expectation("error", at_most=0.1), played(pose=None))[0] is False

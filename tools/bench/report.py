@@ -13,22 +13,26 @@ import math
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 from xml.etree import ElementTree
 
+from daemon.folders import can_be_made
 from daemon.versions import versions
+from tools.bench.against import Before, Compared, Old, compare
 from tools.bench.plots import Plot, svg
 
 ROOT: Final = Path(__file__).parents[2]
+FILES: Final = ("junit.xml", "report.html", "results.json")
 SLOWER: Final = 1.5
 """What takes this many times as long as in the run compared with is marked in the page, and no worse for it: a figure
 tells of what is tested, seconds tell of the machine around it, too."""
 
 
-class CannotCompare(Exception):
-    """The run to compare with cannot be read; the text says why."""
+class CannotReport(Exception):
+    """Nothing can be written where the report is to go; the text says so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,7 @@ class Result:
     """Of one thing that was tried: its name, title, whether it passed, seconds, what was seen or what was wrong.
 
     Attributes:
-        skipped: why it was not tried; empty: it was.
+        skipped: why it was not tried; empty: it was. fake: it was tried on a fake, and says nothing of a device.
     """
 
     name: str
@@ -74,6 +78,7 @@ class Result:
     skipped: str = ""
     figures: tuple[Figure, ...] = ()
     plots: tuple[Plot, ...] = ()
+    fake: bool = False
 
     @property
     def outcome(self) -> str:
@@ -88,16 +93,6 @@ class Seen:
     said: str
     figures: tuple[Figure, ...] = ()
     plots: tuple[Plot, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Old:
-    """What another run says of the same thing; ``judged``: the figures of which one way was worse."""
-
-    outcome: str
-    seconds: float
-    figures: dict[str, float]
-    judged: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +133,10 @@ def junit(results: list[Result], name: str = "bench") -> str:
     for one in results:
         where = name.replace("-", ".")
         case = ElementTree.SubElement(suite, "testcase", classname=where, name=one.name, time=f"{one.seconds:.1f}")
-        if one.figures:
+        if one.figures or one.fake:
             kept = ElementTree.SubElement(case, "properties")
+            if one.fake:
+                ElementTree.SubElement(kept, "property", name="device", value="fake")
             for figure in one.figures:
                 ElementTree.SubElement(kept, "property", name=figure.name, value=f"{figure.value:.9g} {figure.unit}")
         if one.skipped:
@@ -157,51 +154,6 @@ def _plain(text: str) -> str:
     return "".join(char if char in "\t\n" or char.isprintable() else "?" for char in text)
 
 
-def read(against: Path) -> dict[str, Old]:
-    """Another run's results, by name; ``against`` is its ``results.json`` or the folder that holds it.
-
-    Raises:
-        CannotCompare: there is none, or it is something else.
-    """
-    file = against / "results.json" if against.is_dir() else against
-    try:
-        told = json.loads(file.read_text(encoding="utf-8"))["results"]
-        return {one["name"]: _old(one) for one in told}
-    except OSError as error:
-        raise CannotCompare(f"{file}: {error.strerror}; name the results.json of another run") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CannotCompare(f"{file} holds no results of a bench: {error!r}") from error
-
-
-def _old(one: dict[str, Any]) -> Old:
-    outcome = "skipped" if one.get("skipped") else "passed" if one["passed"] else "FAILED"
-    figures = {figure["name"]: float(figure["value"]) for figure in one.get("figures", ())}
-    judged = frozenset(figure["name"] for figure in one.get("figures", ()) if figure.get("worse"))
-    return Old(outcome, float(one["seconds"]), figures, judged)
-
-
-def regressions(results: list[Result], before: dict[str, Old]) -> list[str]:
-    """What has become worse since another run."""
-    found = []
-    for one in results:
-        old = before.get(one.name)
-        if old is None:
-            continue
-        if old.outcome == "passed" and one.outcome == "FAILED":
-            found.append(f"{one.name} passed then")
-        elif old.outcome == "passed" and one.skipped:
-            found.append(f"{one.name} passed then, and was not tried now: {one.skipped}")
-        found += [
-            f"{one.name}: {figure}, {old.figures[figure.name]:.4g} then"
-            for figure in one.figures
-            if figure.name in old.figures and figure.lost(old.figures[figure.name])
-        ]
-        if one.passed and not one.skipped:  # otherwise it is said above why there are none
-            gone = sorted(old.judged - {figure.name for figure in one.figures})
-            found += [f"{one.name}: {name} is not measured any more, {old.figures[name]:.4g} then" for name in gone]
-    return found
-
-
 STYLE: Final = (
     "body{font:15px sans-serif;margin:2em}td{padding:.2em .8em;vertical-align:top}.FAILED{background:#fcc}"
     ".skipped{color:#777}pre{white-space:pre-wrap;margin:0;max-width:80em}tr{border-bottom:1px solid #ddd}"
@@ -209,23 +161,33 @@ STYLE: Final = (
 )
 
 
-def page(results: list[Result], about: About, worse: list[str], before: dict[str, Old] | None = None) -> str:
+def page(results: list[Result], about: About, compared: Compared, before: Before | None = None) -> str:
     """The results as one HTML page that needs nothing else."""
-    rows = "".join(_row(one, (before or {}).get(one.name)) for one in results)
+    rows = "".join(_row(one, before.results.get(one.name) if before else None) for one in results)
     told = "".join(f"<tr><td>{html.escape(k)}<td><pre>{html.escape(v)}</pre></tr>" for k, v in about.facts.items())
-    listed = "".join(f"<li>{html.escape(text)}" for text in worse)
-    counts = f"{sum(one.outcome == 'passed' for one in results)} of {len(results)} passed"
-    skipped = sum(bool(one.skipped) for one in results)
     pictures = "".join(
         f"<h3>{html.escape(one.title)}</h3>{''.join(map(svg, one.plots))}" for one in results if one.plots
     )
     return (
         f"<!doctype html><meta charset=utf-8><title>lumiloop: {html.escape(about.title)}</title><style>{STYLE}</style>"
-        f"<h1>{html.escape(about.title)}: {counts}{f', {skipped} not tried' if skipped else ''}</h1>"
-        f"<table>{told}</table>{f'<h2>Worse than before</h2><ul>{listed}</ul>' if worse else ''}"
+        f"<h1>{html.escape(about.title)}: {counted(results)}</h1><table>{told}</table>"
+        f"{_listed('Worse than before', compared.worse)}{_listed('Compared', compared.told)}"
         f"<h2>Results</h2><table><tr><th><th>what<th>s<th>seen</tr>{rows}</table>"
         f"{f'<h2>Pictures</h2>{pictures}' if pictures else ''}\n"
     )
+
+
+def counted(results: list[Result]) -> str:
+    """How many passed, of them on fakes, and how many were not tried."""
+    fakes = sum(one.outcome == "passed" and one.fake for one in results)
+    skipped = sum(bool(one.skipped) for one in results)
+    text = f"{sum(one.outcome == 'passed' for one in results)} of {len(results)} passed"
+    return f"{text}{f' ({fakes} of them on fakes)' if fakes else ''}{f', {skipped} not tried' if skipped else ''}"
+
+
+def _listed(title: str, lines: Sequence[str]) -> str:
+    rows = "".join(f"<li>{html.escape(text)}" for text in lines)
+    return f"<h2>{title}</h2><ul>{rows}</ul>" if rows else ""
 
 
 def _row(one: Result, old: Old | None) -> str:
@@ -233,26 +195,29 @@ def _row(one: Result, old: Old | None) -> str:
     lines = [f"{figure}{f' ({was[figure.name]:.4g} then)' if figure.name in was else ''}" for figure in one.figures]
     text = html.escape("\n".join([one.skipped or one.said, *lines]))
     slow = f" ({old.seconds:.1f} then)" if old and one.seconds > SLOWER * old.seconds + 2.0 else ""
+    told = f"{one.outcome} (fake)" if one.fake else one.outcome
     return (
-        f"<tr class={one.outcome}><td>{one.outcome}<td>{html.escape(one.title)}<td>{one.seconds:.1f}{slow}"
+        f"<tr class={one.outcome}><td>{told}<td>{html.escape(one.title)}<td>{one.seconds:.1f}{slow}"
         f"<td><pre>{text}</pre></tr>"
     )
 
 
-def write(out: Path, results: list[Result], about: About, against: Path | None) -> list[str]:
-    """Write all three into ``out``; returns what is worse than in the run that ``against`` names.
+def demand_room(out: Path, option: str = "--out") -> None:
+    """Before anything is tried: raise `CannotReport` where this user cannot write a report into ``out``."""
+    kept = [out / name for name in FILES if (out / name).exists()]
+    if not can_be_made(out) or not all(os.access(file, os.W_OK) for file in kept):
+        raise CannotReport(f"nothing can be written to {out}; name another folder with {option}")
 
-    Raises:
-        CannotCompare: that run cannot be read; nothing has been written.
-    """
-    before = read(against) if against is not None else {}
+
+def write(out: Path, results: list[Result], about: About, before: Before | None = None) -> Compared:
+    """Write all three into ``out``; returns how it compares with the run ``before``."""
     out.mkdir(parents=True, exist_ok=True)
-    worse = regressions(results, before)
-    (out / "junit.xml").write_text(junit(results, about.name), encoding="utf-8")
-    (out / "report.html").write_text(page(results, about, worse, before), encoding="utf-8")
-    told = {"about": about.facts, "results": [_kept(one) for one in results]}
-    (out / "results.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-    return worse
+    compared = compare(results, about.facts, before)
+    told = {"bench": about.name, "about": about.facts, "results": [_kept(one) for one in results]}
+    texts = junit(results, about.name), page(results, about, compared, before), json.dumps(told, indent=1) + "\n"
+    for name, text in zip(FILES, texts, strict=True):
+        (out / name).write_text(text, encoding="utf-8")
+    return compared
 
 
 def _kept(one: Result) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def test_intermittent_has_a_share_of_its_own() -> None:
         ),
         ("[[fault]]\nwhere = 'lidar'", r"^fault\[0\]\.what: None is no fault"),
         ("[[fault]]\nwhat = 3\nwhere = 'lidar'", r"^fault\[0\]\.what: 3 is no fault"),
-        ("[[fault]]\nwhat = 'off'", r"^fault\[0\]\.where: None is no device here; there are: adc, lidar"),
+        ("[[fault]]\nwhat = 'off'", r"^fault\[0\]\.where: name one of lidar, adc"),
         ("[[fault]]\nwhat = 'off'\nwhere = 'gyro'", r"^fault\[0\]\.where: 'gyro'"),
         ("[[fault]]\nwhat='off'\nwhere='adc'\n[[fault]]\nwhat='dark'\nwhere='adc'", r"^fault\[1\]\.what: 'dark'"),
         ("[[fault]]\nwhat='bit_flip'\nwhere='lidar'\npart='dta'", r"^fault\[0\]\.part: 'dta' is none of echo, status"),

@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-from daemon.folders import can_be_made
-from tools.bench.report import About, CannotCompare, Result, facts, read, write
+from tools.bench.against import CannotCompare, read
+from tools.bench.report import About, CannotReport, Result, demand_room, facts, write
 from tools.bench.vm.booted import Booted, booted
 from tools.bench.vm.common import Scenario
 from tools.bench.vm.guests import Guest, run_all
@@ -24,6 +24,7 @@ from tools.bench.vm.scenarios import SCENARIOS, SHARES
 
 ROOM = 4_000_000_000
 CANNOT = 2
+NAME = "bench-vm"
 CONFIGURATION = Path(__file__).parent / "guest" / "lumiloop.toml"
 
 
@@ -58,7 +59,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.bench.vm", description=__doc__)
     parser.add_argument("scenario", nargs="*", help="up to which (default: all)")
     parser.add_argument("--out", type=Path, default=Path("out/bench-vm"), help="for results (default %(default)s)")
-    parser.add_argument("--against", type=Path, help="results.json of another run, to compare with")
+    parser.add_argument("--against", type=Path, help="another run's folder, or its results.json, to compare with")
     parser.add_argument("--image-only", action="store_true", help="make the image and stop")
     parser.add_argument("--list", action="store_true", help="say what is tried")
     options = parser.parse_args()
@@ -68,17 +69,18 @@ def main() -> int:
         return 0
     begun = time.monotonic()
     try:
-        if options.against is not None:
-            read(options.against)  # what is wrong with it is told now, not in eight minutes
-        if not can_be_made(options.out):
-            raise CannotBench(f"nothing can be written to {options.out}; name another folder with --out")
         shares = chosen(options.scenario)
+        before = None
+        if options.against is not None:  # what is wrong with it is told now, not in eight minutes
+            before = read(options.against, NAME)
+            before.demand([one.__name__ for share in shares for one in share])
+        demand_room(options.out)
         made = booted(image(say), say)
         outside()
         if options.image_only:
             return 0
         whole, results = run(made, shares, options.out)
-    except (CannotBench, CannotCompare) as reason:
+    except (CannotBench, CannotCompare, CannotReport) as reason:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT
     except OSError as error:
@@ -92,14 +94,14 @@ def main() -> int:
     told = facts(image=made.image.folder.name, configuration=CONFIGURATION.read_text(), **{"seconds in all": seconds})
     if not whole:
         told["broken off"] = "before its end; what was not run by then is named below"
-    worse = write(options.out, results, About("bench-vm", "Virtual bench", told), options.against)
+    compared = write(options.out, results, About(NAME, "Virtual bench", told), before)
     failed = [one.name for one in results if not one.passed]
-    for text in worse:
-        say(f"worse than before: {text}")
     left = sum(bool(one.skipped) for one in results)
     count = f"{len(results) - len(failed)} of {len(results)} passed{f', {left} not run' if left else ''}"
     say(f"{count} in {seconds} s; {options.out}/report.html")
-    return int(bool(failed or worse))
+    for text in compared.closing():
+        say(text)
+    return int(bool(failed or compared.worse))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@
     python -m tools.bench.world my.toml --lidar tcp://0.0.0.0:10940 --light dac:/dev/i2c-1@0x60 --modbus 192.168.0.20
     python -m tools.bench.world lap --local
 
-docs/bench.md has the wiring. Ends with 0 if everything is as expected, 1 if not, 2 if it cannot be played.
+The same words and ``--write-config DIR`` write what the robot computer needs for it; docs/bench.md has the wiring.
+ Ends with 0 if everything is as expected, 1 if not, 2 if it cannot be played.
 """
 
 from __future__ import annotations
@@ -22,18 +23,20 @@ from pathlib import Path
 from typing import Final
 
 from hal.errors import HalError
-from hal.fake.faults import FaultError
-from tools.bench.report import About, CannotCompare, Result, facts, read, write
+from tools.bench.against import Before, CannotCompare, read
+from tools.bench.report import About, CannotReport, Result, demand_room, facts, write
 from tools.bench.world import agreement
 from tools.bench.world.judge import Played, judged, pictures
 from tools.bench.world.local import robot
-from tools.bench.world.scenario import BUILT_IN, Scenario, ScenarioError, find, load
+from tools.bench.world.robotside import write_config
+from tools.bench.world.scenario import BUILT_IN, Scenario, find, load
 from tools.bench.world.stage import CannotPlay, Ends, play
 
 CANNOT: Final = 2
 APART_M: Final = 0.01
 LEAST_S, LEAST_M = 2.0, 1.0
 """Of driving until a fault, for two runs to be compared, and so much way with poses that are."""
+NAME: Final = "bench-world"
 TITLE: Final = "The world played to a robot computer"
 
 
@@ -57,7 +60,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--local", action="store_true", help="no robot computer: a daemon of this tree on a pty of this computer")
     add("--twin", action="store_true", help="compare with the same scenario in virtual time: to agree to 1 cm")
     add("--out", type=Path, default=Path("out/bench-world"), help="for the report (default %(default)s)")
-    add("--against", type=Path, help="results.json of another run, to compare with")
+    add("--against", type=Path, help="another run's folder, or its results.json, to compare with")
+    add(
+        "--write-config", type=Path, metavar="DIR",
+        help="play nothing: write configuration and survey that the robot computer needs, with all other words as for "
+        "the drive",
+    )  # fmt: skip
     return made
 
 
@@ -68,7 +76,7 @@ def tried(scenario: Scenario, ends: Ends, twin: bool) -> list[Result]:
     results = []
     for number, expected in enumerate(scenario.expect):
         passed, seen = judged(expected, played)
-        name = f"{scenario.name}.{number + 1}-{expected.what}"
+        name = named(scenario, number)
         title = f"{scenario.title}: {expected}"
         plots = pictures(played) if number == 0 else ()
         seconds = time.monotonic() - begun if number == 0 else 0.0
@@ -79,6 +87,11 @@ def tried(scenario: Scenario, ends: Ends, twin: bool) -> list[Result]:
         told = "; ".join(filter(None, (one.skipped, one.said, *map(str, one.figures))))
         say(f"{one.outcome}  {one.title}\n        {told}")
     return results
+
+
+def named(scenario: Scenario, number: int) -> str:
+    """How the result of an expectation is called."""
+    return f"{scenario.name}.{number + 1}-{scenario.expect[number].what}"
 
 
 def twins(scenario: Scenario, played: Played) -> Result:
@@ -118,6 +131,35 @@ def opposite(options: argparse.Namespace, scenario: Scenario) -> Generator[Ends]
         yield ends
 
 
+def chosen(options: argparse.Namespace) -> list[Scenario]:
+    """The scenarios that are named, each of which can be played with these ends as far as can be told beforehand."""
+    scenarios = [load(find(name)) for name in options.scenario or ["lap"]]
+    for one in scenarios:
+        if options.light.startswith("dac:") and any(fault.get("where") == "adc" for fault in one.faults):
+            raise CannotPlay(f"{one.name}: no fault can be ordered of the robot computer's converter, behind a DAC")
+    return scenarios
+
+
+def configured(options: argparse.Namespace, scenarios: list[Scenario]) -> int:
+    """Write what the robot computer needs, and say what to do with it."""
+    if options.local or len(scenarios) > 1:
+        raise CannotPlay("--write-config: for one scenario, and a robot computer (no --local)")
+    files = write_config(options.write_config, scenarios[0], ends_of(options))
+    for file in files:
+        say(f"written: {file}")
+    say("Look through it, copy all of it to the robot computer's /etc/lumiloop, and there: systemctl restart lumiloop")
+    return 0
+
+
+def compared_with(options: argparse.Namespace, scenarios: list[Scenario]) -> Before | None:
+    """The run to compare with, if one is named, and it has something of these."""
+    if options.against is None:
+        return None
+    before = read(options.against, NAME)
+    before.demand([named(one, number) for one in scenarios for number in range(len(one.expect))])
+    return before
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Play, judge, report."""
     options = _parser().parse_args(arguments)
@@ -128,15 +170,18 @@ def main(arguments: list[str] | None = None) -> int:
     results: list[Result] = []
     left: list[Scenario] = []
     why = ""
+    before = None
     try:
-        if options.against is not None:
-            read(options.against)
-        left = [load(find(name)) for name in options.scenario or ["lap"]]
+        left = chosen(options)
+        if options.write_config is not None:
+            return configured(options, left)
+        before = compared_with(options, left)
+        demand_room(options.out)
         while left:
             with opposite(options, left[0]) as ends:
                 results += tried(left[0], ends, options.twin)
             del left[0]
-    except (ScenarioError, CannotPlay, CannotCompare, HalError, FaultError, ValueError, OSError) as reason:
+    except (CannotPlay, CannotCompare, CannotReport, HalError, ValueError, OSError) as reason:
         why = f"cannot be played: {reason}"
     except KeyboardInterrupt:
         why = "ended before its end"
@@ -145,17 +190,22 @@ def main(arguments: list[str] | None = None) -> int:
         if not results:
             return CANNOT
         results += [Result(one.name, one.title, False, 0.0, "", skipped=f"not played: {why}") for one in left]
-    told = facts(
+    return told(options, results, before, broken_off=bool(why))
+
+
+def told(options: argparse.Namespace, results: list[Result], before: Before | None, broken_off: bool) -> int:
+    """Write the report and say what came of it; the exit status."""
+    known = facts(
         robot="a process here" if options.local else options.modbus, lidar=options.lidar or "pty",
         light=options.light or "-", scenarios="\n".join(find(name).read_text() for name in options.scenario or ["lap"]),
     )  # fmt: skip
-    worse = write(options.out, results, About("bench-world", TITLE, told), options.against)
-    for text in worse:
-        say(f"worse than before: {text}")
+    compared = write(options.out, results, About(NAME, TITLE, known), before)
     done = [one for one in results if not one.skipped]
     passed = sum(one.passed for one in done)
     say(f"{passed} of {len(done)} as expected; {options.out}/report.html")
-    return CANNOT if why else int(passed < len(done) or bool(worse))
+    for text in compared.closing():
+        say(text)
+    return CANNOT if broken_off else int(passed < len(done) or bool(compared.worse))
 
 
 if __name__ == "__main__":

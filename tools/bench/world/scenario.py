@@ -39,7 +39,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
-from tools.bench.world import room
+from tools.bench.world import orders, room
 from tools.clients.read_modbus import STATES
 from tools.sim.buildings import BUILDINGS
 from tools.sim.robot import Body
@@ -172,13 +172,14 @@ def _scenario(name: str, tree: dict[str, Any]) -> Scenario:
     room.model(world.lidar)
     if not (0.05 <= world.speed <= 3.0 and 1.0 <= drive.seconds <= 86_400.0 and drive.dwell >= 0.0):
         raise ValueError("world.speed is 0.05 to 3 m/s, drive.seconds 1 to 86400, drive.dwell not negative")
-    faults, wanted = tree.get("fault", []), tree.get("expect", [])
-    if not all(isinstance(one, list) and all(isinstance(row, dict) for row in one) for one in (faults, wanted)):
+    tables, wanted = tree.get("fault", []), tree.get("expect", [])
+    if not all(isinstance(one, list) and all(isinstance(row, dict) for row in one) for one in (tables, wanted)):
         raise ValueError("fault, expect: expected [[fault]] and [[expect]] tables")
     if not wanted:
         raise ValueError("expect: a scenario that expects nothing cannot fail")
     expect = tuple(_expectation(f"expect[{k}]", table, world) for k, table in enumerate(wanted))
-    return Scenario(name, str(tree.get("title", name)), world, drive, tuple(faults), expect)
+    orders.check(tables, room.model(world.lidar), world.lamps)
+    return Scenario(name, str(tree.get("title", name)), world, drive, tuple(tables), expect)
 
 
 def _part(path: str, table: Any, default: Any) -> Any:

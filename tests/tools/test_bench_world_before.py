@@ -1,0 +1,90 @@
+"""A bench computer as the world: what is said and written before the drive, and what is said last after it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from daemon.configfile import load as load_config
+from tools.bench.report import About, Figure, Result, write
+from tools.bench.world import __main__ as world
+from tools.bench.world.__main__ import main
+
+ROOT = Path(__file__).parents[2]
+LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
+
+
+def test_a_report_that_cannot_be_written_or_compared_is_said_before_the_drive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(world, "tried", lambda *_: pytest.fail("nothing may be driven"))
+    line = ["lap", "--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}"]
+    (tmp_path / "file").touch()
+    assert main([*line, "--out", str(tmp_path / "file" / "out")]) == 2
+    assert "name another folder with --out" in capsys.readouterr().out
+    good = Result("boots", "boots", True, 1.0, "")
+    for bench, says in {"bench-vm": "is a report of bench-vm", "bench-world": "nothing of what is to be tried"}.items():
+        write(tmp_path / bench, [good], About(bench, "", {}))
+        assert main([*line, "--against", str(tmp_path / bench)]) == 2
+        assert says in capsys.readouterr().out
+    dac = ["--light", "dac:/dev/i2c-1@0x60"]
+    file = tmp_path / "dark.toml"
+    lamps = '[world]\nlamps = true\nbuilding = "paper_room"\n'
+    file.write_text(lamps + "[[fault]]\nwhat = 'dark'\nwhere = 'adc'\n" + LEAST)
+    assert main([str(file), *line[1:], *dac]) == 2
+    assert "no fault can be ordered" in capsys.readouterr().out
+
+
+def test_what_is_worse_is_said_last_and_fails_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = Figure("error, median", 3.0, "mm", "more")
+    lap = Result("lap.1-error", "a lap", True, 17.0, "seen", figures=(error,))
+    monkeypatch.setattr(world, "tried", lambda *_: [lap])
+    line = ["lap", "--modbus", "127.0.0.1:9", "--lidar", "pty:x", "--out"]
+    assert main([*line, str(tmp_path / "w1")]) == 0
+    lap = replace(lap, figures=(replace(error, value=9.0),))
+    assert main([*line, str(tmp_path / "w2"), "--against", str(tmp_path / "w1")]) == 1
+    *_, count, told, worse, last = capsys.readouterr().out.splitlines()
+    assert count.startswith("1 of 1 as expected")
+    assert "1 of 1 outcomes, 1 of 1 figures" in told
+    assert worse.startswith("worse than before: lap.1-error: error, median: 9 mm, 3 then")
+    assert last == "FAILED: 1 worse than before"
+
+
+def test_the_robot_computers_files_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Good ones, with all that the drive takes; what is there is not overwritten."""
+    folder = tmp_path / "robot"
+    ends = ["--lidar", "tcp://0.0.0.0:10999", "--light", "tcp://0.0.0.0:7799", "--modbus", "127.0.0.1:1599"]
+    words = ["lamps", *ends, "--odometry", "udp://127.0.0.1:5699", "--write-config", str(folder)]
+    assert main(words) == 0
+    assert "copy all of it" in capsys.readouterr().out
+    config = load_config(folder / "lumiloop.toml")
+    assert (config.lidar.device, config.lidar.mount.x) == ("tcp://127.0.0.1:10999", 0.15)
+    assert (config.bind, config.allow, config.modbus.port) == ("0.0.0.0", ("127.0.0.1",), 1599)
+    assert (config.odometry.port, config.photodiode.bus) == (5699, "tcp://127.0.0.1:7799")
+    assert (
+        subprocess.run(
+            [sys.executable, "-m", "daemon", "check", str(folder / "lumiloop.toml")], cwd=ROOT, capture_output=True
+        ).returncode
+        == 0
+    )
+    assert main(words) == 2
+    assert "is there already" in capsys.readouterr().out
+    for lidar, device in {
+        "/dev/ttyGS0": "/dev/ttyACM0",
+        "/dev/ttyUSB3@57600": "/dev/ttyUSB0@57600",
+        "pty:/tmp/l": "/tmp/l",
+    }.items():
+        place = tmp_path / device.replace("/", "_")
+        assert main(["lap", "--lidar", lidar, "--modbus", "127.0.0.1", "--write-config", str(place)]) == 0
+        assert load_config(place / "lumiloop.toml").lidar.device == device
+        assert not (place / "lamps.toml").exists()
+    assert main(["lamps", *ends[:2], *ends[4:], "--write-config", str(tmp_path / "dark")]) == 2
+    assert "say with --light" in capsys.readouterr().out
+    assert main(["lap", "cable", *ends, "--write-config", str(tmp_path / "two")]) == 2
+    assert "for one scenario" in capsys.readouterr().out

@@ -1,0 +1,147 @@
+"""A run of a bench against another one of the same bench: what has become worse, and what could be compared at all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from tools.bench.report import Result
+
+NAMED: Final = 6
+"""So many names of what cannot be compared are told."""
+ENDS: Final = ("computer", "robot", "lidar", "adc", "light")
+"""Facts that say what was measured: where they differ, a figure may differ for that reason."""
+
+
+class CannotCompare(Exception):
+    """The run to compare with cannot be; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Old:
+    """What another run says of the same thing; ``judged``: the figures of which one way was worse."""
+
+    outcome: str
+    seconds: float
+    figures: dict[str, float]
+    judged: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """Another run. ``bench``: whose report it is, empty in reports of versions that did not say it."""
+
+    file: Path
+    bench: str
+    facts: dict[str, str]
+    results: dict[str, Old]
+
+    def demand(self, names: Collection[str]) -> None:
+        """Raise `CannotCompare` where it has nothing of that by which this run's results will be called."""
+        if names and not set(names) & set(self.results):
+            raise CannotCompare(
+                f"{self.file} has nothing of what is to be tried now ({_some(sorted(names))}); it has "
+                f"{_some(sorted(self.results)) or 'no results'}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """What came of it: lines that say what could be compared, and what has become worse; both empty without another."""
+
+    told: tuple[str, ...] = ()
+    worse: list[str] = field(default_factory=list)
+
+    def closing(self) -> list[str]:
+        """The last lines of a bench: nothing that reads like success may follow what makes it fail."""
+        lines = [*self.told, *(f"worse than before: {text}" for text in self.worse)]
+        return [*lines, f"FAILED: {len(self.worse)} worse than before"] if self.worse else lines
+
+
+def read(against: Path, bench: str) -> Before:
+    """Another run of ``bench``; ``against`` is its ``results.json`` or the folder that holds it.
+
+    Raises:
+        CannotCompare: there is none, it is something else, or another bench's.
+    """
+    file = against / "results.json" if against.is_dir() else against
+    try:
+        told = json.loads(file.read_text(encoding="utf-8"))
+        results = {one["name"]: _old(one) for one in told["results"]}
+        before = Before(file, str(told.get("bench", "")), dict(told.get("about", {})), results)
+    except OSError as error:
+        raise CannotCompare(f"{file}: {error.strerror}; name the results.json of another run, or its folder") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CannotCompare(f"{file} holds no results of a bench: {error!r}") from error
+    if before.bench not in ("", bench):
+        raise CannotCompare(f"{file} is a report of {before.bench}, and this is {bench}: name one of {bench}")
+    return before
+
+
+def _old(one: dict[str, Any]) -> Old:
+    outcome = "skipped" if one.get("skipped") else "passed" if one["passed"] else "FAILED"
+    figures = {figure["name"]: float(figure["value"]) for figure in one.get("figures", ())}
+    judged = frozenset(figure["name"] for figure in one.get("figures", ()) if figure.get("worse"))
+    return Old(outcome, float(one["seconds"]), figures, judged)
+
+
+def compare(results: Sequence[Result], facts: dict[str, str], before: Before | None) -> Compared:
+    """A run's results and facts with those of the other one, if there is one."""
+    if before is None:
+        return Compared()
+    return Compared((_extent(results, before), *_doubts(facts, before)), regressions(results, before.results))
+
+
+def _extent(results: Sequence[Result], before: Before) -> str:
+    """How much of this run is in the other one, by number, and what is in one of them alone, by name."""
+    shared = [(one, before.results[one.name]) for one in results if one.name in before.results]
+    figures = [figure.name for one in results for figure in one.figures]
+    both = sum(figure.name in old.figures for one, old in shared for figure in one.figures)
+    new = [one.name for one in results if one.name not in before.results]
+    new += [f"{one.name}: {figure.name}" for one, old in shared for figure in one.figures
+            if figure.name not in old.figures]  # fmt: skip
+    gone = sorted(set(before.results) - {one.name for one in results})
+    text = f"compared with {before.file}: {len(shared)} of {len(results)} outcomes, {both} of {len(figures)} figures"
+    text += f"; not in the other: {_some(new)}" if new else ""
+    return text + (f"; only in the other: {_some(gone)}" if gone else "")
+
+
+def _doubts(facts: dict[str, str], before: Before) -> list[str]:
+    """Why a difference may come from elsewhere."""
+    doubts = [] if before.bench else [f"{before.file} does not say of which bench it is; it is taken for one of this"]
+    for name in ENDS:
+        now, then = facts.get(name), before.facts.get(name)
+        if now is not None and then is not None and now != then:
+            doubts.append(f"{name} differs, and so may figures: {now}; {then} then")
+    return doubts
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def regressions(results: Sequence[Result], before: dict[str, Old]) -> list[str]:
+    """What has become worse since another run."""
+    found = []
+    for one in results:
+        old = before.get(one.name)
+        if old is None:
+            continue
+        if old.outcome == "passed" and one.outcome == "FAILED":
+            found.append(f"{one.name} passed then")
+        elif old.outcome == "passed" and one.skipped:
+            found.append(f"{one.name} passed then, and was not tried now: {one.skipped}")
+        found += [
+            f"{one.name}: {figure}, {old.figures[figure.name]:.4g} then"
+            for figure in one.figures
+            if figure.name in old.figures and figure.lost(old.figures[figure.name])
+        ]
+        if one.passed and not one.skipped:  # otherwise it is said above why there are none
+            gone = sorted(old.judged - {figure.name for figure in one.figures})
+            found += [f"{one.name}: {name} is not measured any more, {old.figures[name]:.4g} then" for name in gone]
+    return found
