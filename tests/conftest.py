@@ -26,10 +26,8 @@ FIRST = ("tools/test_soak.py", "faults/test_matrix.py", "systemd/test_container.
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--lidar", default="fake", help="fake, or a real device: /dev/ttyACM0, tcp://192.168.0.10:10940")
-    parser.addoption(
-        "--adc", default="fake", help="fake, or a real converter: /dev/i2c-1@0x4d, /dev/i2c-1@0x54,adc121c021"
-    )
+    parser.addoption("--lidar", help="fake, or a real device: /dev/ttyACM0, tcp://192.168.0.10:10940")
+    parser.addoption("--adc", help="fake, or a real converter: /dev/i2c-1@0x4d, /dev/i2c-1@0x54,adc121c021")
     hil = parser.getgroup("tests/hil", "the suite on devices (docs/bench.md)")
     hil.addoption("--have", default="", help="what real devices can be given: motion,light")
     hil.addoption(
@@ -39,7 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     hil.addoption("--odometry-port", type=int, default=5601, help="UDP port to which the robot sends odometry")
     hil.addoption("--walk-s", type=float, default=60.0, help="seconds of the calibration walk on a real robot")
     hil.addoption("--hil-report", metavar="DIR", help="write report.html, junit.xml and results.json of tests/hil")
-    hil.addoption("--against", metavar="OLD", help="results.json of another run; what is worse makes this one fail")
+    hil.addoption("--against", metavar="OLD", help="another run's report folder or results.json; what is worse fails")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -13,17 +13,22 @@ from typing import Any
 import pytest
 
 from hal.errors import HalError
-from tests.hil.ends import FAKE, AdcEnd, LidarEnd, Operator, operator_for, where_on_a_bus
+from tests.hil.ends import FAKE, NONE, AdcEnd, LidarEnd, Operator, operator_for, where_on_a_bus
 from tests.hil.presence import Presence
 from tests.hil.programs import Served, program, served_lidar
 from tests.hil.walking import Walked, walk_real, walk_simulated
+from tools.bench.against import Before, CannotCompare, read
 from tools.bench.plots import Plot
-from tools.bench.report import About, CannotCompare, Figure, Result, facts, read, write
+from tools.bench.report import About, Figure, Result, facts, write
 
+NAME = "hil"
+DEVICES = ("lidar", "adc")
 KINDS = ("motion", "light", "operator")
 TELLING = pytest.StashKey["Telling"]()
 PRESENCE = pytest.StashKey[Presence]()
 RESULTS = pytest.StashKey[dict[str, Result]]()
+BEFORE = pytest.StashKey[Before | None]()
+ON_FAKE = pytest.StashKey[bool]()
 
 
 @dataclass
@@ -94,16 +99,31 @@ def lumiloop(request: pytest.FixtureRequest) -> list[str]:
 
 
 def _operator(request: pytest.FixtureRequest) -> Operator | None:
-    return operator_for(str(request.config.getoption("--operator")))
+    return _operator_of(request.config)
+
+
+def _operator_of(config: pytest.Config) -> Operator | None:
+    return operator_for(str(config.getoption("--operator")))
 
 
 def _device(request: pytest.FixtureRequest, option: str) -> str:
     """The device that an option names, where this test can be tried on it; else the test fails or is skipped."""
-    name = str(request.config.getoption(f"--{option}"))
+    name = named(request.config, option)
+    if name == NONE:
+        pytest.skip(f"no --{option} named")
+    request.node.stash[ON_FAKE] = name == FAKE
     _needs(request, name)
     if name != FAKE:
         request.config.stash[PRESENCE].demand(option, name)
     return name
+
+
+def named(config: pytest.Config, option: str) -> str:
+    """The device of an option; where it is left out a fake, beside another one that is real none: who tries a lidar is
+    not told that a converter has passed."""
+    if given := config.getoption(f"--{option}"):
+        return str(given)
+    return NONE if any(config.getoption(f"--{one}") not in (None, FAKE, NONE) for one in DEVICES) else FAKE
 
 
 def _needs(request: pytest.FixtureRequest, device: str) -> None:
@@ -146,7 +166,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """See early that options say something, that the run to compare with can be read, and the report be written."""
     config.stash[RESULTS] = {}
     config.stash[PRESENCE] = Presence()
-    where_on_a_bus(str(config.getoption("--adc")))
+    if (adc := named(config, "adc")) != NONE:
+        where_on_a_bus(adc)
+    _operator_of(config)
     _there(config)
     folder = config.getoption("--hil-report")
     if folder and config.getoption("numprocesses", None):
@@ -160,9 +182,29 @@ def pytest_configure(config: pytest.Config) -> None:
             raise pytest.UsageError(f"--hil-report {folder}: this user may not write into it; name another folder")
     elif config.getoption("--against"):
         raise pytest.UsageError("--against compares with the report of this run: say with --hil-report where it goes")
+    config.stash[BEFORE] = None
     if config.getoption("--against"):
         try:
-            read(Path(config.getoption("--against")))
+            config.stash[BEFORE] = read(Path(config.getoption("--against")), NAME)
+        except CannotCompare as reason:
+            raise pytest.UsageError(f"--against: {reason}") from reason
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The suite's test of itself is none of a device: it is left out where one is named."""
+    if not {named(config, option) for option in DEVICES} - {FAKE, NONE}:
+        return
+    itself = [item for item in items if item.path == Path(__file__).with_name("test_ends.py")]
+    config.hook.pytest_deselected(items=itself)
+    items[:] = [item for item in items if item not in itself]
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Another run that has nothing of what is to be tried is refused before anything is."""
+    before = session.config.stash[BEFORE]
+    if before is not None and session.items:
+        try:
+            before.demand([result_name(item.nodeid) for item in session.items])
         except CannotCompare as reason:
             raise pytest.UsageError(f"--against: {reason}") from reason
 
@@ -181,8 +223,9 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     said = "\n".join([*telling.lines, *([report.longreprtext[-3000:]] if report.failed else [])])
     name = result_name(item.nodeid)
     item.config.stash[RESULTS][name] = Result(
-        name, title, report.passed, report.duration, said, skipped, tuple(telling.figures), tuple(telling.plots)
-    )
+        name, title, report.passed, report.duration, said, skipped, tuple(telling.figures), tuple(telling.plots),
+        item.stash.get(ON_FAKE, False),
+    )  # fmt: skip
 
 
 def result_name(nodeid: str) -> str:
@@ -191,22 +234,21 @@ def result_name(nodeid: str) -> str:
     return "::".join([file.rpartition("/")[2], *rest])
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the report if one is asked for; what has become worse makes the run fail."""
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
+    """Write the report if one is asked for; what has become worse makes the run fail, and is said last."""
+    yield
     config = session.config
     results = list(config.stash[RESULTS].values())
-    folder, old = config.getoption("--hil-report"), config.getoption("--against")
+    folder = config.getoption("--hil-report")
     if not folder or not results:
         return
-    options = ("lidar", "adc", "have", "operator", "program")
-    ends = {name: str(config.getoption(f"--{name}") or "-") for name in options}
-    about = About("hil", "Devices", facts(**ends, when=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())))
-    worse = write(Path(folder), results, about, Path(old) if old else None)
+    ends = {option: named(config, option) for option in DEVICES}
+    ends |= {name: str(config.getoption(f"--{name}") or "-") for name in ("have", "operator", "program")}
+    about = About(NAME, "Devices", facts(**ends, when=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())))
+    compared = write(Path(folder), results, about, config.stash[BEFORE])
     say = config.get_terminal_writer()
-    say.line()
-    for text in worse:
-        say.line(f"worse than before: {text}")
-    say.line(f"report: {folder}/report.html")
-    if worse and session.exitstatus == 0:
+    for line in (f"report: {folder}/report.html", *compared.closing()):
+        say.line(line, red=line.startswith("FAILED"))
+    if compared.worse and session.exitstatus == 0:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED

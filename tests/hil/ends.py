@@ -37,6 +37,8 @@ from hal.photodiode.driver import PhotodiodeAdc
 from hal.port import PortOpener
 
 FAKE: Final = "fake"
+NONE: Final = "none"
+"""No device of that kind is tried, because another one is."""
 LINE, BUS = "/dev/ttyACM7", "/dev/i2c-7"  # names that stand for a kind; nothing is opened under them
 UNIT: Final = Unit(serial="H0000007", clock_gain=30e-6, seed=7)
 ANSWER_S: Final = 5.0
@@ -119,7 +121,10 @@ def operator_for(text: str) -> Operator | None:
         try:
             Path("/dev/tty").open("r+b", buffering=0).close()
         except OSError as error:
-            raise pytest.UsageError(f"--operator terminal: {error}; run it in a terminal, not in a job") from error
+            raise pytest.UsageError(
+                f"--operator terminal: {error.strerror}: nobody can be asked. Run it in a terminal (ssh -t), or "
+                "leave it out: what needs an operator is then skipped"
+            ) from error
         return Person()
     if text and not Path(text).is_socket():
         raise pytest.UsageError(f"--operator {text}: no socket; say terminal, or the socket of hal.fake --control")

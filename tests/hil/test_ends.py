@@ -251,9 +251,45 @@ def test_a_figure_that_is_worse_than_in_another_run_fails_this_one(tmp_path: Pat
     code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(file))
     assert code == 1
     assert "worse than before: test_photodiode.py::test_light_levels: swing of the signal" in said
+    assert said.splitlines()[-1] == "FAILED: 1 worse than before", said
     assert "swing of the signal" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_what_nothing_can_be_compared_with_is_refused_before_anything_is_tried(tmp_path: Path) -> None:
+    """A folder does as well as its file; another bench's report does not, nor one of other tests."""
+    ours = {"bench": "hil", "about": {}, "results": [{"name": "x.py::test", "passed": True, "seconds": 1.0}]}
+    olds = {"folder": (ours, "has nothing of what is to be tried now (test_photodiode.py::test_light_levels)"),
+            "theirs": (ours | {"bench": "bench-vm"}, "is a report of bench-vm, and this is hil")}  # fmt: skip
+    for name, (old, says) in olds.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps(old))
+        code, said, results = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / name))
+        assert (code, says in said, results) == (4, True, {}), said
     code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / "none.json"))
     assert (code, "name the results.json" in said) == (4, True)
+
+
+def test_beside_a_real_device_no_fake_counts(tmp_path: Path) -> None:
+    """Of the one that is not named nothing is tried, nor of the suite itself; where all are fakes that is said."""
+    words = words_of(tmp_path, "--lidar", "/dev/ttyNOPE", "-k", "who_it_is or light_levels or named_wrongly")
+    words.remove("--ignore=tests/hil/test_ends.py")
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=100)
+    results = results_of(tmp_path)
+    assert {name.partition("::")[0] for name in results} == {"test_lidar.py", "test_photodiode.py"}, done.stdout
+    assert results["test_photodiode.py::test_light_levels"]["skipped"] == "no --adc named"
+    assert not any(one["fake"] for one in results.values())
+    code, said, results = suite(tmp_path, "-k", "light_levels")
+    assert (code, [one["fake"] for one in results.values()]) == (0, [True]), said
+    assert "1 of 1 passed (1 of them on fakes)" in (tmp_path / "report" / "report.html").read_text()
+    told = json.loads((tmp_path / "report" / "results.json").read_text())
+    assert (told["bench"], told["about"]["lidar"], told["about"]["adc"]) == ("hil", "fake", "fake")
+
+
+def test_a_terminal_that_is_not_there_is_said_once(tmp_path: Path) -> None:
+    words = ["setsid", "--wait", *words_of(tmp_path, "--operator", "terminal", "-k", "unplugged")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, results_of(tmp_path)) == (4, {}), done.stdout
+    assert done.stderr.count("Run it in a terminal") == 1
 
 
 @pytest.mark.parametrize(
@@ -331,7 +367,7 @@ def test_programs_and_operators_that_are_not_there(tmp_path: Path) -> None:
         operator_for(str(tmp_path / "control"))
     assert operator_for("") is None
     if not _terminal():
-        with pytest.raises(pytest.UsageError, match="run it in a terminal"):
+        with pytest.raises(pytest.UsageError, match="Run it in a terminal"):
             operator_for("terminal")
 
 

@@ -31,7 +31,7 @@ BY_HAND = {
 
 @pytest.fixture
 def lidar(request: pytest.FixtureRequest) -> str:
-    return str(request.config.getoption("--lidar"))
+    return str(request.config.getoption("--lidar") or "fake")
 
 
 @pytest.mark.parametrize("words", BY_HAND.values(), ids=BY_HAND)

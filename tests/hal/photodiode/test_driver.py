@@ -18,7 +18,7 @@ from tests.hal.photodiode.bench import Bench, falsehoods, on_bench, on_fake
 
 @pytest.fixture
 def adc(request: pytest.FixtureRequest) -> str:
-    return str(request.config.getoption("--adc"))
+    return str(request.config.getoption("--adc") or "fake")
 
 
 def test_delivers_uniform_blocks(adc: str) -> None:
