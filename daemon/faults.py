@@ -61,9 +61,9 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.NONE: ("no fault", ""),
     Fault.LIDAR_MISSING: ("the lidar is not there", "check power, cable and `lidar.device`; run `lumiloop probe`"),
     Fault.LIDAR_REFUSED: (
-        "the lidar's port may not be used",
-        "serial: join the group dialout; Ethernet: it serves one client; close what else uses it, or name another "
-        "`lidar.device`",
+        "the lidar's port may not be used, or its network address turns the connection away",
+        "serial: join the group dialout; Ethernet: is it on, is the port right, is it another client's? close what "
+        "else uses it, or name another `lidar.device`",
     ),
     Fault.LIDAR_BROKEN: (
         "the lidar reports a fault of its own, or its port is open and nothing answers",

@@ -95,6 +95,9 @@ def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
 def describe(fault: Fault, now: Vitals | None = None) -> str:
     """One line for a log: number, meaning, remedy, and what the device's driver or the data say of it ``now``."""
     text, remedy = FAULTS[fault]
+    own = now is not None and fault is Fault.LIDAR_REFUSED and now.error is not None and now.error.remedy
+    if own:  # the table's is for serial ports and networks, the driver knows which it is
+        remedy = ""
     line = f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
     return f"{line}: {words}" if now is not None and (words := _words(fault, now)) else line
 

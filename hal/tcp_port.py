@@ -16,6 +16,7 @@ from hal.port import OnData, OnLost
 
 DEFAULT_TCP_PORT: Final = 10940
 CONNECT_TIMEOUT_S: Final = 2.0
+REFUSED: Final = "is it on, and is the port right? a sensor serves one client: stop the other"
 _DEAD_PEER_S: Final = 3  # a pulled network cable is noticed within this time, even with nothing to send
 
 
@@ -155,6 +156,6 @@ async def _connect(port: TcpPort, addresses: list[inet.Address]) -> None:
 
 def _explain(device: str, error: OSError) -> HalError:
     if error.errno == errno.ECONNREFUSED:
-        return DeviceRefused(device, "connection refused", "a sensor serves one client: stop the other, check the port")
+        return DeviceRefused(device, "connection refused", REFUSED)
     reason = os.strerror(error.errno) if error.errno else str(error)
     return DeviceMissing(device, reason, "check power, cable, address and this host's netmask")

@@ -107,6 +107,10 @@ def test_every_fault_has_a_meaning_and_a_remedy() -> None:
     assert all(text for text, _ in FAULTS.values())
     assert [fault for fault, (_, remedy) in FAULTS.items() if not remedy] == [Fault.NONE]
     assert describe(Fault.OVERRUNS).startswith("fault 302: more than 5 % of the cycles")
+    gone = replace(WELL, link=Link.WAITING, error=DeviceRefused("tcp://h", "connection refused", "is it on?"))
+    assert describe(Fault.LIDAR_REFUSED, gone).endswith("connection away: tcp://h: connection refused (is it on?)")
+    assert "dialout" not in describe(Fault.LIDAR_REFUSED, gone), "that is for serial ports"
+    assert "dialout" in describe(Fault.LIDAR_REFUSED)
 
 
 @pytest.mark.parametrize("fault", [Fault.LIDAR_LATE, Fault.ODOMETRY_GAPS])

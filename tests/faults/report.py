@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import fcntl
 import json
+import re
 from pathlib import Path
 from typing import Any, Final
 
+from daemon.faults import FAULTS
 from tests.faults.matrix import DEVICES, FAULT_S, TIMES, WORDS, Cell, Outcome, cells
 
 ROOT: Final = Path(__file__).parents[2]
@@ -78,7 +80,7 @@ def page(results: dict[str, Measured]) -> str:
             rows = [_row(cell, results[cell.name]) for cell in mine if cell.name in results]
             head = ("fault", "noticed in", "shown", "TRACKING after", "largest error", "lost")
             parts.append(f"### {device} at {time}\n\n{TIME[time]}.\n\n{_table(head, rows)}")
-    parts += [_widened(), _defects()]
+    parts += [_widened(), _defects(), _index(results)]
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
@@ -119,6 +121,18 @@ def _defects() -> str:
         return "## Known defects\n\nNone: every cell is survived."
     told = "These cells are not survived as the rules above have it."
     return f"## Known defects\n\n{told}\n\n{_table(('cell', 'why'), rows)}"
+
+
+def _index(results: dict[str, Measured]) -> str:
+    """Every fault by its number, with what brings it about on this page."""
+    computer = HEAD.read_text().partition("## The computer")[2]
+    rows = []
+    for fault in sorted(FAULTS)[1:]:
+        named = [cell for cell in cells() if str(int(fault)) in results.get(cell.name, {"codes": {}})["codes"]]
+        brought = list(dict.fromkeys(f"{cell.device} {cell.word}" for cell in named))
+        brought += ["the computer"] if re.search(rf"\b{int(fault)}\b", computer) else []
+        rows.append((str(int(fault)), FAULTS[fault][0], ", ".join(brought) or "-"))
+    return f"## By number\n\n{_table(('number', 'meaning', 'brought about here by'), rows)}"
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
