@@ -162,11 +162,11 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     ),
     Fault.LOOP_STALLED: ("the process did not get to run for two scan periods", "take load off the computer"),
     Fault.OVERRUNS: ("more than 5 % of the cycles exceed their budget", "take load off the computer"),
+    Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
     Fault.OVERLOADED: (
         "map work, or the laser itself, is left out for lack of time",
         "take load off the computer, or raise `cycle.budget_ms`; the stages' times are published",
     ),
-    Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
     Fault.PART_FAILED: (
         "a part of the daemon has failed and is started again and again",
         "read the log, which names it: is `odometry.port` taken by another program? a defect: please report it",
@@ -181,14 +181,6 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "the map cannot be saved; what was saved before stays",
         "read the log; free disk space, end another daemon that keeps its maps there, or name another `map.folder`",
     ),
-    Fault.FLIGHT_RECORDER_FAILED: (
-        "the flight recorder cannot keep a state or a dump",
-        "free disk space where it records, see the log for what is in the way",
-    ),
-    Fault.THREAD_HANGS: (
-        "a thread of the daemon does not come back",
-        "the log names it: look for a disk or a bus that hangs; a computation that hangs ends in a restart",
-    ),
     Fault.MAP_REFUSED: (
         "a stored map cannot be used",
         "the log names the file, why, and what to do; without one a new map is begun",
@@ -196,6 +188,14 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.POSE_NOT_KEPT: (
         "the pose cannot be kept for the next start",
         "read the log; free disk space, or name another `map.folder` that may be written",
+    ),
+    Fault.FLIGHT_RECORDER_FAILED: (
+        "the flight recorder cannot keep a state or a dump",
+        "free disk space where it records, see the log for what is in the way",
+    ),
+    Fault.THREAD_HANGS: (
+        "a thread of the daemon does not come back",
+        "the log names it: look for a disk or a bus that hangs; a computation that hangs ends in a restart",
     ),
 }
 """For every fault what it means and what a person can do."""

@@ -13,9 +13,19 @@ from daemon.configfile import load as load_config
 from tools.bench.report import About, Figure, Result, write
 from tools.bench.world import __main__ as world
 from tools.bench.world.__main__ import main
+from tools.bench.world.scenario import load
 
 ROOT = Path(__file__).parents[2]
 LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
+
+
+def test_the_scenario_of_the_page_is_one(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "bench.md").read_text()
+    (text,) = [block.partition("```")[0] for block in page.split("```toml\n")[1:] if "[[expect]]" in block]
+    (tmp_path / "my.toml").write_text(text)
+    made = load(tmp_path / "my.toml")
+    assert {fault["what"] for fault in made.faults} == {"silence", "carry"}
+    assert max(one.until for one in made.expect) == 35.0
 
 
 def test_a_report_that_cannot_be_written_or_compared_is_said_before_the_drive(
