@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tools.bench.report import Seen
+from tools.bench.report import About, Figure, Result, Seen, write
+from tools.bench.vm import __main__ as command
 from tools.bench.vm import trying_removal, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.machine import Order
@@ -102,3 +104,33 @@ def test_what_is_left_of_a_removed_package_is_named(kept: str) -> None:
     else:
         with pytest.raises(Order, match=f"left: .*{kept}"):
             trying_removal.is_removed(inside(run))
+
+
+def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of another bench, or of other scenarios: before an image is made."""
+    boots = Result("boots", "it boots", True, 1.0, "", figures=(Figure("up after", 9.0, "s", "more"),))
+
+    def bench(*words: str) -> tuple[int, list[str]]:
+        monkeypatch.setattr("sys.argv", ["vm", "boots", *words])
+        return command.main(), capsys.readouterr().out.splitlines()
+
+    monkeypatch.setattr(command, "image", lambda say: pytest.fail("nothing may be made"))
+    for name, (about, result, says) in {
+        "hil": ("hil", boots, "is a report of hil, and this is bench-vm"),
+        "other": ("bench-vm", replace(boots, name="drives"), "has nothing of what is to be tried now (boots)"),
+    }.items():
+        write(tmp_path / name, [result], About(about, "", {}))
+        code, said = bench("--against", str(tmp_path / name))
+        assert (code, says in said[-1]) == (2, True), said
+    made = SimpleNamespace(image=SimpleNamespace(folder=tmp_path))
+    monkeypatch.setattr(command, "image", lambda say: None)
+    monkeypatch.setattr(command, "booted", lambda image, say: made)
+    monkeypatch.setattr(command, "outside", lambda: None)
+    monkeypatch.setattr(command, "run", lambda *_: (True, [boots]))
+    write(tmp_path / "1", [replace(boots, figures=(Figure("up after", 3.0, "s", "more"),))], About("bench-vm", "", {}))
+    code, said = bench("--against", str(tmp_path / "1"), "--out", str(tmp_path / "2"))
+    assert (code, said[-1]) == (1, "FAILED: 1 worse than before"), said
+    assert said[0].startswith("1 of 1 passed")
+    assert bench("--out", str(tmp_path / "3"))[0] == 0
