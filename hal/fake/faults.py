@@ -118,30 +118,38 @@ def _near(word: Any, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+def _named(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocabulary]) -> tuple[str, str]:
+    """Device and word of an order; where it names no device, the only one that knows the word."""
+    for key in ("what", "where"):
+        if not isinstance(table.get(key, ""), str):
+            raise FaultError(f"{path}.{key}", f"expected a text, got {table[key]!r}")
+    what, where = table.get("what"), table.get("where")
+    able = [name for name, words in vocabularies.items() if len(vocabularies) == 1 or what in words]
+    if where is None and len(able) > 1:
+        raise FaultError(f"{path}.where", f"name one of {', '.join(able)}")
+    if where is None and not able:
+        near = _near(what, {word for words in vocabularies.values() for word in words})
+        raise FaultError(f"{path}.what", f"{what!r} is no fault of any device here{near}")
+    where = able[0] if where is None else where
+    if where not in vocabularies:
+        there = sorted(vocabularies)
+        told = f"{where!r} is no device here; there are: {', '.join(there)}"
+        raise FaultError(f"{path}.where", f"{told}{_near(where, there)}")
+    if what is None or what not in vocabularies[where]:
+        known = sorted(vocabularies[where])
+        told = f"{what!r} is no fault of {where!r}; known: {', '.join(known)}"
+        raise FaultError(f"{path}.what", f"{told}{_near(what, known)}")
+    return where, what
+
+
 def read_fault(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocabulary]) -> Fault:
     """Check one order against the vocabulary of the device it names.
 
     Raises:
         FaultError: unknown device, word or key, or a value of the wrong kind or out of range.
     """
-    able = [name for name, words in vocabularies.items() if len(vocabularies) == 1 or table.get("what") in words]
-    where = table.get("where", able[0] if len(able) == 1 else None)
-    what = table.get("what")
-    if where is None:  # not named, and the word does not tell, either
-        every = sorted({word for words in vocabularies.values() for word in words})
-        problem = f"name one of {', '.join(able)}" if able else f"{what!r} is no fault of any device here"
-        raise FaultError(f"{path}.{'where' if able else 'what'}", problem + ("" if able else _near(what, every)))
-    if where not in vocabularies:
-        there = sorted(vocabularies)
-        raise FaultError(
-            f"{path}.where", f"{where!r} is no device here; there are: {', '.join(there)}{_near(where, there)}"
-        )
-    word = vocabularies[where].get(what) if isinstance(what, str) else None
-    if word is None:
-        known = sorted(vocabularies[where])
-        raise FaultError(
-            f"{path}.what", f"{what!r} is no fault of {where!r}; known: {', '.join(known)}{_near(what, known)}"
-        )
+    where, what = _named(table, path, vocabularies)
+    word = vocabularies[where][what]
     common = COMMON[word.kind]
     rules = {**common, **word.parameters}
     unknown = sorted(set(table) - set(rules) - {"what", "where"})
@@ -152,8 +160,8 @@ def read_fault(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, V
     given = {key: _check(f"{path}.{key}", value, rules[key]) for key, value in table.items() if key in rules}
     values = {key: given.get(key, rule.default) for key, rule in word.parameters.items()}
     return Fault(
-        what=str(what),
-        where=str(where),
+        what=what,
+        where=where,
         when=float(given.get("when", 0.0)),
         lasts=float(given.get("for", 0.0)),
         count=int(given.get("count", 0)),

@@ -79,6 +79,7 @@ def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
         (SILENCE + "[[fault]]\nwhat='carry'\nahed=3.0\n" + LEAST, r"number 2: fault\[1\]\.ahed: .*mean ahead\?"),
         ("[[fault]]\nwhat='carry'\nahead=0.0\n" + LEAST, r"ahead: 0\.0 is outside 1\.\.\."),
         ("[[fault]]\nwhat='baud'\nrate=19200\n" + LEAST, "it has no line rate"),
+        ("[[fault]]\nwhat=['dark']\n" + LEAST, r"number 1: fault\[0\]\.what: expected a text, got \['dark'\]"),
         ("[[fault]]\nwhat='dark'\nwhere='adc'\n" + LEAST, "'adc' is no device here"),
     ],
 )

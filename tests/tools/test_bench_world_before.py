@@ -96,5 +96,9 @@ def test_the_robot_computers_files_are_written(tmp_path: Path, capsys: pytest.Ca
         assert not (place / "lamps.toml").exists()
     assert main(["lamps", *ends[:2], *ends[4:], "--write-config", str(tmp_path / "dark")]) == 2
     assert "say with --light" in capsys.readouterr().out
+    for odd in (["--lidar", "tcp://here"], ["--odometry", "192.168.0.20:5601"], ["--modbus", "no.such.host.invalid"]):
+        words = ["lap", *ends, *odd, "--write-config", str(tmp_path / "odd")]
+        assert main(words) == 2
+        assert not (tmp_path / "odd").exists(), "nothing is written where something is wrong"
     assert main(["lap", "cable", *ends, "--write-config", str(tmp_path / "two")]) == 2
     assert "for one scenario" in capsys.readouterr().out

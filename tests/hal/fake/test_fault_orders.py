@@ -65,7 +65,7 @@ def test_intermittent_has_a_share_of_its_own() -> None:
             r"^fault\[0\]\.what: 'bitflip' is no fault of 'lidar'; known: alien",
         ),
         ("[[fault]]\nwhere = 'lidar'", r"^fault\[0\]\.what: None is no fault"),
-        ("[[fault]]\nwhat = 3\nwhere = 'lidar'", r"^fault\[0\]\.what: 3 is no fault"),
+        ("[[fault]]\nwhat = 3\nwhere = 'lidar'", r"^fault\[0\]\.what: expected a text, got 3"),
         ("[[fault]]\nwhat = 'off'", r"^fault\[0\]\.where: name one of lidar, adc"),
         ("[[fault]]\nwhat = 'off'\nwhere = 'gyro'", r"^fault\[0\]\.where: 'gyro'"),
         ("[[fault]]\nwhat='off'\nwhere='adc'\n[[fault]]\nwhat='dark'\nwhere='adc'", r"^fault\[1\]\.what: 'dark'"),

@@ -12,7 +12,7 @@ from tools.sim.serve_light import write_plan
 
 CONFIG: Final = "lumiloop.toml"
 SURVEY: Final = "lamps.toml"
-ANYWHERE: Final = ("0.0.0.0", "::", "")
+ANYWHERE: Final = ("0.0.0.0", "[::]")
 
 
 def write_config(folder: Path, scenario: Scenario, ends: Ends) -> list[Path]:
@@ -20,7 +20,7 @@ def write_config(folder: Path, scenario: Scenario, ends: Ends) -> list[Path]:
 
     Raises:
         CannotPlay: there is a file already that is not overwritten, the robot computer cannot be reached from here, or
-            a scenario with lamps is to send its light nowhere.
+            a scenario with lamps is to send its light nowhere, or an address is none.
     """
     scene = scenario.scene(held=True)
     if scene.light is not None and not ends.light:
@@ -64,7 +64,7 @@ def _text(scenario: Scenario, ends: Ends, bench: str) -> str:
         f"port = {port}",
     ]
     if ends.odometry and scenario.world.odometry:
-        lines += ["", "[odometry]", f"port = {ends.odometry.rpartition(':')[2]}"]
+        lines += ["", "[odometry]", f"port = {_port(ends.odometry, 'udp://')}"]
     if scenario.world.lamps:
         bus = "/dev/i2c-1" if ends.light.startswith("dac:") else _reached(ends.light, bench)
         lines += ["", "[photodiode]", f'bus = "{bus}"', 'converter = "mcp3221@0x4d"']
@@ -83,5 +83,14 @@ def _device(lidar: str, bench: str) -> list[str]:
 
 def _reached(served: str, bench: str) -> str:
     """A name that is served by this computer, as the other one says it."""
-    host, colon, port = served.removeprefix("tcp://").rpartition(":")
-    return f"tcp://{bench}{colon}{port}" if served.startswith("tcp://") and host in ANYWHERE else served
+    if not served.startswith("tcp://"):
+        return served
+    port = _port(served, "tcp://")
+    return f"tcp://{bench}:{port}" if served.removeprefix("tcp://").rpartition(":")[0] in ANYWHERE else served
+
+
+def _port(address: str, scheme: str) -> str:
+    host, _, port = address.removeprefix(scheme).rpartition(":")
+    if not (address.startswith(scheme) and host and port.isdigit()):
+        raise CannotPlay(f"{address}: expected {scheme}HOST:PORT")
+    return port
