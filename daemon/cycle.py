@@ -39,7 +39,7 @@ from estimator.records import Answer, Command, LightEpoch, Limits, Order, Record
 from estimator.result import Fix, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
-from hal.lidar import LidarStatus
+from hal.lidar import LidarStatus, Link
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class CycleRecord:
         switched: SHA-256 of the stored map that the estimator has gone on in with this cycle, empty: none.
         limits: the step's caps; None where nothing had arrived and no step was made.
         result: of the step, or the previous one's; None before the first. snapshot: what was published.
-        stage_us: measured microseconds by stage, empty without a stopwatch.
+        stage_us: measured microseconds by stage, empty without a stopwatch. waiting: `Link.WAITING` of the lidar.
     """
 
     cycle: int
@@ -82,6 +82,7 @@ class CycleRecord:
     stage_us: dict[str, int]
     samples: int = 0
     switched: str = ""
+    waiting: bool = False
 
 
 Tap = Callable[[CycleRecord], None]
@@ -97,7 +98,7 @@ class Parts:
         budget_us: time budget of a cycle, 0: half of the scan period.
         stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
         fault: number of the gravest present fault. condition: how the daemon's parts are. map_id: of the map frame.
-        alert_m: limit of the position error above which an alert is raised, 0: none.
+        alert_m: limit of the position error above which an alert is raised, 0: none. t_begun: start of the run; 0: now.
     """
 
     clock: Clock
@@ -118,6 +119,7 @@ class Parts:
     condition: Callable[[], Condition | None] = lambda: None
     map_id: int = 0
     alert_m: float = 0.0
+    t_begun: float = 0.0
 
 
 class Cycle:
@@ -143,7 +145,8 @@ class Cycle:
         self.verdict = Memory()
         self.watch = Watch()
         self.result: StepResult | None = None
-        self.observer = Observer(parts.clock.now(), parts.odometry, parts.lidar, parts.samples is not None)
+        begun = parts.t_begun or parts.clock.now()
+        self.observer = Observer(begun, parts.odometry, parts.lidar, parts.samples is not None)
         self._painter = Painter(parts.map_id)
         self.cycle_us: int | None = None
         self.failing: set[int] = set()
@@ -195,6 +198,7 @@ class Cycle:
                 stage_us=laps.us,
                 samples=taken.samples_total,
                 switched=self._switched,
+                waiting=self.parts.status.link is Link.WAITING,
             )
             self.parts.tap(record)
         return snapshot

@@ -107,6 +107,7 @@ class Daemon:
                 tap=None if recorder is None else recorder.on_cycle,
                 map_id=world.draw_map_id() if world.start is None else world.start.stored.meta.map_id,
                 alert_m=settings.integrity.alert_m,
+                t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay begins at the same instant
             )
         )
         self._estimator.lap = self.cycle.laps.lap

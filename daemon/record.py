@@ -2,7 +2,8 @@
 
 The loop thread only appends to a list; one thread (`daemon/disk.py`) writes what is ready. What is kept is all it takes
 to repeat the run exactly: the same bytes go through the same codec, and each cycle consumes what it consumed, under the
-same caps. The published pose is kept too, so that a replay can say whether it is the same.
+same caps. The published pose, state and reason are kept too, so that a replay can say whether they are the same; and
+the published faults, most of which a replay cannot have: drivers and the computer said them.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.disk import SegmentWriter
 from daemon.lights import RESIDUALS, Lights
+from daemon.publish.snapshot import Snapshot
 from daemon.store import START, Start
 from daemon.tapped import tapped
 from daemon.versions import versions
@@ -67,6 +69,9 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
         codes: `Limits.codes`, None where nothing was stepped or before there were lights.
         samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
         rung: `Limits.rung`. switched: `CycleRecord.switched`; the map is in a file of its own, see :func:`switch_name`.
+        reason: published with the state, None in recordings of before it was kept; they know of no ``faults`` either.
+        faults: numbers of all that were published, gravest first. In every cycle, for a recording may begin with any.
+        waiting: `CycleRecord.waiting`, all that state and reason take from a driver.
     """
 
     cycle: int
@@ -85,6 +90,9 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
     light: Pose | None = None
     rung: int = 0
     switched: str = ""
+    reason: int | None = None
+    faults: tuple[int, ...] = ()
+    waiting: bool = False
 
     def caps(self) -> Limits | None:
         """The step's caps as the estimator takes them."""
@@ -132,7 +140,16 @@ def _entry(record: CycleRecord) -> CycleEntry:
         light=light_of(result),
         rung=0 if limits is None else limits.rung,
         switched=record.switched,
+        reason=record.snapshot.reason,
+        faults=_faults(record.snapshot),
+        waiting=record.waiting,
     )
+
+
+def _faults(snapshot: Snapshot) -> tuple[int, ...]:
+    if snapshot.condition is not None:
+        return snapshot.condition.faults
+    return (snapshot.fault,) if snapshot.fault else ()
 
 
 def light_of(result: StepResult | None) -> Pose | None:
@@ -145,6 +162,9 @@ class Recorder:
 
     Hand :meth:`tap` to the driver as its port opener, :meth:`on_scan`, :meth:`on_samples`, :meth:`on_odometry` and
     :meth:`on_imu` to the sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
+
+    Attributes:
+        t_begun: start of the run, as its head says it: what has not spoken yet is silent from then on.
     """
 
     def __init__(
@@ -172,7 +192,7 @@ class Recorder:
             **({} if lights is None else lights.header()),
             **({} if start is None else {MAP: {"sha256": hashlib.sha256(start.content).hexdigest()}}),
         }
-        self._clock = clock
+        self._clock, self.t_begun = clock, float(header["t_mono"])
         beside = {RESIDUALS: lights.residuals} if lights is not None and lights.residuals else {}
         beside |= {} if start is None else {START: start.content}  # too large for every head
         self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header, beside=beside)

@@ -367,7 +367,13 @@ def _recorded(outcome: Outcome) -> dict[str, Any] | None:
     compared = outcome.rerun.comparison
     if not outcome.source.recorded:
         return None
-    return {"cycles": compared.cycles, "differ": compared.differ, "first_difference": compared.first}
+    return {
+        "cycles": compared.cycles,
+        "differ": compared.differ,
+        "first_difference": compared.first,
+        "judged": compared.judged,
+        "published_with": {str(fault): count for fault, count in compared.faults.items()} if compared.judged else None,
+    }
 
 
 def timing(outcome: Outcome) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from array import array
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -37,7 +38,7 @@ from estimator.records import UNLIMITED, Array, Limits, Order, Record
 from estimator.result import StepResult
 from hal.adc import AdcStatus, RawSamples
 from hal.imu import RawImu
-from hal.lidar import RawScan
+from hal.lidar import Link, RawScan
 from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
@@ -74,15 +75,20 @@ class ReplayBudget(FixedBudget):
 
 @dataclass(slots=True)
 class Comparison:
-    """A recording's own poses against those of its replay.
+    """What a recording says that was published, against its replay.
 
     Attributes:
-        cycles: compared. differ: whose pose or inputs are not the same to the last bit. first: says how the first did.
+        cycles: compared. differ: whose pose, state, reason or inputs are not the same to the last bit. first: says how
+            the first did.
+        judged: those of which state and reason were compared; of older recordings none.
+        faults: by number, in how many of those it was published. Not compared: a replay has no devices.
     """
 
     cycles: int = 0
     differ: int = 0
     first: str = ""
+    judged: int = 0
+    faults: Counter[int] = field(default_factory=Counter)
 
     def note(self, cycle: int, how: str) -> None:
         """Count one cycle that is not the recorded one."""
@@ -135,6 +141,7 @@ class Rerun:
         self._latest: tuple[float, float] = (0.0, 0.0)
         self._odometry: RawOdometry | None = None
         self._kept: list[CycleRecord] = []
+        self._published: frozenset[int] = frozenset()
         self.cycle: Final = Cycle(self._parts(config, lights, begin))
         if begin is not None:
             begin.put_into(self.cycle)
@@ -155,6 +162,7 @@ class Rerun:
             budget_us=1e3 * config.cycle.budget_ms,
             tap=self._keep,
             alert_m=config.integrity.alert_m,
+            t_begun=self._source.t_begun,
         )
 
     def _scheduled(self, begin: Restored | None) -> ScheduledWorker:
@@ -174,9 +182,13 @@ class Rerun:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Those of :data:`~daemon.health.REPLAYED` that are present, gravest first; to be asked for once a second."""
+        """Those that are present, gravest first; to be asked for once a second.
+
+        What the data say (:data:`~daemon.health.REPLAYED`) is said anew; all others are those that were published.
+        """
         now = vitals(self.cycle, set(), 0.0)
-        return tuple(fault for fault in assess(now, now) if fault in REPLAYED)
+        again = [fault for fault in assess(now, now) if fault in REPLAYED]
+        return tuple(sorted([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)]))
 
     def feed(self, event: Event) -> None:
         """Take one event; runs a cycle where one is due."""
@@ -240,6 +252,8 @@ class Rerun:
             self.cycle.switch(partial(self._switch, entry.switched))
         self._caps.now = entry.caps() or UNLIMITED
         self._answers[self.cycle.cycles + 1] = entry.answers
+        self._source.status.link = Link.WAITING if entry.waiting else Link.STREAMING
+        self._published = frozenset(entry.faults)
         try:
             record = self._run()
         except LookupError as error:
@@ -266,8 +280,12 @@ class Rerun:
         result = record.result
         pose = None if result is None else (tuple(result.T_odom_base.tolist()), tuple(result.T_map_odom.tolist()))
         recorded = None if entry.odom is None else (entry.odom, entry.map_odom)
-        light = light_of(result)
+        light, said = light_of(result), (entry.state, entry.reason)
+        judged = (int(record.snapshot.state), record.snapshot.reason)
         self.comparison.cycles += 1
+        if entry.reason is not None:
+            self.comparison.judged += 1
+            self.comparison.faults.update(entry.faults)
         if (entry.scan, entry.dropped) != (record.scan, record.dropped):
             self.comparison.note(entry.cycle, f"took scan {record.scan}, recorded is {entry.scan}")
         elif entry.samples != record.samples:
@@ -278,6 +296,8 @@ class Rerun:
             self.comparison.note(entry.cycle, f"T_odom_base, T_map_odom are {pose}, recorded are {recorded}")
         elif light != entry.light:
             self.comparison.note(entry.cycle, f"the pose from light is {light}, recorded is {entry.light}")
+        elif entry.reason is not None and judged != said:
+            self.comparison.note(entry.cycle, f"state and reason are {judged}, recorded are {said}")
 
     def _run(self) -> CycleRecord:
         begun = time.perf_counter()

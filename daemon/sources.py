@@ -69,6 +69,7 @@ class Source(ABC):
         mount: (x, y, yaw) of the lidar as the log knows it, m and rad, or None.
         header: of a recording: versions and configuration it was made with.
         begin: the moment that it begins at, None where that is the start of a run.
+        t_begun: start of the run in its own time, 0: not known.
     """
 
     kind: ClassVar[str]
@@ -83,6 +84,7 @@ class Source(ABC):
         self.mount: Mount | None = None
         self.header: dict[str, Any] = {}
         self.begin: Moment | None = None
+        self.t_begun = 0.0
 
     @abstractmethod
     def events(self) -> Iterator[Event]:
@@ -229,7 +231,8 @@ class RecordingSource(Source):
         super().__init__(path, LogReport(), self._codec.status, size)
         self.files = self._recording.segments
         self.header = self._recording.header
-        self._utc = _number(self.header, "t_utc") - _number(self.header, "t_mono")
+        self.t_begun = _number(self.header, "t_mono")
+        self._utc = _number(self.header, "t_utc") - self.t_begun
         self._marks = _Marks()
         if state_beside(self._recording.segments[0]).exists() and self._recording.first > 0:
             self.begin = read_moment(state_beside(self._recording.segments[0]))

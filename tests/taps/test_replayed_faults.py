@@ -1,4 +1,4 @@
-"""Faults that follow from what was recorded: a replay shows them as the daemon did, to files and to browsers."""
+"""Faults of a recorded run: a replay shows them as the daemon did, to files and to browsers."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from daemon.lampwatch import LASTS_S
 from taps.frames import Faults
 from taps.inside import Retold
 from tests.daemon.replay.test_recorded_lights import Recorded, record
+from tests.daemon.replay.test_recorded_run import pulled
+from tests.daemon.replay.test_recorded_run import record as record_run
 from tests.daemon.test_lights import decoded
 
 LATER_S = 3.0
@@ -65,3 +67,15 @@ def test_a_film_shows_them_when_they_were(dark: tuple[Path, set[int]], tmp_path:
     came = next(t for t, present in zip(reel.times, told, strict=True) if any(one["fault"] == 171 for one in present))
     assert film.t_first + LASTS_S < came < film.t_last
     film.close()
+
+
+def test_what_devices_said_is_told_as_it_was_published(tmp_path: Path) -> None:
+    """A replay has no devices."""
+    record_run(tmp_path / "rec", pulled)
+    told = [frame for frame in Retold(tmp_path / "rec", Config()).frames(raw=False) if isinstance(frame, Faults)]
+    assert [any(one.fault == Fault.LIDAR_MISSING for one in frame.present) for frame in told] == [True, False]
+    came, gone = (frame.t_mono for frame in told)
+    assert came is not None
+    assert gone is not None
+    assert 4.0 < came < 6.0
+    assert 8.0 < gone < 11.0, "once the lidar has started up"

@@ -9,6 +9,7 @@ import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,9 +18,11 @@ import pytest
 from daemon import cli
 from daemon.budget import FixedBudget
 from daemon.config import Config, LidarConfig, ModbusConfig, Mount
+from daemon.faults import Fault
 from daemon.main import Daemon, World
 from daemon.publish.snapshot import Snapshot, State
-from daemon.record import Recorder
+from daemon.reasons import Reason
+from daemon.record import CycleEntry, Recorder, decode_cycle
 from daemon.store import Start
 from daemon.worker import CycleWorker
 from estimator import se2
@@ -32,6 +35,8 @@ from hal.fake.transport import FakeOpener
 from hal.fake.world import Room
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
+from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
+from hal.replay.report import LogReport
 from tests.daemon.driven import during
 from tests.daemon.replay.room import read_tum
 
@@ -134,6 +139,13 @@ def replay(folder: Path, out: Path) -> dict[str, dict[str, object]]:
     return summary
 
 
+def assert_the_same(summary: dict[str, Any], cycles: int) -> None:
+    """Every cycle was compared, with its state and reason, and none differs."""
+    said = dict(summary["recorded_run"])
+    said.pop("published_with")
+    assert said == {"cycles": cycles, "differ": 0, "first_difference": "", "judged": cycles}
+
+
 async def calm(bench: Bench) -> None:
     await bench.drive(8.0)
 
@@ -182,11 +194,7 @@ def test_the_replay_gives_the_same_poses_to_the_last_bit(
 ) -> None:
     bench = record(tmp_path / "rec", scenario, device)
     summary = replay(tmp_path / "rec", tmp_path / "out")
-    assert summary["recorded_run"] == {
-        "cycles": bench.daemon.cycle.cycles,
-        "differ": 0,
-        "first_difference": "",
-    }
+    assert_the_same(summary, bench.daemon.cycle.cycles)
     assert summary["counts"]["scans"] >= bench.daemon.lidar.status.scans > 30
     assert summary["config"]["lidar"]["mount"] == {"x": 0.1, "y": -0.02, "yaw": 30.0, "inverted": False}  # type: ignore[index]  # plain data
     stamps, poses = read_tum(tmp_path / "out" / "online.tum")
@@ -195,6 +203,73 @@ def test_the_replay_gives_the_same_poses_to_the_last_bit(
         told = posed[np.abs(posed[:, 0] - stamp) < 2e-6]  # cycles without a scan may carry the same instant
         off = np.column_stack([told[:, 1:3] - pose[:2], np.sin(told[:, 3] - pose[2])])
         assert np.abs(off).max(axis=1).min() < 2e-6
+
+
+async def pulled(bench: Bench) -> None:
+    """The lidar's plug, for a while."""
+    await bench.drive(4.0)
+    bench.opener.unplug(USB)
+    await bench.drive(4.0)
+    bench.opener.plug(USB, bench.device)
+    await bench.drive(4.0)
+
+
+def aged(folder: Path) -> None:
+    """Make the cycles of a recording those of before reason and faults were kept."""
+    (segment,) = folder.rglob("*.lumirec")
+    recording = open_recording(folder)
+    frames = [pack_head(recording.header)]
+    for frame in recording.frames(LogReport()):
+        payload = frame.payload
+        if frame.kind == Kind.CYCLE:
+            entry = msgspec.msgpack.decode(payload)
+            payload = msgspec.msgpack.encode(entry[: CycleEntry.__struct_fields__.index("reason")])
+        frames.append(pack_frame(frame.kind, frame.channel, frame.t_mono, payload))
+    segment.write_bytes(b"".join(frames))
+
+
+def test_what_was_published_is_kept_and_what_the_driver_had_to_say_is_repeated(tmp_path: Path) -> None:
+    """A lidar that cannot be opened has a reason, and a fault, that its bytes do not tell."""
+    bench = record(tmp_path / "rec", pulled)
+    entries = [
+        decode_cycle(frame.payload)
+        for frame in open_recording(tmp_path / "rec").frames(LogReport())
+        if frame.kind == Kind.CYCLE
+    ]
+    ran = [one for one in bench.snapshots if one.seq > len(bench.snapshots) - len(entries)]
+    assert [(entry.state, entry.reason) for entry in entries] == [(one.state, one.reason) for one in ran]
+    assert [entry.faults for entry in entries] == [one.condition.faults for one in ran if one.condition is not None]
+    assert (State.NO_LIDAR, Reason.LIDAR_UNREACHABLE) in {(entry.state, entry.reason) for entry in entries}
+    summary = replay(tmp_path / "rec", tmp_path / "out")
+    assert_the_same(summary, len(entries))
+    missing = sum(Fault.LIDAR_MISSING in entry.faults for entry in entries)
+    assert summary["recorded_run"]["published_with"]["101"] == missing > 20  # type: ignore[index]  # plain data
+
+
+@pytest.mark.parametrize("other", [{"state": State.LOST}, {"reason": Reason.PAUSED}])
+def test_a_state_or_reason_that_is_not_the_recorded_one_is_a_difference(
+    tmp_path: Path, other: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one cycle of many."""
+    record(tmp_path / "rec", calm)
+
+    def decode(payload: bytes) -> CycleEntry:
+        entry = decode_cycle(payload)
+        return msgspec.structs.replace(entry, **other) if entry.cycle == 40 else entry
+
+    monkeypatch.setattr("daemon.sources.decode_cycle", decode)
+    said = replay(tmp_path / "rec", tmp_path / "out")["recorded_run"]
+    assert said["differ"] == 1
+    assert str(said["first_difference"]).startswith("cycle 40: state and reason are (")
+
+
+def test_a_recording_of_before_reason_and_faults_were_kept_is_replayed(tmp_path: Path) -> None:
+    """State and reason are not compared, for what the driver said is not known."""
+    record(tmp_path / "rec", pulled)
+    aged(tmp_path / "rec")
+    said = replay(tmp_path / "rec", tmp_path / "out")["recorded_run"]
+    assert (said["differ"], said["judged"], said["published_with"]) == (0, 0, None)
+    assert said["cycles"] > 80  # type: ignore[operator]  # plain data
 
 
 async def lost(bench: Bench) -> None:
