@@ -28,7 +28,7 @@ from daemon.results import Folder, OutputRefused
 from daemon.sources import RecordingSource, Turn
 from daemon.versions import made_elsewhere
 from daemon.whysaid import Moment
-from hal.errors import DataInvalid, HalError
+from hal.errors import DataInvalid, DeviceMissing, HalError
 from hal.replay.recording import SUFFIX, open_recording
 from hal.replay.report import LogReport
 from hal.replay.text import unreadable
@@ -100,6 +100,8 @@ def spans(folder: Path) -> list[Span]:
         HalError: it cannot be read, or there is none.
     """
     try:
+        if not (_is_folder(folder) or folder.exists()):
+            raise DeviceMissing(str(folder), "no such folder", "name a recording, a dump, or a folder of several")
         inside = sorted(path for path in folder.iterdir() if path.is_dir()) if _is_folder(folder) else []
     except OSError as error:
         raise unreadable(folder, error) from error

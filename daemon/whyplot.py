@@ -6,12 +6,13 @@ import io
 import math
 from collections.abc import Sequence
 from importlib.util import find_spec
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 
 from daemon.publish.snapshot import LinkUse, State
-from daemon.whysaid import AXES, GAP, Moment, at, clock, laser_dissents, light_apart
+from daemon.whysaid import AXES, GAP, Moment, at, clock, faults_changed, laser_dissents, light_apart
 from estimator import se2
 from estimator.grid import Grid
 from estimator.records import Array
@@ -114,7 +115,7 @@ def _empty(axes: Any, why: str) -> None:
 
 
 def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
-    """Strips: state, axes, scans that came to nothing."""
+    """Strips: state, axes, scans that came to nothing; and where faults came and went, by their numbers."""
     ends = np.append(seconds[1:], seconds[-1] + LAST_S)
     for moment, begin, end in zip(told, seconds.tolist(), ends.tolist(), strict=True):
         axes.barh(0, end - begin, left=begin, color=COLOURS[moment.state], height=0.8)
@@ -123,6 +124,11 @@ def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
                 axes.barh(axis + 1, end - begin, left=begin, color="tab:red", height=0.8)
         if laser_dissents(moment):
             axes.barh(4, end - begin, left=begin, color="tab:red", height=0.8)
+    for (before, moment), begin in zip(pairwise(told), seconds[1:].tolist(), strict=True):
+        if changed := faults_changed(before, moment):
+            said = "\n".join(f"{sign}{fault}" for sign, fault in changed)
+            axes.axvline(begin, color="tab:red", linestyle=":", linewidth=0.8)
+            axes.text(begin, 4.4, said, color="tab:red", fontsize=7, va="top", clip_on=True)
     axes.set_yticks(range(5), ["state", *(f"{name} unknown" for name in AXES), "scan refused"], fontsize=8)
     axes.set_ylim(-0.5, 4.5)
 

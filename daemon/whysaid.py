@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from daemon.cycle import Cycle, CycleRecord
+from daemon.faults import FAULTS, Fault
 from daemon.publish.meanings import USES
 from daemon.publish.snapshot import LightLink, LinkUse, Snapshot, State
 from daemon.reasons import REASONS, Reason
@@ -38,12 +39,14 @@ SECOND_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One cycle as it was replayed.
+    """One cycle as it was replayed, with what was published then.
 
     Attributes:
         utc: when it began. state: as it was published then. snapshot, result: of the replay. scan: number of the scan
             it took. fresh: whether the result is of this cycle. wheels: what wheels and laser told over the last two
             seconds, None where that cannot be said. dropped: scans that were not taken.
+        told: the reason that was published, None in a recording of before reason and faults were kept.
+        faults: numbers of those that were published, gravest first.
     """
 
     utc: float
@@ -55,11 +58,13 @@ class Moment:
     wheels: Wheels | None
     dropped: int
     orders: tuple[str, ...]
+    told: Reason | None = None
+    faults: tuple[int, ...] = ()
 
     @property
     def reason(self) -> Reason:
-        """Why the state is what it is."""
-        return Reason(self.snapshot.reason)
+        """Why the state is what it is: as it was published, where that is known, else as the replay has it."""
+        return Reason(self.snapshot.reason) if self.told is None else self.told
 
 
 def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle: Cycle) -> Moment:
@@ -74,6 +79,8 @@ def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle:
         wheels=cycle.observer.witnesses.told(),
         dropped=len(record.dropped),
         orders=tuple(command.order for command in entry.commands),
+        told=next((reason for reason in Reason if reason == entry.reason), None),
+        faults=entry.faults,
     )
 
 
@@ -93,15 +100,21 @@ def at(told: Sequence[Moment], utc: float) -> int:
 
 
 def first_change(told: Sequence[Moment], utc: float) -> int | None:
-    """Index of the first cycle of a second in which state, reason or fault are others than before; None: in none."""
+    """Index of the first cycle of a second in which state, reason or faults are others than before; None: in none."""
     for k in range(1, len(told)):
         if utc <= told[k].utc < utc + SECOND_S and _key(told[k]) != _key(told[k - 1]):
             return k
     return None
 
 
-def _key(one: Moment) -> tuple[State, Reason, int]:
-    return one.state, one.reason, one.snapshot.fault
+def _key(one: Moment) -> tuple[State, Reason, tuple[int, ...]]:
+    return one.state, one.reason, one.faults
+
+
+def faults_changed(before: Moment, one: Moment) -> list[tuple[str, int]]:
+    """What has come (``+``) and gone (``-``) of the published faults between two cycles, gravest first."""
+    come = [("+", fault) for fault in one.faults if fault not in before.faults]
+    return come + [("-", fault) for fault in before.faults if fault not in one.faults]
 
 
 def report(told: Sequence[Moment], utc: float, where: str, second: bool = False, made: str = "") -> str:
@@ -115,7 +128,7 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False,
         changed = first_change(told, utc)
         k = k if changed is None else changed
         last = max((j for j, one in enumerate(told) if one.utc < utc + SECOND_S), default=k)
-        what = "nothing changes" if changed is None else "state, reason or fault first change in it"
+        what = "nothing changes" if changed is None else "state, reason or faults first change in it"
         when = f"{when.partition('.')[0]}, the whole second: {what}"
     one = told[k]
     begun, apart = when.partition(", the whole")[0], one.utc - utc
@@ -139,10 +152,15 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False,
 def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
     one = told[k]
     since = _since(told, k, lambda moment: (moment.state, moment.reason))
-    meaning, remedy = REASONS[one.reason]
-    yield f"{one.state.name} since {since}: {meaning or 'nothing is the matter'}" + (f" ({remedy})" if remedy else "")
-    if one.snapshot.state is not one.state:
-        yield f"(the replay says {one.snapshot.state.name}: what the driver said of the device is not recorded)"
+    yield f"{one.state.name} since {since}: {_because(one.reason)}{_in_brackets(REASONS[one.reason][1])}"
+    for fault in one.faults:
+        text, remedy = _fault(fault)
+        yield f"fault {fault} since {_since(told, k, partial(_has, fault))}: {text}{_in_brackets(remedy)}"
+    again = one.snapshot.state, Reason(one.snapshot.reason)
+    if again != (one.state, one.reason):
+        yield f"(this was published; the replay itself says {again[0].name}: {_because(again[1])})"
+    if one.told is None:
+        yield "(published reason and faults were not recorded then: the reason is the replay's, faults are not known)"
     if one.snapshot.pose is not None:
         x, y, yaw = one.snapshot.pose
         said = f"pose {x:.3f} {y:.3f} m, {math.degrees(yaw):.1f} deg"
@@ -156,6 +174,24 @@ def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
         yield said
     if one.snapshot.trust.places is not None:
         yield f"the place in the map is looked for: {one.snapshot.trust.places} fit"
+
+
+def _because(reason: Reason) -> str:
+    """A reason with the number under which it is published."""
+    return f"reason {int(reason)}, {REASONS[reason][0]}" if reason else REASONS[reason][0]
+
+
+def _in_brackets(remedy: str) -> str:
+    return f" ({remedy})" if remedy else ""
+
+
+def _fault(number: int) -> tuple[str, str]:
+    """What a fault means and what a person can do; newer software may have recorded one that is not known here."""
+    return FAULTS[Fault(number)] if number in Fault._value2member_map_ else ("not known here", "")
+
+
+def _has(fault: int, one: Moment) -> bool:
+    return fault in one.faults
 
 
 def _since(told: Sequence[Moment], k: int, what: Callable[[Moment], object]) -> str:
@@ -294,7 +330,9 @@ def _changed(before: Moment, one: Moment) -> Iterator[str]:
     old, new = before.snapshot, one.snapshot
     yield from (f"order {order}" for order in one.orders)
     if (before.state, before.reason) != (one.state, one.reason):
-        yield f"{one.state.name}: {REASONS[one.reason][0] or 'all is well'}"
+        yield f"{one.state.name}: {_because(one.reason)}"
+    for sign, fault in faults_changed(before, one):
+        yield f"fault {fault} {'comes' if sign == '+' else 'is over'}: {_fault(fault)[0]}"
     for axis, name in enumerate(AXES):
         if old.known[axis] != new.known[axis]:
             yield f"{name} {'known' if new.known[axis] else 'unknown'}"
@@ -311,8 +349,6 @@ def _changed(before: Moment, one: Moment) -> Iterator[str]:
         yield f"the pose jumps by {math.dist(new.pose[:2], old.pose[:2]):.2f} m"
     if one.dropped:
         yield f"{one.dropped} scans came too fast and were left out"
-    if new.fault != old.fault:
-        yield f"fault {new.fault}" if new.fault else f"fault {old.fault} is over"
     yield from _lamps_changed(old, new)
 
 

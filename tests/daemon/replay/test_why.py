@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,13 +20,13 @@ from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, 
 from daemon.reasons import Reason
 from daemon.versions import build
 from daemon.why import NoMoment, Span, find, meant, whole_second
-from daemon.whysaid import Moment, report
+from daemon.whysaid import Moment, first_change, report
 from daemon.witness import Told
 from estimator.grid import Grid
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
 from tests.daemon.replay.test_dump import let_write, unplugged
-from tests.daemon.replay.test_recorded_run import Bench, record
+from tests.daemon.replay.test_recorded_run import Bench, aged, pulled, record
 
 AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
 SPAN = Span(Path("rec"), AT, AT + 3600.0, AT - 100.0)
@@ -170,7 +171,42 @@ def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]
     assert "laser   silent for 5.0 s" in said
     assert "x       UNKNOWN since" in said
     assert "TRACKING: the pose is confirmed" in said
-    assert "NO_LIDAR: no valid scan" in said
+    assert "NO_LIDAR: reason 3, the lidar cannot be opened" in said
+    assert "the replay" not in said
+
+
+def test_what_was_published_is_shown_with_its_faults_at_their_own_times(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Modbus and the journal had it: the lidar cannot be opened, and a beat later it is a fault."""
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
+    head, state, fault, *rest = asked("2023-11-14T22:13:25Z", dump, capsys).splitlines()
+    at = fault.split(" since ")[1].split(": ")[0]
+    assert f"the whole second: state, reason or faults first change in it, cycle of {at}" in head
+    assert "NO_LIDAR since" in state
+    assert ": reason 3, the lidar cannot be opened (" in state
+    assert at not in state, "it came later"
+    assert fault.startswith("fault 101 since ")
+    assert "the lidar is not there (check power" in fault
+    assert f"  {at}  fault 101 comes: the lidar is not there" in rest
+
+
+def test_a_fault_that_is_over_is_told_too(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (ring,) = (path for path in recorded.iterdir() if not path.name.startswith(DUMP))
+    said = asked("2023-11-14T22:13:35Z", ring, capsys)
+    assert "state, reason or faults first change in it" in said.splitlines()[0]
+    assert "fault 101 since" not in said
+    assert "fault 101 is over: the lidar is not there" in said
+
+
+def test_of_an_older_recording_it_is_said_what_is_not_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(tmp_path / "rec", pulled)
+    aged(tmp_path / "rec")
+    said = asked("6.5", tmp_path / "rec", capsys)
+    assert "NO_LIDAR since" in said
+    assert "reason 4, no valid scan" in said
+    assert "(published reason and faults were not recorded then: the reason is the replay's" in said
+    assert "\nfault " not in said
 
 
 def test_a_recording_of_another_build_is_said_to_be_one(
@@ -192,7 +228,7 @@ def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pyt
     second, fraction = at.split(".")
     assert int(fraction) > 0, "else nothing is shown here"
     head, state = asked(second, dump, capsys).splitlines()[:2]
-    assert f"{second}, the whole second: state, reason or fault first change in it, cycle of {at}" in head
+    assert f"{second}, the whole second: state, reason or faults first change in it, cycle of {at}" in head
     assert state == silent
     head, state = asked(f"{second}.0", dump, capsys).splitlines()[:2]
     assert f"{second}.000, cycle of" in head
@@ -287,6 +323,41 @@ def test_a_picture_of_nothing_says_so_in_place_of_curves(monkeypatch: pytest.Mon
         "wheels and laser could not be compared",
         "light told no place",
     ]
+
+
+def test_where_the_replay_says_something_else_that_is_said_in_a_line() -> None:
+    shown = replace(NOTHING, state=State.NO_LIDAR, reason=Reason.LIDAR_SILENT)
+    moment = Moment(0.0, State.NO_LIDAR, shown, None, None, True, None, 0, (), told=Reason.LIDAR_UNREACHABLE)
+    said = report([moment], 0.0, "here").splitlines()
+    assert ": reason 3, the lidar cannot be opened" in said[1]
+    assert said[2].startswith("(this was published; the replay itself says NO_LIDAR: reason 4, no valid scan")
+    assert not any("the replay" in line for line in said[3:])
+    alike = replace(moment, told=Reason.LIDAR_SILENT)
+    assert "the replay" not in report([alike], 0.0, "here")
+
+
+@pytest.mark.parametrize(
+    "other", [{"told": Reason.LIDAR_UNREACHABLE}, {"faults": (101,)}, {"faults": (101, 999)}, {"state": State.LOST}]
+)
+def test_the_first_change_of_a_second_is_that_of_what_was_published(other: dict[str, Any]) -> None:
+    """The gravest fault may stay what it is, while another one comes; 999 is one of newer software."""
+    before = Moment(0.0, State.NO_LIDAR, NOTHING, None, None, True, None, 0, (), told=Reason.LIDAR_SILENT)
+    told = [before, replace(before, utc=5.25, **other), replace(before, utc=5.5, **other)]
+    assert first_change(told, 5.0) == 1
+    assert first_change(told, 6.0) is None
+    changed = report(told, 5.0, "here", second=True)
+    assert "cycle of" in changed.splitlines()[0]
+    for fault in other.get("faults", ()):
+        assert f"fault {fault} comes: " in changed
+
+
+@pytest.mark.parametrize("named", ["nowhere", "nowhere/at/all"])
+def test_a_folder_that_is_not_there_is_said_to_be_none(
+    named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["why", "3", str(tmp_path / named)]) == 1
+    said = capsys.readouterr().err
+    assert f"{tmp_path / named}: no such folder (name a recording, a dump, or a folder of several)" in said
 
 
 def test_a_moment_without_a_cycle_is_said_to_have_none() -> None:
