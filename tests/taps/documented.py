@@ -51,6 +51,7 @@ ELSEWHERE: Final = {
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/test_bench_world.py",
     r".*: (python -m tools.experiments|make experiments)": "tests/tools/experiments",
     r"replay.md: python -m tests.logs": "tests/logs",
+    r"replay.md: mbpoll": "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says",
 }
 """The test that runs it, or what it is made of where the whole takes minutes, hours, or the devices of a computer."""
 

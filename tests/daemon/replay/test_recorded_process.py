@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
+import shutil
+import subprocess
 import time
 from pathlib import Path
 
@@ -11,7 +15,8 @@ import pytest
 from daemon import cli
 from daemon.publish.snapshot import State
 from daemon.why import spans
-from tests.daemon.test_process import fake_lidar, running
+from tests.daemon.test_process import ROOT, fake_lidar, running
+from tests.taps.documented import documented
 
 
 @pytest.mark.realtime
@@ -57,6 +62,26 @@ def test_the_ring_of_a_killed_run_is_a_dump_after_the_next_start_and_is_repeated
     compared = json.loads((tmp_path / "out" / "summary.json").read_text())["recorded_run"]
     assert compared["differ"] == 0, compared["first_difference"]
     assert compared["cycles"] > 20
+
+
+@pytest.mark.realtime
+@pytest.mark.system
+@pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed (Debian: apt-get install mbpoll)")
+def test_a_dump_is_asked_for_as_the_page_says(tmp_path: Path) -> None:
+    """The lines of docs/replay.md, to this daemon's port."""
+    ask, read = (shlex.split(line) for line in documented(ROOT / "docs" / "replay.md") if line.startswith("mbpoll"))
+    link, folder = tmp_path / "lidar", tmp_path / "flight"
+    options = ["--record", str(folder), "--last", "1", "--set", "modbus.write=true"]
+    with fake_lidar(link), running(link, *options) as daemon:
+        daemon.until(30.0, "state", State.TRACKING)
+        for words in (ask, read):
+            words[words.index("-p") + 1] = str(daemon.modbus)
+        subprocess.run(ask, check=True, capture_output=True, timeout=10.0)
+        end, said = time.monotonic() + 20.0, ""
+        while re.findall(r"\[100[89]\]:\s*(\d+)", said) != ["1", "2"]:
+            assert time.monotonic() < end, said
+            said = subprocess.run(read, check=True, capture_output=True, text=True, timeout=10.0).stdout
+    assert len(list(folder.glob("dump-*-asked"))) == 1
 
 
 @pytest.mark.realtime
