@@ -281,7 +281,7 @@ class Rerun:
         pose = None if result is None else (tuple(result.T_odom_base.tolist()), tuple(result.T_map_odom.tolist()))
         recorded = None if entry.odom is None else (entry.odom, entry.map_odom)
         light, said = light_of(result), (entry.state, entry.reason)
-        judged = (int(record.snapshot.state), record.snapshot.reason)
+        judged = (int(record.snapshot.state), int(record.snapshot.reason))
         self.comparison.cycles += 1
         if entry.reason is not None:
             self.comparison.judged += 1

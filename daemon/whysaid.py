@@ -28,7 +28,7 @@ GAP: Final = 16.27
 """Squared Mahalanobis distance of three components that is beyond chance (1 in 1000)."""
 SILENT_S: Final = 0.5
 MOST: Final = 12
-"""Changes that are listed."""
+"""Changes that are listed; beyond that those of state and faults, and of all others the latest."""
 AGAINST: Final = (LinkUse.OCCLUDED, LinkUse.REJECTED)
 """What is received of these lamps speaks against the place, or did a moment ago."""
 FITS: Final = 0.2
@@ -141,11 +141,9 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False,
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
     if one.snapshot.light is not None:
         lines += ["", "lamps", *(f"  {line}" for line in _lamps(told, k))]
-    changes = list(_changes(told[: last + 1]))
     first = f"{one.utc - told[0].utc:.0f} s before"
     lines += ["", f"what changed in the {first}{' and in this second' if second else ''}"]
-    lines += [f"  ... {len(changes) - MOST} more"] if len(changes) > MOST else []
-    lines += [f"  {line}" for line in changes[-MOST:]] or ["  nothing"]
+    lines += [f"  {line}" for line in _listed(list(_changes(told[: last + 1])))] or ["  nothing"]
     return "\n".join(lines) + "\n"
 
 
@@ -319,20 +317,34 @@ def _link(link: LightLink) -> str:
     return f"{name} ({math.exp(link.residual):.2f} of expected{again})"
 
 
-def _changes(told: Sequence[Moment]) -> Iterator[str]:
-    """One line for everything that became otherwise, oldest first."""
+def _listed(changes: list[tuple[bool, str]]) -> Iterator[str]:
+    """The changes that there is room for; what the lamps do in the meantime must not hide a fault."""
+    minor = [k for k, (grave, _) in enumerate(changes) if not grave]
+    out = set(minor[: max(0, len(changes) - MOST)])
+    if out:
+        yield f"... {len(out)} more, of axes, witnesses, lamps"
+    yield from (text for k, (_, text) in enumerate(changes) if k not in out)
+
+
+def _changes(told: Sequence[Moment]) -> Iterator[tuple[bool, str]]:
+    """One line for everything that became otherwise, oldest first, and whether it was published as state or fault."""
     for before, one in pairwise(told):
+        for text in _published(before, one):
+            yield True, f"{of_day(one.utc)}  {text}"
         for text in _changed(before, one):
-            yield f"{of_day(one.utc)}  {text}"
+            yield False, f"{of_day(one.utc)}  {text}"
 
 
-def _changed(before: Moment, one: Moment) -> Iterator[str]:
-    old, new = before.snapshot, one.snapshot
+def _published(before: Moment, one: Moment) -> Iterator[str]:
     yield from (f"order {order}" for order in one.orders)
     if (before.state, before.reason) != (one.state, one.reason):
         yield f"{one.state.name}: {_because(one.reason)}"
     for sign, fault in faults_changed(before, one):
         yield f"fault {fault} {'comes' if sign == '+' else 'is over'}: {_fault(fault)[0]}"
+
+
+def _changed(before: Moment, one: Moment) -> Iterator[str]:
+    old, new = before.snapshot, one.snapshot
     for axis, name in enumerate(AXES):
         if old.known[axis] != new.known[axis]:
             yield f"{name} {'known' if new.known[axis] else 'unknown'}"

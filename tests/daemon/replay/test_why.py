@@ -351,6 +351,22 @@ def test_the_first_change_of_a_second_is_that_of_what_was_published(other: dict[
         assert f"fault {fault} comes: " in changed
 
 
+def test_what_lamps_do_meanwhile_hides_no_fault() -> None:
+    def lit(use: LinkUse) -> Snapshot:
+        return replace(NOTHING, light=LightPicture(links=(LightLink(7, 7, use, 1e-9, 0.1),)))
+
+    uses = [(LinkUse.ACCEPTED, LinkUse.OCCLUDED)[k % 2] for k in range(40)]
+    moments = [
+        Moment(0.1 * k, State.DEGRADED, lit(use), None, None, True, None, 0, (), Reason.NONE, (101,) if k > 3 else ())
+        for k, use in enumerate(uses)
+    ]
+    changes = report(moments, 3.95, "here").partition("what changed")[2].splitlines()[1:]
+    assert changes[0] == "  ... 28 more, of axes, witnesses, lamps"
+    assert "fault 101 comes: the lidar is not there" in changes[1]
+    assert len(changes) == 13
+    assert "lamp 7: ACCEPTED -> OCCLUDED" in changes[-1]
+
+
 @pytest.mark.parametrize("named", ["nowhere", "nowhere/at/all"])
 def test_a_folder_that_is_not_there_is_said_to_be_none(
     named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
