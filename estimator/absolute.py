@@ -27,7 +27,7 @@ from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
 from estimator.records import Array, Command, Order
 from estimator.result import SURPRISE, Fix, LightsResult
-from estimator.row import straighten, sure_part
+from estimator.row import Lately, doubt, straighten, sure_part
 from estimator.state import State
 from estimator.swing import Swing
 from estimator.trail import KEPT_S
@@ -91,7 +91,7 @@ class Absolute:
         t_match: instant of the latest match; scan_s: what had passed since the scan before it.
         t_light: instant of the latest epoch, whatever was in it; light_s: what had passed since the one before it.
         poses: T_odom_base of the last second, each with its instant.
-        swing: the heading of the odom frame by light over the last stretch of way.
+        swing: the heading of the odom frame by light over the last stretch of way. row: what a row of lamps leaves.
         mended: when light has mended the pose in the last seconds, and what part (3x3, odom axes) of its error is left.
     """
 
@@ -120,6 +120,7 @@ class Absolute:
     light_s: float = 0.0
     poses: deque[tuple[float, Array]] = field(default_factory=deque)
     swing: Swing = field(default_factory=Swing)
+    row: Lately = field(default_factory=Lately)
     mended: deque[tuple[float, Array]] = field(default_factory=deque)
 
 
@@ -178,8 +179,8 @@ def on_lights(state: State, lights: LightsResult) -> None:
         tie.way_young = tie.way
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
-    catalogue, told = state.light.filter.catalogue, state.light.told
-    lights = across_the_row(catalogue, doubted(lights, tie.way - tie.way_young, told))
+    tie.row.take(doubt(state.light.filter.catalogue, lights.accepted), tie.way)
+    lights = across_the_row(tie.row.left, doubted(lights, tie.way - tie.way_young, state.light.told))
     held = holds_heading(state)
     if held:
         lights = without_heading(lights)
@@ -317,7 +318,7 @@ def virtual(state: State) -> Virtual | None:
     if tie is None or state.light is None or state.light.result.fix is not Fix.GOOD:
         return None
     wheels = state.light.told
-    lights = across_the_row(state.light.filter.catalogue, state.light.result)
+    lights = across_the_row(tie.row.left, state.light.result)
     _, factor = doubted_covariance(lights, tie.way - tie.way_young, wheels)
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     T_map_base = lights.T_map_base.copy()

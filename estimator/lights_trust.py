@@ -11,15 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.lights_catalogue import Catalogue
 from estimator.linear3 import invert3, symmetric
 from estimator.records import Array
 from estimator.result import LightsResult
-from estimator.row import doubt
 
 TRUST, YOUNG, YOUNG_M = 2.0, 2.5, 4.0
 """By how much the variance of a position from light is raised: always, because errors of the light model hang together
-farther than it knows; and at the start, fading with the way driven, because gains and heading are being found."""
+farther than it knows; and at the start, fading with the way driven (m), because gains and heading are being found."""
 UNGUIDED = 1.5
 """By how much that variance is raised further where no wheels tell `lights` how the robot moves."""
 ANY_HEADING = math.pi**2 / 3.0
@@ -58,9 +56,11 @@ def without_heading(lights: LightsResult) -> LightsResult:
     return replace(lights, covariance=P, gained=symmetric(keep @ lights.gained @ keep.T), gained_by=made)
 
 
-def across_the_row(catalogue: Catalogue, lights: LightsResult) -> LightsResult:
-    """The lights' result, trusted less across the row where all lamps in use stand in one."""
-    more = doubt(catalogue, lights.accepted)
+def across_the_row(more: Array, lights: LightsResult) -> LightsResult:
+    """The lights' result, trusted less across the row in which all lamps in use stand, or have stood until lately.
+
+    ``more``: covariance (3, 3; m, m, rad; survey axes) that is added, see `row.doubt` and `row.Lately`.
+    """
     if not more.any():
         return lights
     P = lights.covariance + more

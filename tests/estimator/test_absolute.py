@@ -292,14 +292,15 @@ def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> No
     catalogue = state.light.filter.catalogue  # type: ignore[union-attr]  # lit
     lamps = catalogue.by_id
     assert len({round(lamps[k].y, 2) for k in (1, 2, 3, 4)}) == 1
-    row = across_the_row(catalogue, lights_at(T, frozenset((1, 2, 3, 4)), state))
+    in_a_row = doubt(catalogue, frozenset((1, 2, 3, 4)))
+    row = across_the_row(in_a_row, lights_at(T, frozenset((1, 2, 3, 4)), state))
     assert np.sqrt(np.diag(row.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
     told = lights_at(T, frozenset((1, 2, 3, 4)), state)
     told = replace(told, gained=0.5 * np.linalg.inv(told.covariance), gained_by=np.array((0.02, 0.1, 0.0)))
-    row = across_the_row(catalogue, told)
+    row = across_the_row(in_a_row, told)
     x, y, _ = (np.linalg.inv(row.covariance) @ row.gained_by / np.diag(row.gained)).tolist()
     assert (x, y) == pytest.approx((0.04, 0.2), rel=0.05), "a correction goes with what it weighs, along and across"
-    grid = across_the_row(catalogue, lights_at(T, frozenset((1, 4, 13, 16)), state))
+    grid = across_the_row(doubt(catalogue, frozenset((1, 4, 13, 16))), lights_at(T, frozenset((1, 4, 13, 16)), state))
     assert np.sqrt(np.diag(grid.covariance)) == pytest.approx((0.05, 0.05, 0.02), abs=0.005)
 
 
@@ -308,7 +309,9 @@ def test_what_light_says_of_a_keyframe_is_as_doubtful_across_a_row(driven: tuple
     state = copy.deepcopy(driven[0])
     assert state.light is not None
     T = driven[1].results[-1].T_map_odom
+    assert state.absolute is not None
     state.light.result = lights_at(T, frozenset((1, 2, 3, 4)), state)
+    state.absolute.row.take(doubt(state.light.filter.catalogue, state.light.result.accepted), state.absolute.way)
     told = absolute.virtual(state)
     assert told is not None
     assert np.sqrt(np.diag(told.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)

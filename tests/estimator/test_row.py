@@ -63,6 +63,46 @@ def test_of_a_pose_that_is_off_only_what_is_beyond_doubt_counts(angle: float) ->
     assert row.sure_part(R @ np.array((3.0, -4.0, 0.0)), P) == pytest.approx((5.0, 0.0))
 
 
+def test_what_a_row_has_led_astray_stays_in_doubt_for_a_while_with_other_lamps() -> None:
+    """Ten metres of a row, then a lamp beside it: doubted as before at first, as those lamps alone after a metre."""
+    known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
+    a_row, beside = (row.doubt(known, frozenset(lamps)) for lamps in ({1, 2, 3, 4}, {1, 2, 5}))
+    assert a_row.trace() > 100.0 * beside.trace()
+    lately = row.Lately()
+    for k in range(101):
+        lately.take(a_row, 0.1 * k)
+    assert lately.left == pytest.approx(a_row)
+    lately.take(beside, 10.05)
+    assert lately.left.trace() > 0.5 * a_row.trace()
+    for k in range(1, 12):
+        lately.take(beside, 10.05 + 0.1 * k)
+    assert lately.left.trace() < 0.01 * a_row.trace()
+
+
+def test_what_a_row_has_led_astray_is_not_forgotten_in_the_dark() -> None:
+    """The first lamp beside it after a metre without any is the first all the same; so is a start below a row."""
+    known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
+    a_row, beside = (row.doubt(known, frozenset(lamps)) for lamps in ({1, 2, 3, 4}, {1, 2, 5}))
+    for begun, way in ((10.0, 11.0), (0.0, 0.05)):
+        lately = row.Lately(way=begun)
+        lately.take(a_row, begun)
+        lately.take(beside, way)
+        assert lately.left.trace() > 0.5 * a_row.trace()
+
+
+def test_a_row_for_a_moment_leaves_nothing() -> None:
+    """Lamps hidden behind somebody: as doubtful as a row while they are, and not after."""
+    known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
+    a_row, all_of_them = row.doubt(known, frozenset({1, 2, 3, 4})), row.doubt(known, frozenset({1, 2, 5}))
+    lately = row.Lately()
+    for way in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5):
+        lately.take(all_of_them, way)
+    lately.take(a_row, 0.51)
+    assert lately.left == pytest.approx(a_row)
+    lately.take(all_of_them, 0.52)
+    assert lately.left.trace() < 0.1 * a_row.trace()
+
+
 @pytest.mark.jit
 def test_a_lamp_that_hangs_elsewhere_does_not_lead_a_robot_away_whose_place_the_laser_holds() -> None:
     """Light that began anew below one of two such lamps had taken the pose 2 m and 17 deg along (RMSE)."""
