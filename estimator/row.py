@@ -33,8 +33,8 @@ SURE = 3.0
 """An offset of fewer standard deviations of what has told it may be none."""
 
 FORGOTTEN_M, EPOCH_M = 0.1, 0.05
-"""Way with other lamps over which what a row has left in place and heading fades, by a factor of e in its variance; and how much of it
-one epoch can be."""
+"""Way with other lamps over which what a row has left in place and heading fades, by a factor of e in its variance; and
+how much of it one epoch can be."""
 
 KNOWN = 4096
 """So many sets of lamps are remembered."""
