@@ -204,3 +204,20 @@ def test_pictures_are_well_formed_whatever_is_drawn() -> None:
         ElementTree.fromstring(text)
     with_plots = replace(GOOD, plots=(plots[1],))
     assert "<svg" in page([with_plots], ABOUT, Compared())
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ('{"results": [{"name": 1, "passed": true, "seconds": 1}]}', "name"),
+        ('{"results": [{"name": "a", "passed": "no", "seconds": 1}]}', "passed"),
+        ('{"results": [{"name": "a", "passed": true, "seconds": 1, "figures": [{"name": 4, "value": 1}]}]}', "figures"),
+        ('{"results": [{"name": "a", "passed": true, "seconds": 1' + "0" * 400 + "}]}", "holds no results"),
+        ('{"results": [], "about": {"lidar": 3}}', "about"),
+        ("[" * 200_000, "holds no results"),
+    ],
+)
+def test_a_report_of_other_types_is_refused_before_anything_is_tried(tmp_path: Path, text: str, word: str) -> None:
+    (tmp_path / "results.json").write_text(text, encoding="utf-8")
+    with pytest.raises(CannotCompare, match=word):
+        read(tmp_path, "bench")

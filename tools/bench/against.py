@@ -6,7 +6,9 @@ import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+import msgspec
 
 if TYPE_CHECKING:
     from tools.bench.report import Result
@@ -19,6 +21,28 @@ ENDS: Final = ("computer", "robot", "lidar", "adc", "light")
 
 class CannotCompare(Exception):
     """The run to compare with cannot be; the text says why."""
+
+
+class _KeptFigure(msgspec.Struct):
+    """Of a report's file, what is needed here; so are the next two."""
+
+    name: str
+    value: float
+    worse: str = ""
+
+
+class _KeptResult(msgspec.Struct):
+    name: str
+    passed: bool
+    seconds: float
+    skipped: str = ""
+    figures: list[_KeptFigure] = []
+
+
+class _Kept(msgspec.Struct):
+    results: list[_KeptResult]
+    bench: str = ""
+    about: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,23 +94,20 @@ def read(against: Path, bench: str) -> Before:
     """
     file = against / "results.json" if against.is_dir() else against
     try:
-        told = json.loads(file.read_text(encoding="utf-8"))
-        results = {one["name"]: _old(one) for one in told["results"]}
-        before = Before(file, str(told.get("bench", "")), dict(told.get("about", {})), results)
+        told = msgspec.convert(json.loads(file.read_text(encoding="utf-8")), _Kept)
     except OSError as error:
         raise CannotCompare(f"{file}: {error.strerror}; name the results.json of another run, or its folder") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CannotCompare(f"{file} holds no results of a bench: {error!r}") from error
-    if before.bench not in ("", bench):
-        raise CannotCompare(f"{file} is a report of {before.bench}, and this is {bench}: name one of {bench}")
-    return before
+    except (ValueError, ArithmeticError, RecursionError) as error:
+        raise CannotCompare(f"{file} holds no results of a bench: {error}") from error
+    if told.bench not in ("", bench):
+        raise CannotCompare(f"{file} is a report of {told.bench}, and this is {bench}: name one of {bench}")
+    return Before(file, told.bench, told.about, {one.name: _old(one) for one in told.results})
 
 
-def _old(one: dict[str, Any]) -> Old:
-    outcome = "skipped" if one.get("skipped") else "passed" if one["passed"] else "FAILED"
-    figures = {figure["name"]: float(figure["value"]) for figure in one.get("figures", ())}
-    judged = frozenset(figure["name"] for figure in one.get("figures", ()) if figure.get("worse"))
-    return Old(outcome, float(one["seconds"]), figures, judged)
+def _old(one: _KeptResult) -> Old:
+    outcome = "skipped" if one.skipped else "passed" if one.passed else "FAILED"
+    figures = {figure.name: figure.value for figure in one.figures}
+    return Old(outcome, one.seconds, figures, frozenset(figure.name for figure in one.figures if figure.worse))
 
 
 def compare(results: Sequence[Result], facts: dict[str, str], before: Before | None) -> Compared:
