@@ -30,9 +30,9 @@ def write_config(folder: Path, scenario: Scenario, ends: Ends) -> list[Path]:
         raise CannotPlay(f"{there[0]} is there already: name another folder with --write-config")
     text = _text(scenario, ends, own_address(*ends.modbus))
     folder.mkdir(parents=True, exist_ok=True)
-    files[0].write_text(text, encoding="utf-8")
-    if scene.light is not None:
+    if scene.light is not None:  # first: it may fail, and another attempt must not meet a configuration
         write_plan(scene.light, folder / SURVEY)
+    files[0].write_text(text, encoding="utf-8")
     return files
 
 
