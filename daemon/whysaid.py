@@ -45,7 +45,7 @@ class Moment:
         utc: when it began. state: as it was published then. snapshot, result: of the replay. scan: number of the scan
             it took. fresh: whether the result is of this cycle. wheels: what wheels and laser told over the last two
             seconds, None where that cannot be said. dropped: scans that were not taken.
-        told: the reason that was published, None in a recording of before reason and faults were kept.
+        told: number of the reason that was published, None in a recording of before reason and faults were kept.
         faults: numbers of those that were published, gravest first.
     """
 
@@ -58,13 +58,14 @@ class Moment:
     wheels: Wheels | None
     dropped: int
     orders: tuple[str, ...]
-    told: Reason | None = None
+    told: int | None = None
     faults: tuple[int, ...] = ()
 
     @property
     def reason(self) -> Reason:
         """Why the state is what it is: as it was published, where that is known, else as the replay has it."""
-        return Reason(self.snapshot.reason) if self.told is None else self.told
+        known = self.told if self.told in Reason._value2member_map_ else None
+        return Reason(self.snapshot.reason if known is None else known)
 
 
 def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle: Cycle) -> Moment:
@@ -79,7 +80,7 @@ def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle:
         wheels=cycle.observer.witnesses.told(),
         dropped=len(record.dropped),
         orders=tuple(command.order for command in entry.commands),
-        told=next((reason for reason in Reason if reason == entry.reason), None),
+        told=entry.reason,
         faults=entry.faults,
     )
 
@@ -155,6 +156,8 @@ def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
         text, remedy = _fault(fault)
         yield f"fault {fault} since {_since(told, k, partial(_has, fault))}: {text}{_in_brackets(remedy)}"
     again = one.snapshot.state, Reason(one.snapshot.reason)
+    if one.told is not None and one.told not in Reason._value2member_map_:
+        yield f"(reason {one.told} was published, which is not known here: newer software's; told is the replay's)"
     if again != (one.state, one.reason):
         yield f"(this was published; the replay itself says {again[0].name}: {_because(again[1])})"
     if one.told is None:

@@ -95,7 +95,9 @@ async def test_time_stamps(lidar: LidarEnd, told: Telling) -> None:
     off = t - t[0] - (offset + gain * (tick - tick[0]))
     age = np.array([scan.t_rx - scan.t_mono for scan in scans])
     period = scans[0].geometry.period_s
-    told.figure("time stamps about the sensor's clock, rms", 1e3 * float(np.sqrt(np.mean(off**2))), "ms", worse="more")
+    told.figure(
+        "time stamps about the sensor's clock, rms", 1e3 * float(np.sqrt(np.mean(off**2))), "ms", worse="more", room=0.3
+    )
     told.figure("age at arrival, median", 1e3 * float(np.median(age)), "ms", worse="more", room=2.0)
     told.figure("age at arrival, 99 %", 1e3 * float(np.quantile(age, 0.99)), "ms", worse="more", room=5.0)
     told.figure("sensor's clock is fast by", -1e6 * (gain - 1.0), "ppm")

@@ -13,7 +13,9 @@ from daemon.configfile import load as load_config
 from tools.bench.report import About, Figure, Result, write
 from tools.bench.world import __main__ as world
 from tools.bench.world.__main__ import main
-from tools.bench.world.scenario import load
+from tools.bench.world.judge import Read
+from tools.bench.world.scenario import ScenarioError, load
+from tools.bench.world.stage import Ends, why_no_pose
 
 ROOT = Path(__file__).parents[2]
 LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
@@ -76,6 +78,7 @@ def test_the_robot_computers_files_are_written(tmp_path: Path, capsys: pytest.Ca
     config = load_config(folder / "lumiloop.toml")
     assert (config.lidar.device, config.lidar.mount.x) == ("tcp://127.0.0.1:10999", 0.15)
     assert (config.bind, config.allow, config.modbus.port) == ("0.0.0.0", ("127.0.0.1",), 1599)
+    assert config.map.folder == "none", "it would look for itself in a map of another drive"
     assert (config.odometry.port, config.photodiode.bus) == (5699, "tcp://127.0.0.1:7799")
     assert (
         subprocess.run(
@@ -102,3 +105,30 @@ def test_the_robot_computers_files_are_written(tmp_path: Path, capsys: pytest.Ca
         assert not (tmp_path / "odd").exists(), "nothing is written where something is wrong"
     assert main(["lap", "cable", *ends, "--write-config", str(tmp_path / "two")]) == 2
     assert "for one scenario" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [
+        ('[[fault]]\nwhat = "hangup"\nwhere = "lidar"\nwhen = 40\n', r"number 1: when: 40 s is not before the end"),
+        ('[[expect]]\nwhat = "clear"\nwithin = 4.0\nfrom = 41.0\n', r"expect\[1\]\.from: 41 s is not before the end"),
+        (
+            '[[expect]]\nwhat = "error"\nat_most = 0.1\nfrom = 9.0\nuntil = 8.0\n',
+            r"until: 8 s is not after its `from`, 9",
+        ),
+    ],
+)
+def test_what_would_never_come_is_refused_before_the_drive(tmp_path: Path, what: str, says: str) -> None:
+    """It could not fail either: a fault after the end would be survived by anybody."""
+    file = tmp_path / "late.toml"
+    file.write_text(LEAST + what)
+    with pytest.raises(ScenarioError, match=says):
+        load(file)
+
+
+def test_a_robot_computer_that_looks_for_itself_in_a_map_is_told_apart_from_one_without_a_lidar() -> None:
+    ends = Ends("tcp://127.0.0.1:10940", ("127.0.0.1", 1502))
+    looking, silent = (why_no_pose(Read(0.0, state), ends, 120.0) for state in ("RELOCATING", "NO_LIDAR"))
+    assert 'folder = "none"' in looking
+    assert "lidar.device" not in looking
+    assert "lidar.device" in silent

@@ -334,6 +334,9 @@ def test_where_the_replay_says_something_else_that_is_said_in_a_line() -> None:
     assert not any("the replay" in line for line in said[3:])
     alike = replace(moment, told=Reason.LIDAR_SILENT)
     assert "the replay" not in report([alike], 0.0, "here")
+    newer = report([replace(moment, told=999, faults=(101,))], 0.0, "here")
+    assert "(reason 999 was published, which is not known here" in newer
+    assert "not recorded then" not in newer
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@
     python -m tools.bench.world lap --local
 
 The same words and ``--write-config DIR`` write what the robot computer needs for it; docs/bench.md has the wiring.
- Ends with 0 if everything is as expected, 1 if not, 2 if it cannot be played.
+Ends with 0 if everything is as expected, 1 if not, 2 if it cannot be played.
 """
 
 from __future__ import annotations

@@ -62,6 +62,9 @@ def _text(scenario: Scenario, ends: Ends, bench: str) -> str:
         "",
         "[modbus]",
         f"port = {port}",
+        "",
+        "[map]",
+        'folder = "none"  # a map of another drive, or of the real building, would be looked through for this place',
     ]
     if ends.odometry and scenario.world.odometry:
         lines += ["", "[odometry]", f"port = {_port(ends.odometry, 'udp://')}"]

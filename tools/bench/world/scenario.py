@@ -34,7 +34,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
@@ -179,7 +179,20 @@ def _scenario(name: str, tree: dict[str, Any]) -> Scenario:
         raise ValueError("expect: a scenario that expects nothing cannot fail")
     expect = tuple(_expectation(f"expect[{k}]", table, world) for k, table in enumerate(wanted))
     orders.check(tables, room.model(world.lidar), world.lamps)
+    _in_time(drive.seconds, tables, expect)
     return Scenario(name, str(tree.get("title", name)), world, drive, tuple(tables), expect)
+
+
+def _in_time(seconds: float, faults: Sequence[Mapping[str, Any]], expect: Sequence[Expectation]) -> None:
+    """Refuse what would never come: it could not fail either."""
+    times = [(f"[[fault]] number {k}: when", table.get("when", 0.0)) for k, table in enumerate(faults, 1)]
+    times += [(f"expect[{k}].from", one.from_) for k, one in enumerate(expect)]
+    for path, t in times:
+        if t >= seconds:
+            raise ValueError(f"{path}: {t:g} s is not before the end of the drive (drive.seconds = {seconds:g})")
+    for k, one in enumerate(expect):
+        if one.until and one.until <= one.from_:
+            raise ValueError(f"expect[{k}].until: {one.until:g} s is not after its `from`, {one.from_:g}")
 
 
 def _part(path: str, table: Any, default: Any) -> Any:

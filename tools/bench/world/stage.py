@@ -44,6 +44,7 @@ WAIT_S: Final = 0.05
 STANDING_S: Final = 2.0
 """Poses of so long, read while it stands, say where the map lies."""
 PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
+LOOKING: Final = ("RELOCATING", "AMBIGUOUS")
 HEARD_A: Final = 1e-9
 SET_OFF_S: Final = 5.0
 
@@ -281,17 +282,24 @@ async def _settled(
         elif since == math.inf:
             since = time.monotonic()
         if since == math.inf and time.monotonic() - begun > scenario.drive.settle:
-            raise CannotPlay(_why(last, ends, scenario.drive.settle))
+            raise CannotPlay(why_no_pose(last, ends, scenario.drive.settle))
         await asyncio.sleep(WAIT_S)
     return [one.pose for one in ears.reads if one.t >= since and one.pose is not None]
 
 
-def _why(last: Read, ends: Ends, settle: float) -> str:
+def why_no_pose(last: Read, ends: Ends, settle: float) -> str:
+    """What to look at, by the last that was read, where there is no pose after ``settle`` s."""
     host, port = ends.modbus
     if not last.answered:
         return (
             f"nobody answers at {host} port {port}: is lumiloop running there, does its `bind` and `allow` let this "
             f"computer in, is UDP port {port} open in its firewall?"
+        )
+    if last.state in LOOKING:
+        return (
+            f"no pose within {settle:g} s: state {last.state}: it looks for its place. Has it started with a map, of "
+            'another drive or another building? Stop it, give it [map] folder = "none" (--write-config writes that), '
+            "and start it again. Under lamps: does their light arrive?"
         )
     return (
         f"no pose within {settle:g} s: state {last.state}, fault {last.fault}; does its lidar.device name the line "
