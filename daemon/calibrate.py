@@ -25,10 +25,11 @@ from daemon.wheels import calibrate_wheels
 from estimator.align import Unaligned, align
 from estimator.calibrate import Calibrated, Estimate, TooLittle, calibrate
 from estimator.calibrate_problem import COMMONS, Common, Priors, placed
+from estimator.calibrate_residual import learn
 from estimator.calibrate_rows import Rows
 from estimator.lamps import Survey
 from estimator.records import Array
-from estimator.residual import ResidualMap, learn
+from estimator.residual import ResidualMap
 from estimator.survey import Heard, survey
 from hal.errors import HalError
 

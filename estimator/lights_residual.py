@@ -9,7 +9,8 @@ import numpy as np
 from estimator import se2
 from estimator.lamps import Receiver
 from estimator.records import Array
-from estimator.residual import ResidualMap, look_up
+from estimator.residual import ResidualMap
+from estimator.residual_look import look_up
 
 
 class Learned:

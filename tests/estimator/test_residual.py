@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimator.calibrate_residual import learn, residuals_of
 from estimator.calibrate_rows import Rows, thinned
 from estimator.lamps import Survey
-from estimator.residual import ResidualMap, expected_ln, learn, look_up, residuals_of
+from estimator.residual import ResidualMap
 from estimator.residual_gp import Hyper, choose, fit, matern
+from estimator.residual_look import expected_ln, look_up
 from tests.estimator.teach import drive, nominal, received
 
 pytestmark = pytest.mark.jit

@@ -17,11 +17,11 @@ import numpy.typing as npt
 from estimator import lights
 from estimator.calibrate import calibrate
 from estimator.calibrate_problem import Priors
+from estimator.calibrate_residual import learn
 from estimator.calibrate_rows import Rows
 from estimator.lights_residual import Learned
 from estimator.lights_state import LightsSettings
 from estimator.records import LightEpoch, Odometry
-from estimator.residual import learn
 from estimator.result import Fix
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
 from tools.figures import Figure, bounded

@@ -18,10 +18,12 @@ import numpy.typing as npt
 
 from estimator.calibrate import calibrate
 from estimator.calibrate_problem import Priors
+from estimator.calibrate_residual import learn
 from estimator.calibrate_rows import Rows, model
 from estimator.lamps import Lamp, Receiver, Survey
 from estimator.optics import pack_lamps, pack_receiver
-from estimator.residual import ResidualMap, learn, look_up
+from estimator.residual import ResidualMap
+from estimator.residual_look import look_up
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
 from tools.experiments.vlp import Campaign, campaign
 from tools.figures import Figure, bounded

@@ -1,0 +1,82 @@
+"""The first start ever, from an empty folder of kernels: once it drives, nothing is compiled any more."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from daemon.lights import Lights
+from daemon.publish.snapshot import State
+from daemon.surveyfile import write_survey
+from daemon.warmup import load
+from estimator.cdma_profile import PROFILE_A
+from tests.daemon.lightroom import SURVEY
+from tests.daemon.test_lights_process import served
+from tests.daemon.test_process import ROOT, fake_lidar, running
+
+COMPILES_S = 600.0
+FIRST_STATE_S = 33.0
+"""Until a ring of a minute has its first state."""
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("lit", [False, True], ids=["laser", "laser and light"])
+def test_nothing_is_compiled_once_it_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lit: bool) -> None:
+    """With a recorder, which loads more than a start without."""
+    cache, link = tmp_path / "cache", tmp_path / "lidar"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    keys = ["--record", str(tmp_path / "ring"), "--last", "1"]
+    lamps = contextlib.nullcontext()
+    if lit:
+        load(Lights(SURVEY, PROFILE_A))  # in this process, for the fake: into the folder that it began with
+        write_survey(tmp_path / "lights.toml", SURVEY)
+        bus = f"unix:{tmp_path / 'bus'}"
+        keys += ["--set", f"photodiode.bus={bus}", "--set", f"lights.survey={tmp_path / 'lights.toml'}"]
+        lamps = served(bus)
+    with fake_lidar(link), lamps, running(link, *keys) as daemon:
+        daemon.until(COMPILES_S, "state", State.TRACKING)
+        time.sleep(FIRST_STATE_S)
+        code, said, _ = daemon.stop()
+    assert code == 0
+    assert "kernels compiled in" in said
+    assert list((tmp_path / "ring").glob("*/*.lumistate")), "a state was taken"
+    (mark,) = cache.glob("kernels-*/warm-*")
+    late = [path.name for path in cache.rglob("*.nb[ic]") if path.stat().st_mtime_ns > mark.stat().st_mtime_ns]
+    assert late == []
+
+
+LATE = """
+import sys
+from importlib import import_module
+from pathlib import Path
+import daemon.record, daemon.run
+from daemon import warmup
+from daemon.lights import Lights
+from estimator.cdma_profile import PROFILE_A
+from estimator.lamps import Survey
+
+warmup.load(Lights(Survey(), PROFILE_A) if sys.argv[1:] else None)
+before = set(sys.modules)
+for name in ("checkpoint", "restore", "statefile", "store_image", "mapswitch", "maptiles", "residualfile"):
+    import_module(f"daemon.{name}")
+for name in ("hypotheses", "commands", "livemap", "mapimage", "motion"):
+    import_module(f"estimator.{name}")
+new = [sys.modules[name] for name in sorted(set(sys.modules) - before) if name.startswith("estimator.")]
+print([one.__name__ for one in new if "\\n@kernel(" in Path(one.__file__).read_text()])
+"""
+
+
+@pytest.mark.parametrize("lights", [(), ("lights",)], ids=["laser", "laser and light"])
+def test_what_a_daemon_loads_while_it_drives_has_no_kernel(lights: tuple[str, ...]) -> None:
+    """States and dumps of a recorder, maps: a kernel among them would be compiled then, at the first start ever."""
+    command = [sys.executable, "-c", LATE, *lights]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
