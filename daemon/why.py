@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from daemon import cli, warmup, whyplot, whysaid
+from daemon import cli, warmup, whymoment, whyplot, whysaid
 from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.extras import how_to_install
@@ -27,7 +27,7 @@ from daemon.rerun import Rerun
 from daemon.results import Folder, OutputRefused
 from daemon.sources import RecordingSource, Turn
 from daemon.versions import made_elsewhere
-from daemon.whysaid import Moment
+from daemon.whymoment import Moment, chosen
 from hal.errors import DataInvalid, DeviceMissing, HalError
 from hal.replay.recording import SUFFIX, open_recording
 from hal.replay.report import LogReport
@@ -41,6 +41,8 @@ EVER_S: Final = 1e11
 """Beyond the year 5000."""
 UNIX_S: Final = 1e8
 """A number of seconds beyond is since the Unix epoch, else since the recording began."""
+DIGITS: Final = 6
+"""Of a second's fraction, beyond which times are not told apart."""
 
 
 class NoMoment(Exception):
@@ -69,17 +71,16 @@ def main(args: argparse.Namespace) -> int:
         if args.log is None and not _is_folder(folder):
             looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
             return cli.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
-        span, utc = find(spans(folder), args.time, folder)
+        span, utc, wide = find(spans(folder), args.time, folder)
         told, rerun = moments(span, utc)
         second = whole_second(args.time)
-        sys.stdout.write(whysaid.report(told, utc, span.path.name, second, span.made))
+        sys.stdout.write(whysaid.report(told, utc, span.path.name, second, span.made, wide))
         if rerun.comparison.differ:
             cli.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
             )
         if args.out is not None:
-            changed = whysaid.first_change(told, utc) if second else None
-            return _draw(args.out, told, utc if changed is None else told[changed].utc, rerun)
+            return _draw(args.out, told, max(utc, told[chosen(told, utc, second, wide).cycle].utc), rerun)
     except (HalError, NoMoment, OutputRefused, warmup.CannotLoad) as error:
         return cli.fail(str(error))
     return cli.OK
@@ -147,31 +148,36 @@ def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:
     return t_mono, t_utc - t_mono
 
 
-def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float]:
-    """The recording that holds a moment, with most of the time before it, and that moment (UTC).
+def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, float]:
+    """The recording that holds a moment, with most of the time before it, that moment (UTC) and how long it lasts, s.
 
     Of a whole second it may hold a part: the moment is not before it begins.
 
     Raises:
         NoMoment: none does, or that is no time.
     """
-    wide = whysaid.SECOND_S if whole_second(words) else 0.0
+    wide = width(words)
     asked = [(span, utc, max(utc, span.begin)) for span in recorded for utc in meant(words, span)]
     here = [
-        (min(begin - span.begin, BEFORE_S), span.begin, span, begin)
+        (min(begin - span.begin, BEFORE_S), span.begin, span, begin, utc + wide - begin)
         for span, utc, begin in asked
         if utc <= span.end and span.begin <= utc + wide
     ]
     if here:
-        _, _, span, utc = max(here, key=lambda one: one[:2])
-        return span, utc
-    there = "\n".join(f"  {whysaid.clock(s.begin)} to {whysaid.clock(s.end)}  {s.path.name}" for s in recorded)
+        return max(here, key=lambda one: one[:2])[2:]
+    there = "\n".join(f"  {whymoment.clock(s.begin)} to {whymoment.clock(s.end)}  {s.path.name}" for s in recorded)
     raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n{there}")
 
 
 def whole_second(words: str) -> bool:
     """Whether no fraction is named: then all that came in that second is meant, as where the journal says the time."""
     return not re.search("[.,]", words)
+
+
+def width(words: str) -> float:
+    """Seconds that a time stands for: one of its last digit. So does one that was printed, and cut, mean its cycle."""
+    fraction = re.search("[.,]([0-9]*)", words)
+    return whymoment.SECOND_S * 10.0 ** -min(0 if fraction is None else max(1, len(fraction[1])), DIGITS)
 
 
 def meant(words: str, span: Span) -> list[float]:
@@ -231,7 +237,7 @@ def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:
         rerun.feed(event)
         if isinstance(event, Turn) and records:
             if event.t_mono >= t_mono - BEFORE_S:
-                told.append(whysaid.moment_of(span.utc_at_zero, event.entry, records[-1], rerun.cycle))
+                told.append(whymoment.moment_of(span.utc_at_zero, event.entry, records[-1], rerun.cycle))
             records.clear()
             if event.t_mono > t_mono + AFTER_S:
                 break

@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.publish.snapshot import LinkUse, State
-from daemon.whysaid import AXES, GAP, Moment, at, clock, faults_changed, laser_dissents, light_apart
+from daemon.whymoment import Moment, at, clock, faults_changed
+from daemon.whysaid import AXES, GAP, laser_dissents, light_apart
 from estimator import se2
 from estimator.grid import Grid
 from estimator.records import Array

@@ -4,136 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from daemon.cycle import Cycle, CycleRecord
 from daemon.faults import FAULTS, Fault
 from daemon.publish.meanings import USES
 from daemon.publish.snapshot import LightLink, LinkUse, Snapshot, State
 from daemon.reasons import REASONS, Reason
-from daemon.record import CycleEntry
-from daemon.witness import Told as Wheels
+from daemon.whymoment import SECOND_S, Moment, chosen, clock, faults_changed, of_day
 from estimator import se2
 from estimator.records import Array
-from estimator.result import StepResult
 
 AXES: Final = ("x", "y", "heading")
 GAP: Final = 16.27
 """Squared Mahalanobis distance of three components that is beyond chance (1 in 1000)."""
 SILENT_S: Final = 0.5
+"""Without a scan; sooner where the daemon says so, which goes by scan periods."""
+GONE: Final = (Reason.LIDAR_SILENT, Reason.LIDAR_UNREACHABLE)
+"""What is published of a laser that is silent, or not steady again, whoever holds the pose meanwhile."""
 MOST: Final = 12
 """Changes that are listed; beyond that those of state and faults, and of all others the latest."""
 AGAINST: Final = (LinkUse.OCCLUDED, LinkUse.REJECTED)
 """What is received of these lamps speaks against the place, or did a moment ago."""
 FITS: Final = 0.2
 """Deviation (ln) below which what is received fits."""
-SECOND_S: Final = 1.0
-"""A time without a fraction, as the journal writes it, is of all that came in this long."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Moment:
-    """One cycle as it was replayed, with what was published then.
+def report(
+    told: Sequence[Moment], utc: float, where: str, second: bool = False, made: str = "", wide: float = 0.0
+) -> str:
+    """The text of a time.
 
-    Attributes:
-        utc: when it began. state: as it was published then. snapshot, result: of the replay. scan: number of the scan
-            it took. fresh: whether the result is of this cycle. wheels: what wheels and laser told over the last two
-            seconds, None where that cannot be said. dropped: scans that were not taken.
-        told: number of the reason that was published, None in a recording of before reason and faults were kept.
-        faults: numbers of those that were published, gravest first.
+    ``second``: a whole one that begins then, of which the first change is told. ``wide``: how long the time lasts that
+    is meant (:func:`daemon.whymoment.chosen`). ``made``: a line on what the recording was made with, where there is
+    something to say of it.
     """
-
-    utc: float
-    state: State
-    snapshot: Snapshot
-    result: StepResult | None
-    scan: int | None
-    fresh: bool
-    wheels: Wheels | None
-    dropped: int
-    orders: tuple[str, ...]
-    told: int | None = None
-    faults: tuple[int, ...] = ()
-
-    @property
-    def reason(self) -> Reason:
-        """Why the state is what it is: as it was published, where that is known, else as the replay has it."""
-        known = self.told if self.told in Reason._value2member_map_ else None
-        return Reason(self.snapshot.reason if known is None else known)
-
-
-def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle: Cycle) -> Moment:
-    """A cycle that has just been repeated."""
-    return Moment(
-        utc=utc_at_zero + record.t_mono,
-        state=State(entry.state),
-        snapshot=record.snapshot,
-        result=record.result,
-        scan=record.scan,
-        fresh=record.limits is not None,
-        wheels=cycle.observer.witnesses.told(),
-        dropped=len(record.dropped),
-        orders=tuple(command.order for command in entry.commands),
-        told=entry.reason,
-        faults=entry.faults,
-    )
-
-
-def clock(utc: float) -> str:
-    """Local time of day with its date and zone."""
-    return f"{datetime.fromtimestamp(utc, UTC).astimezone():%Y-%m-%d %H:%M:%S.%f}"[:-3]
-
-
-def of_day(utc: float) -> str:
-    """Local time of day."""
-    return f"{datetime.fromtimestamp(utc, UTC).astimezone():%H:%M:%S.%f}"[:-3]
-
-
-def at(told: Sequence[Moment], utc: float) -> int:
-    """Index of the cycle in force at an instant."""
-    return max((k for k, one in enumerate(told) if one.utc <= utc), default=0)
-
-
-def first_change(told: Sequence[Moment], utc: float) -> int | None:
-    """Index of the first cycle of a second in which state, reason or faults are others than before; None: in none."""
-    for k in range(1, len(told)):
-        if utc <= told[k].utc < utc + SECOND_S and _key(told[k]) != _key(told[k - 1]):
-            return k
-    return None
-
-
-def _key(one: Moment) -> tuple[State, Reason, tuple[int, ...]]:
-    return one.state, one.reason, one.faults
-
-
-def faults_changed(before: Moment, one: Moment) -> list[tuple[str, int]]:
-    """What has come (``+``) and gone (``-``) of the published faults between two cycles, gravest first."""
-    come = [("+", fault) for fault in one.faults if fault not in before.faults]
-    return come + [("-", fault) for fault in before.faults if fault not in one.faults]
-
-
-def report(told: Sequence[Moment], utc: float, where: str, second: bool = False, made: str = "") -> str:
-    """The text of an instant; ``second``: of the whole second that begins then, at the first change in it.
-
-    ``made``: a line on what the recording was made with, where there is something to say of it.
-    """
-    k = last = at(told, utc)
-    when = clock(utc)
+    k, last, changed = chosen(told, utc, second, wide)
+    one, when = told[k], clock(utc)
     if second:
-        changed = first_change(told, utc)
-        k = k if changed is None else changed
-        last = max((j for j, one in enumerate(told) if one.utc < utc + SECOND_S), default=k)
-        what = "nothing changes" if changed is None else "state, reason or faults first change in it"
-        when = f"{when.partition('.')[0]}, the whole second: {what}"
-    one = told[k]
+        when = f"{when.partition('.')[0]}, the whole second: {_change(one.utc - utc - (wide or SECOND_S), changed)}"
     begun, apart = when.partition(", the whole")[0], one.utc - utc
-    if apart > SECOND_S:
+    if apart > SECOND_S and changed is None:
         when = f"{begun}, no cycle had run yet; the first, {apart:.0f} s later"
     elif apart < -SECOND_S:
         when = f"{begun}, no cycle ran then; the last before it, {-apart:.0f} s earlier"
@@ -142,10 +56,19 @@ def report(told: Sequence[Moment], utc: float, where: str, second: bool = False,
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
     if one.snapshot.light is not None:
         lines += ["", "lamps", *(f"  {line}" for line in _lamps(told, k))]
-    first = f"{one.utc - told[0].utc:.0f} s before"
-    lines += ["", f"what changed in the {first}{' and in this second' if second else ''}"]
+    first = f"{max(0.0, utc - told[0].utc):.0f} s before"
+    lines += ["", f"what changed in the {first}{' and in this second, or just after it' if second else ''}"]
     lines += [f"  {line}" for line in _listed(list(_changes(told[: last + 1])))] or ["  nothing"]
     return "\n".join(lines) + "\n"
+
+
+def _change(after_s: float, changed: int | None) -> str:
+    """What of a whole second is told; ``after_s``: from its end, negative within it."""
+    if changed is None:
+        return "nothing changes"
+    if after_s < 0.0:
+        return "state, reason or faults first change in it"
+    return f"nothing changes in it, but {after_s:.2f} s after it state, reason or faults do"
 
 
 def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
@@ -223,13 +146,17 @@ def _laser(told: Sequence[Moment], k: int) -> str:
         return "laser   no scan in all that time"
     match, ago = latest.result.match, told[k].utc - latest.utc
     when = f", {ago:.2f} s ago" if ago > 0.3 else ""
+    gone = told[k].state is State.NO_LIDAR or told[k].reason in GONE
+    silent = latest is not told[k] and (ago > SILENT_S or told[k].snapshot.lidar_ok is False)
+    before = f"silent for {ago:.{1 if ago >= 1.0 else 2}f} s; before: "
     if not match.ok:
-        return f"laser   DISSENTS: the scan{when} came to nothing: {match.reason.value} ({match.queries} points)"
+        said = f"came to nothing: {match.reason.value} ({match.queries} points)"
+        return f"laser   {before}a scan {said}" if silent else f"laser   DISSENTS: the scan{when} {said}"
     x, y, yaw = match.correction.tolist()
     moved = f"moved the prediction by {1e3 * math.hypot(x, y):.0f} mm, {math.degrees(yaw):.2f} deg"
     fit = f"{match.inliers} of {match.queries} points fit, residual {1e3 * match.residual_m:.0f} mm"
-    word = f"silent for {ago:.1f} s; before" if ago > SILENT_S else f"speaks{when}"
-    return f"laser   {word}: {fit}, {moved}"
+    word = before if silent else f"speaks{' again, not steadily yet' if gone else when}: "
+    return f"laser   {word}{fit}, {moved}"
 
 
 def _wheels(one: Moment) -> str:

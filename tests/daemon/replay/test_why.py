@@ -5,24 +5,18 @@ from __future__ import annotations
 import errno
 import os
 import time
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from daemon import blackbox, cli, disk, folders, whyplot
+from daemon import blackbox, cli, disk, folders
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
-from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
-from daemon.reasons import Reason
 from daemon.versions import build
 from daemon.why import NoMoment, Span, find, meant, whole_second
-from daemon.whysaid import Moment, first_change, report
 from daemon.witness import Told
-from estimator.grid import Grid
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
 from tests.daemon.replay.test_dump import let_write, unplugged
@@ -49,7 +43,7 @@ SPAN = Span(Path("rec"), AT, AT + 3600.0, AT - 100.0)
     ],
 )
 def test_times_are_understood(words: str, after: float) -> None:
-    span, utc = find([SPAN], words, Path())
+    span, utc, _ = find([SPAN], words, Path())
     assert span is SPAN
     assert utc - AT == pytest.approx(after, abs=1e-6)
 
@@ -136,7 +130,9 @@ def test_a_time_that_nobody_has_recorded_is_told_with_those_that_were() -> None:
 
 def test_a_second_of_which_a_part_is_recorded_is_found_and_an_instant_is_not() -> None:
     late = Span(Path("late"), AT + 5.4, AT + 60.0, 0.0)
-    assert find([late], "22:13:25Z", Path()) == (late, AT + 5.4)
+    span, utc, wide = find([late], "22:13:25Z", Path())
+    assert (span, utc) == (late, AT + 5.4)
+    assert wide == pytest.approx(0.6, abs=1e-6), "what is left of it"
     assert find([SPAN], "23:13:20Z", Path())[1] - AT == 3600.0
     with pytest.raises(NoMoment, match="not in what is recorded"):
         find([late], "22:13:25.0Z", Path())
@@ -168,7 +164,7 @@ def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]
     (dump,) = recorded.glob(f"{DUMP}*-fault-101")
     said = asked("9", dump, capsys)
     assert "NO_LIDAR since" in said
-    assert "laser   silent for 5.0 s" in said
+    assert "laser   silent for 5.1 s; before: " in said
     assert "x       UNKNOWN since" in said
     assert "TRACKING: the pose is confirmed" in said
     assert "NO_LIDAR: reason 3, the lidar cannot be opened" in said
@@ -227,13 +223,31 @@ def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pyt
     at = silent.split(" since ")[1].split(": ")[0]
     second, fraction = at.split(".")
     assert int(fraction) > 0, "else nothing is shown here"
-    head, state = asked(second, dump, capsys).splitlines()[:2]
+    said = asked(second, dump, capsys)
+    assert "laser   silent for 0." in said, "as published, however short it is"
+    head, state = said.splitlines()[:2]
     assert f"{second}, the whole second: state, reason or faults first change in it, cycle of {at}" in head
     assert state == silent
     head, state = asked(f"{second}.0", dump, capsys).splitlines()[:2]
     assert f"{second}.000, cycle of" in head
     assert state.startswith("TRACKING since")
     assert "the whole second: nothing changes, cycle of" in asked("9", dump, capsys).splitlines()[0]
+
+
+def test_a_time_that_it_has_printed_means_the_same_cycle(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
+    said = asked("9", dump, capsys)
+    printed = {line.split()[0] for line in said.partition("what changed")[2].splitlines()[1:]}
+    assert len(printed) > 2
+    for at in printed:
+        assert f"{at}, cycle of {at}, " in asked(at, dump, capsys).splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "wide"), [("22:13:25Z", 1.0), ("22:13:25.5Z", 0.1), ("22:13:25,123Z", 1e-3), ("5.0", 0.1), ("5", 1.0)]
+)
+def test_how_wide_that_is(words: str, wide: float) -> None:
+    assert find([SPAN], words, Path())[2] == pytest.approx(wide, abs=1e-6)
 
 
 def test_a_run_where_all_is_well_from_a_folder_of_several(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -294,82 +308,6 @@ def test_wheels_that_slip_dissent(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "odometry and laser disagree" in said
 
 
-NOTHING = Snapshot(1, 1.0, 1.0, 0.0, State.DEGRADED, Reason.NONE)
-
-
-@pytest.mark.parametrize(("against", "word"), [(0, "agrees"), (1, "agrees"), (3, "DISSENTS")])
-def test_lamps_that_do_not_fit_the_place_dissent_though_what_is_left_agrees(against: int, word: str) -> None:
-    links = tuple(LightLink(k, k, LinkUse.REJECTED if k < against else LinkUse.ACCEPTED, 1e-9, 0.5) for k in range(5))
-    picture = LightPicture(LightFix.GOOD, 5 - against, 1.0, (1.0, 2.0, 0.0), links=links)
-    shown = replace(NOTHING, pose=(1.0, 2.02, 0.0), light=picture, trust=Trust(gap=0.04))
-    moment = Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())
-    said = report([moment], 0.0, "here")
-    line = next(line for line in said.splitlines() if line.startswith("  light "))
-    assert f"light   {word}: its place is 0.02 m" in line
-    assert (f"{against} speak against the place" in line) is (against > 0)
-    assert "fits again" not in said
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_picture_of_nothing_says_so_in_place_of_curves(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib")
-    said: list[str] = []
-    monkeypatch.setattr(whyplot, "_empty", lambda _, why: said.append(why))
-    shown = replace(NOTHING, light=LightPicture())
-    moment = Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())
-    assert whyplot.draw([moment], 0.0, Grid(np.zeros(2), 0.05, np.zeros((0, 0), np.float32))) is not None
-    assert said == [
-        "no sigma and no bound was told",
-        "wheels and laser could not be compared",
-        "light told no place",
-    ]
-
-
-def test_where_the_replay_says_something_else_that_is_said_in_a_line() -> None:
-    shown = replace(NOTHING, state=State.NO_LIDAR, reason=Reason.LIDAR_SILENT)
-    moment = Moment(0.0, State.NO_LIDAR, shown, None, None, True, None, 0, (), told=Reason.LIDAR_UNREACHABLE)
-    said = report([moment], 0.0, "here").splitlines()
-    assert ": reason 3, the lidar cannot be opened" in said[1]
-    assert said[2].startswith("(this was published; the replay itself says NO_LIDAR: reason 4, no valid scan")
-    assert not any("the replay" in line for line in said[3:])
-    alike = replace(moment, told=Reason.LIDAR_SILENT)
-    assert "the replay" not in report([alike], 0.0, "here")
-    newer = report([replace(moment, told=999, faults=(101,))], 0.0, "here")
-    assert "(reason 999 was published, which is not known here" in newer
-    assert "not recorded then" not in newer
-
-
-@pytest.mark.parametrize(
-    "other", [{"told": Reason.LIDAR_UNREACHABLE}, {"faults": (101,)}, {"faults": (101, 999)}, {"state": State.LOST}]
-)
-def test_the_first_change_of_a_second_is_that_of_what_was_published(other: dict[str, Any]) -> None:
-    """The gravest fault may stay what it is, while another one comes; 999 is one of newer software."""
-    before = Moment(0.0, State.NO_LIDAR, NOTHING, None, None, True, None, 0, (), told=Reason.LIDAR_SILENT)
-    told = [before, replace(before, utc=5.25, **other), replace(before, utc=5.5, **other)]
-    assert first_change(told, 5.0) == 1
-    assert first_change(told, 6.0) is None
-    changed = report(told, 5.0, "here", second=True)
-    assert "cycle of" in changed.splitlines()[0]
-    for fault in other.get("faults", ()):
-        assert f"fault {fault} comes: " in changed
-
-
-def test_what_lamps_do_meanwhile_hides_no_fault() -> None:
-    def lit(use: LinkUse) -> Snapshot:
-        return replace(NOTHING, light=LightPicture(links=(LightLink(7, 7, use, 1e-9, 0.1),)))
-
-    uses = [(LinkUse.ACCEPTED, LinkUse.OCCLUDED)[k % 2] for k in range(40)]
-    moments = [
-        Moment(0.1 * k, State.DEGRADED, lit(use), None, None, True, None, 0, (), Reason.NONE, (101,) if k > 3 else ())
-        for k, use in enumerate(uses)
-    ]
-    changes = report(moments, 3.95, "here").partition("what changed")[2].splitlines()[1:]
-    assert changes[0] == "  ... 28 more, of axes, witnesses, lamps"
-    assert "fault 101 comes: the lidar is not there" in changes[1]
-    assert len(changes) == 13
-    assert "lamp 7: ACCEPTED -> OCCLUDED" in changes[-1]
-
-
 @pytest.mark.parametrize("named", ["nowhere", "nowhere/at/all"])
 def test_a_folder_that_is_not_there_is_said_to_be_none(
     named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -377,21 +315,3 @@ def test_a_folder_that_is_not_there_is_said_to_be_none(
     assert cli.main(["why", "3", str(tmp_path / named)]) == 1
     said = capsys.readouterr().err
     assert f"{tmp_path / named}: no such folder (name a recording, a dump, or a folder of several)" in said
-
-
-def test_a_moment_without_a_cycle_is_said_to_have_none() -> None:
-    moment = Moment(100.0, State.DEGRADED, NOTHING, None, None, True, None, 0, ())
-    for second in (False, True):
-        head = report([moment], 50.0, "here", second).splitlines()[0]
-        assert "no cycle had run yet; the first, 50 s later, cycle of" in head
-        assert "nothing changes" not in head
-        head = report([moment, replace(moment, utc=200.0)], 195.0, "here", second).splitlines()[0]
-        assert "no cycle ran then; the last before it, 95 s earlier, cycle of" in head
-    assert "no cycle" not in report([moment], 100.5, "here").splitlines()[0]
-
-
-def test_a_lamp_that_was_hidden_and_fits_again_is_said_to_wait() -> None:
-    links = (LightLink(7, 7, LinkUse.OCCLUDED, 1e-9, 0.1), LightLink(8, 8, LinkUse.OCCLUDED, 1e-9, -0.9))
-    shown = replace(NOTHING, pose=(1.0, 2.0, 0.0), light=LightPicture(links=links))
-    said = report([Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())], 0.0, "here")
-    assert "lamp 7 (1.11 of expected; fits again, and is used when it goes on so), lamp 8 (0.41 of expected)" in said
