@@ -18,6 +18,8 @@ USAGE: Final = 2
 INTERRUPTED: Final = 130
 LONGEST_RING: Final = 1440.0
 """Minutes; whoever wants more keeps all of it."""
+PICTURES: Final = (".png", ".svg", ".pdf")
+"""Endings of files that can be drawn."""
 
 Body = Callable[[argparse.Namespace], int]
 
@@ -114,6 +116,13 @@ def _minutes(text: str) -> float:
     return minutes
 
 
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in PICTURES:
+        raise argparse.ArgumentTypeError(f"{text}: a picture ends with {', '.join(PICTURES)}")
+    return path
+
+
 def _recording(body: Body) -> Body:
     def check_and_run(args: argparse.Namespace) -> int:
         if args.last is not None and args.record is None:
@@ -156,7 +165,7 @@ def _why(parser: argparse.ArgumentParser) -> None:
         metavar="REC",
         help="a recording or a dump, or a folder of several; default: `flight` in the state directory",
     )
-    parser.add_argument("--out", type=Path, metavar="PNG", help="and draw it")
+    parser.add_argument("--out", type=_picture, metavar="FILE", help="and draw it: .png, .svg or .pdf")
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.why", "main"))
 

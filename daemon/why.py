@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -68,6 +69,8 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; ``args``: the ``time`` as it was typed, ``log`` or None, where to draw (``out``) or None."""
     folder = args.log or recordings_folder(FLIGHT)
     try:
+        if args.out is not None:
+            _try(args.out)
         if args.log is None and not _is_folder(folder):
             looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
             return cli.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
@@ -80,18 +83,23 @@ def main(args: argparse.Namespace) -> int:
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
             )
         if args.out is not None:
-            return _draw(args.out, told, max(utc, told[chosen(told, utc, second, wide).cycle].utc), rerun)
+            _draw(args.out, told, max(utc, told[chosen(told, utc, second, wide).cycle].utc), rerun)
     except (HalError, NoMoment, OutputRefused, warmup.CannotLoad) as error:
         return cli.fail(str(error))
     return cli.OK
 
 
-def _draw(out: Path, told: list[Moment], utc: float, rerun: Rerun) -> int:
-    picture = whyplot.draw(told, utc, rerun.render())
-    if picture is None:
-        return cli.fail(f"pictures need matplotlib: {how_to_install('plot')}")
-    Folder(out.parent).write(out.name, picture)
-    return cli.OK
+def _try(out: Path) -> None:
+    """Whether a picture can be drawn, and put there: known before anything is replayed; raises `OutputRefused`."""
+    if find_spec("matplotlib") is None:
+        raise OutputRefused(f"pictures need matplotlib: {how_to_install('plot')}")
+    if out.is_dir():
+        raise OutputRefused(f"{out} is a folder; name a file in it")
+    Folder(out.parent)
+
+
+def _draw(out: Path, told: list[Moment], utc: float, rerun: Rerun) -> None:
+    Folder(out.parent).write(out.name, whyplot.draw(told, utc, rerun.render(), out.suffix[1:].lower()))
 
 
 def spans(folder: Path) -> list[Span]:

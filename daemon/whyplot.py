@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any, Final
 
@@ -34,10 +33,8 @@ COLOURS: Final = {
 }
 
 
-def draw(told: Sequence[Moment], utc: float, grid: Grid) -> bytes | None:
-    """PNG; None without matplotlib."""
-    if find_spec("matplotlib") is None:
-        return None
+def draw(told: Sequence[Moment], utc: float, grid: Grid, kind: str = "png") -> bytes:
+    """A file of that kind: png, svg or pdf; wants matplotlib."""
     from matplotlib.figure import Figure
 
     one = told[at(told, utc)]
@@ -56,7 +53,7 @@ def draw(told: Sequence[Moment], utc: float, grid: Grid) -> bytes | None:
         row.set_xlim(seconds[0], max(seconds[-1], seconds[0] + LAST_S))
     rows[-1].set_xlabel("seconds from the moment")
     out = io.BytesIO()
-    canvas.savefig(out, format="png")
+    canvas.savefig(out, format=kind)
     return out.getvalue()
 
 

@@ -266,6 +266,35 @@ def test_it_is_drawn(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         assert min(image.size) > 700
 
 
+@pytest.mark.parametrize(("ending", "begin"), [(".svg", b"<?xml"), (".PDF", b"%PDF")])
+def test_it_is_drawn_as_its_ending_says(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], ending: str, begin: bytes
+) -> None:
+    asked("9", recorded, capsys, "--out", str(tmp_path / f"why{ending}"))
+    assert (tmp_path / f"why{ending}").read_bytes().startswith(begin)
+
+
+def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.why.moments", lambda *_: pytest.fail("replayed"))
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["why", "9", str(recorded), "--out", "why.xyz"])
+    assert ended.value.code == cli.USAGE
+    assert "why.xyz: a picture ends with .png, .svg, .pdf" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.png").mkdir()
+    for name, problem in (
+        ("file/why.png", "is a file; name a folder"),
+        ("folder.png", "is a folder; name a file in it"),
+    ):
+        assert cli.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == cli.FAILED
+        assert problem in capsys.readouterr().err
+    monkeypatch.setattr("daemon.why.find_spec", lambda name: None)
+    assert cli.main(["why", "9", str(recorded), "--out", str(tmp_path / "why.png")]) == cli.FAILED
+    assert "pictures need matplotlib" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("lost", [{"t_utc": None}, {"t_mono": "soon"}, {"t_utc": float("nan")}, {"t_utc": 1e300}])
 def test_a_recording_whose_head_says_no_time_is_named_and_passed_over(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], lost: dict[str, object]

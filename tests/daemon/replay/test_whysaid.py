@@ -72,7 +72,7 @@ def test_a_picture_of_nothing_says_so_in_place_of_curves(monkeypatch: pytest.Mon
     monkeypatch.setattr(whyplot, "_empty", lambda _, why: said.append(why))
     shown = replace(NOTHING, light=LightPicture())
     moment = Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())
-    assert whyplot.draw([moment], 0.0, Grid(np.zeros(2), 0.05, np.zeros((0, 0), np.float32))) is not None
+    assert whyplot.draw([moment], 0.0, Grid(np.zeros(2), 0.05, np.zeros((0, 0), np.float32)))
     assert said == [
         "no sigma and no bound was told",
         "wheels and laser could not be compared",
@@ -168,3 +168,8 @@ def test_what_is_said_of_the_laser_agrees_with_what_was_published(
     told = told if ago else [replace(told[0], snapshot=shown, **published)]
     line = next(line for line in report(told, ago, "here").splitlines() if line.startswith("  laser "))
     assert line.startswith(f"  laser   {word}")
+
+
+def test_changes_are_told_of_the_twenty_seconds_before_the_second() -> None:
+    told = [replace(AGREED, utc=-14.98), replace(AGREED, utc=5.95, faults=(101,))]
+    assert "what changed in the 20 s before and in this second" in report(told, 5.0, "here", second=True)
