@@ -66,8 +66,16 @@ def log_root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def warm_kernels() -> None:
+def warm_kernels(request: pytest.FixtureRequest) -> None:
     """Compile the kernels of this tree once, before anything is judged against the wall clock."""
+    from daemon.warmup import is_warm
+
+    plugins = request.config.pluginmanager
+    terminal, capture = plugins.get_plugin("terminalreporter"), plugins.get_plugin("capturemanager")
+    if terminal is not None and not is_warm(lights=False):
+        with capture.global_and_fixture_disabled():
+            terminal.ensure_newline()
+            terminal.write_line("the kernels of this tree are compiled first, once: that takes a minute or two")
     command = [sys.executable, "-c", "from daemon.warmup import load; load()"]
     subprocess.run(command, cwd=ROOT, check=True, timeout=900)
 

@@ -23,6 +23,8 @@ from tools.bench.report import About, Figure, Result, facts, write
 
 NAME = "hil"
 DEVICES = ("lidar", "adc")
+DEVICE_OF = {"lidar": "lidar", "served": "lidar", "walk": "lidar", "adc": "adc"}
+"""The option that names what a fixture is of."""
 KINDS = ("motion", "light", "operator")
 TELLING = pytest.StashKey["Telling"]()
 PRESENCE = pytest.StashKey[Presence]()
@@ -57,6 +59,16 @@ def told(request: pytest.FixtureRequest) -> Telling:
     telling = Telling()
     request.node.stash[TELLING] = telling
     return telling
+
+
+@pytest.fixture(autouse=True)
+def compiled_before_the_clock_runs(request: pytest.FixtureRequest) -> None:
+    """As for all tests; but first the device is looked at: who has named a wrong one hears of it at once."""
+    for fixture, option in DEVICE_OF.items():
+        if fixture in request.fixturenames:
+            _device(request, option)
+    if request.node.get_closest_marker("realtime") or request.node.get_closest_marker("system"):
+        request.getfixturevalue("warm_kernels")
 
 
 @pytest.fixture
