@@ -105,7 +105,7 @@ def test_what_cannot_be_played_is_said_with_the_remedy(tmp_path: Path, capsys: p
         str(tmp_path / "ttyGS0"): "modprobe g_serial",
         str(tmp_path / "ttyUSB0@115200"): "ftdi_sio",
         "/dev/null": "not a serial port",
-        "tcp://here": "expected tcp://HOST:PORT",
+        "tcp://here": "tcp://here: no port to listen at: expected tcp://HOST:PORT, as tcp://0.0.0.0:10940",
         "ttyUSB0": "expected /dev/ttyUSB0",
     }.items():
         assert main(["lap", *line, port]) == 2
@@ -114,6 +114,29 @@ def test_what_cannot_be_played_is_said_with_the_remedy(tmp_path: Path, capsys: p
     assert "expected dac:/dev/i2c-1@0x60" in capsys.readouterr().out
     assert main(["lap", *line, f"pty:{tmp_path / 'l'}", "--against", str(tmp_path)]) == 2
     assert "results.json" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("lap --local --modbus 192.168.0.20", "without --modbus: leave one or the other out"),
+        ("lap --local --lidar pty:x --anyone", "without --lidar, --anyone: leave one or the other out"),
+        ("lap --local --write-config DIR", "--write-config is for a robot computer"),
+        (
+            "lap cable --lidar pty:x --modbus 127.0.0.1 --write-config DIR",
+            "takes one scenario, and 2 are named (lap, cable): name one of them",
+        ),
+        ("lap --lidar tcp://0.0.0.0 --modbus 127.0.0.1 --write-config DIR", "as tcp://0.0.0.0:10940"),
+        ("lamps --lidar pty:x --light tcp://0.0.0.0 --modbus 127.0.0.1 --write-config DIR", "as tcp://0.0.0.0:7777"),
+    ],
+)
+def test_words_that_do_not_go_together_are_refused_before_anything(
+    words: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 2
+    assert says in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_dac_that_is_not_there_is_named_and_not_the_robot(

@@ -184,7 +184,7 @@ async def _connect(options: Options, device: FakeHokuyo, stack: AsyncExitStack) 
         return pty.path
     host, _, port = options.tcp.rpartition(":")
     if not port.isdigit():
-        raise ValueError(f"--tcp {options.tcp}: expected HOST:PORT")
+        raise ValueError(f"--tcp {options.tcp}: expected HOST:PORT, as 127.0.0.1:10940; port 0 chooses a free one")
     server = TcpServer(device)
     stack.push_async_callback(server.close)
     return f"tcp://{host}:{await server.listen(host, int(port))}"

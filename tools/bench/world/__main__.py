@@ -33,6 +33,11 @@ from tools.bench.world.scenario import BUILT_IN, Scenario, find, load
 from tools.bench.world.stage import CannotPlay, Ends, play
 
 CANNOT: Final = 2
+ELSEWHERE: Final = ("lidar", "modbus", "odometry", "light", "anyone")
+"""Words that say where a robot computer is reached."""
+TCP: Final = "tcp://"
+SERVED: Final = {"lidar": "tcp://0.0.0.0:10940", "light": "tcp://0.0.0.0:7777"}
+"""Words that may name an address to serve at, each with one that is good."""
 APART_M: Final = 0.01
 LEAST_S, LEAST_M = 2.0, 1.0
 """Of driving until a fault, for two runs to be compared, and so much way with poses that are."""
@@ -54,17 +59,25 @@ def _parser() -> argparse.ArgumentParser:
         "--lidar", default="", help="line that the lidar is to come out of: /dev/ttyGS0, /dev/ttyUSB0@115200, tcp://..."
     )
     add("--modbus", default="", metavar="HOST[:PORT]", help="robot computer")
-    add("--odometry", default="", metavar="udp://HOST:PORT", help="where odometry goes")
+    add(
+        "--odometry", default="", metavar="udp://HOST:PORT",
+        help="where the wheels' odometry goes; without it none is sent: the robot computer must not expect any "
+        "(odometry.port left out, as --write-config then does), or says DEGRADED",
+    )  # fmt: skip
     add("--light", default="", help="dac:/dev/i2c-1@0x60, or a bus to serve: unix:/path, tcp://0.0.0.0:7777")
     add("--anyone", action="store_true", help="serve that bus to other computers, without authentication")
-    add("--local", action="store_true", help="no robot computer: a daemon of this tree on a pty of this computer")
+    add(
+        "--local", action="store_true",
+        help="no robot computer: a daemon of this tree on a pty of this computer, with wheels and lamps of its own; "
+        "beside none of the words above",
+    )  # fmt: skip
     add("--twin", action="store_true", help="compare with the same scenario in virtual time: to agree to 1 cm")
     add("--out", type=Path, default=Path("out/bench-world"), help="for the report (default %(default)s)")
     add("--against", type=Path, help="another run's folder, or its results.json, to compare with")
     add(
         "--write-config", type=Path, metavar="DIR",
-        help="play nothing: write configuration and survey that the robot computer needs, with all other words as for "
-        "the drive",
+        help="play nothing: write configuration and survey that the robot computer needs for one scenario, with all "
+        "other words as for the drive",
     )  # fmt: skip
     return made
 
@@ -121,6 +134,11 @@ def ends_of(options: argparse.Namespace) -> Ends:
         raise CannotPlay(f"{' and '.join(missing)} missing (docs/bench.md has the wiring), or --local without any")
     if port and not port.isdigit():
         raise CannotPlay(f"--modbus {options.modbus}: expected HOST:PORT, as 192.168.0.20:1502")
+    for name, as_here in SERVED.items():
+        address = getattr(options, name)
+        at, _, number = address.removeprefix(TCP).rpartition(":")
+        if address.startswith(TCP) and not (at and number.isdigit()):
+            raise CannotPlay(f"--{name} {address}: no port to listen at: expected tcp://HOST:PORT, as {as_here}")
     return Ends(options.lidar, (host, int(port or 1502)), options.odometry, options.light, options.anyone)
 
 
@@ -133,6 +151,11 @@ def opposite(options: argparse.Namespace, scenario: Scenario) -> Generator[Ends]
 
 def chosen(options: argparse.Namespace) -> list[Scenario]:
     """The scenarios that are named, each of which can be played with these ends as far as can be told beforehand."""
+    beside = [f"--{name}" for name in ELSEWHERE if getattr(options, name)]
+    if options.local and beside:
+        raise CannotPlay(
+            f"--local is a daemon of this computer, without {', '.join(beside)}: leave one or the other out"
+        )
     scenarios = [load(find(name)) for name in options.scenario or ["lap"]]
     for one in scenarios:
         if options.light.startswith("dac:") and any(fault.get("where") == "adc" for fault in one.faults):
@@ -142,8 +165,13 @@ def chosen(options: argparse.Namespace) -> list[Scenario]:
 
 def configured(options: argparse.Namespace, scenarios: list[Scenario]) -> int:
     """Write what the robot computer needs, and say what to do with it."""
-    if options.local or len(scenarios) > 1:
-        raise CannotPlay("--write-config: for one scenario, and a robot computer (no --local)")
+    if options.local:
+        raise CannotPlay("--write-config is for a robot computer; --local configures its own daemon: leave one out")
+    if len(scenarios) > 1:
+        names = ", ".join(one.name for one in scenarios)
+        raise CannotPlay(
+            f"--write-config takes one scenario, and {len(scenarios)} are named ({names}): name one of them"
+        )
     files = write_config(options.write_config, scenarios[0], ends_of(options))
     for file in files:
         say(f"written: {file}")
