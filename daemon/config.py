@@ -87,7 +87,7 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         Meta(
             min_length=1,
             description="auto (look for one), auto:SERIAL (that one), a path such as /dev/ttyACM0 or "
-            "/dev/ttyUSB0@115200 (fixed line rate), tcp://host:port, or none (lights alone)",
+            "/dev/ttyUSB0@115200 (fixed line rate), tcp://host:port (10940 without a port), or none (lights alone)",
         ),
     ] = "auto"
     intensity: Annotated[bool, Meta(description="true to read intensities too, where the model can")] = False

@@ -124,12 +124,16 @@ async def open_tcp_port(device: str, clock: Clock | None = None) -> TcpPort:
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
             await _connect(port, await _resolved(device, host, number))
     except TimeoutError as error:
-        raise DeviceMissing(
-            device, f"no answer within {CONNECT_TIMEOUT_S:g} s", "check power, cable, address and this host's netmask"
-        ) from error
+        problem = f"no answer within {CONNECT_TIMEOUT_S:g} s{_unnamed(device)}"
+        raise DeviceMissing(device, problem, "check power, cable, address and this host's netmask") from error
     except OSError as error:
         raise _explain(device, error) from error
     return port
+
+
+def _unnamed(device: str) -> str:
+    """Says which port was meant by a name without one."""
+    return "" if urlsplit(device).port else f" at port {DEFAULT_TCP_PORT}, as the name has none"
 
 
 async def _resolved(device: str, host: str, number: int) -> list[inet.Address]:
@@ -156,6 +160,6 @@ async def _connect(port: TcpPort, addresses: list[inet.Address]) -> None:
 
 def _explain(device: str, error: OSError) -> HalError:
     if error.errno == errno.ECONNREFUSED:
-        return DeviceRefused(device, "connection refused", REFUSED)
+        return DeviceRefused(device, f"connection refused{_unnamed(device)}", REFUSED)
     reason = os.strerror(error.errno) if error.errno else str(error)
     return DeviceMissing(device, reason, "check power, cable, address and this host's netmask")

@@ -82,7 +82,7 @@ def test_no_answer_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
         monkeypatch.setattr(asyncio.get_running_loop(), "create_connection", never)
         monkeypatch.setattr("hal.tcp_port.CONNECT_TIMEOUT_S", 0.02)
-        with pytest.raises(DeviceMissing, match=r"no answer .*cable"):
+        with pytest.raises(DeviceMissing, match=r"no answer .* at port 10940, as the name has none .*cable"):
             await open_port("tcp://127.0.0.1", 0)
 
     asyncio.run(body())
@@ -113,6 +113,11 @@ def test_bad_names(name: str) -> None:
         (OSError(errno.EHOSTUNREACH, "Connect call failed"), DeviceMissing, "No route to host (check power"),
         (OSError("Multiple exceptions: a, b"), DeviceMissing, "Multiple exceptions: a, b"),
         (OSError(errno.ECONNREFUSED, "Connect call failed"), DeviceRefused, "a sensor serves one client"),
+        (
+            OSError(errno.ECONNREFUSED, "Connect call failed"),
+            DeviceRefused,
+            "refused at port 10940, as the name has none",
+        ),
     ],
 )
 def test_connect_errors(error: OSError, kind: type[HalError], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
