@@ -104,7 +104,7 @@ def test_the_robot_computers_files_are_written(tmp_path: Path, capsys: pytest.Ca
         assert main(words) == 2
         assert not (tmp_path / "odd").exists(), "nothing is written where something is wrong"
     assert main(["lap", "cable", *ends, "--write-config", str(tmp_path / "two")]) == 2
-    assert "for one scenario" in capsys.readouterr().out
+    assert "takes one scenario, and 2 are named" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
