@@ -273,6 +273,9 @@ class Suspicion:
         t_still: since when the wheels stand, as far as they have told since the last match; moved: by what they have
             turned meanwhile (x, y, yaw). unwatched_s: the longest time since that match for which they stood, and
             turned then.
+        t_rest: since when the wheels stand, whether matches come or not; rested: by what they have turned meanwhile.
+        against: share of the evidence that spoke against the place when they stopped, negative before the first scan.
+        strange_s: for so long more of it has since; t_strange: when it last did.
         period_s: usual time between two matches, 0 before it is known.
         question: what the look under way decides, None: there is none. job: its ID. t_asked: when it was asked for.
         again: the next one may search more.
@@ -288,6 +291,11 @@ class Suspicion:
     t_still: float = -math.inf
     moved: Array = field(default_factory=lambda: np.zeros(3))
     unwatched_s: float = 0.0
+    t_rest: float = math.inf
+    rested: Array = field(default_factory=lambda: np.zeros(3))
+    against: float = -1.0
+    strange_s: float = 0.0
+    t_strange: float = -math.inf
     period_s: float = 0.0
     question: Question | None = None
     job: int = 0

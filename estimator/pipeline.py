@@ -66,7 +66,7 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
     """
     match: MatchResult | None = None
     keyframe = -1
-    for record in sorted(records, key=order):
+    for record in in_turn(state, records):
         why = refused(state, record) if isinstance(record, Scan) else None
         if why is None:
             predict(state, record)
@@ -129,6 +129,29 @@ def order(record: Record) -> tuple[float, bool]:
     """Records go by the instant up to which they speak; a scan after whatever moved the robot until then."""
     end = record.t_end if isinstance(record, Scan | SampleBlock | LightEpoch | Odometry | Imu) else record.t_begin
     return end if in_time(end) else -math.inf, isinstance(record, Scan)
+
+
+def in_turn(state: State, records: Iterable[Record]) -> list[Record]:
+    """Records in the order in which they are taken; where matches tell `lights` the way, epochs after their scan.
+
+    Until the scan has been matched nobody knows how the robot has moved since the one before, and light would be held
+    against where the velocity has carried it: of a robot that is suddenly pushed and turned that is wrong by more than
+    light is, and what light then says of the place turns its heading.
+    """
+    told = sorted(records, key=order)
+    if state.light is None or state.light.guided is None or state.settings.matcher is not Matcher.LINE:
+        return told
+    waiting: list[Record] = []
+    taken: list[Record] = []
+    for record in told:
+        if isinstance(record, SampleBlock | LightEpoch):
+            waiting.append(record)
+            continue
+        taken.append(record)
+        if isinstance(record, Scan):
+            taken += waiting
+            waiting = []
+    return taken + waiting
 
 
 def predict(state: State, record: Record) -> None:

@@ -6,7 +6,8 @@ is suspected where physics says that something else than driving has happened:
 * a match moves the pose farther than any driving can have in that time;
 * the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
   seen afterwards is not what was seen before;
-* what is seen changes from one scan to the next, all at once (`leap`).
+* what is seen changes from one scan to the next, all at once (`leap`);
+* the wheels stand, and for a while much of what is seen speaks against the place (`strange`).
 
 One look in the whole map then decides: if another place fits nearly as well the robot is adrift, and after a leap also
 if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the local
@@ -26,7 +27,7 @@ import numpy as np
 from estimator import absolute, adrift, keyframe, localmap, relocate, se2
 from estimator.atlas import LOOK
 from estimator.commands import forget
-from estimator.fusion import noise_of
+from estimator.fusion import BLIND, noise_of
 from estimator.hypotheses import BEHIND, Question
 from estimator.keyframe import unturned
 from estimator.leap import glance
@@ -54,6 +55,12 @@ LEARNING: Final = 0.1
 STILL_M, STILL_RAD = 0.005, 0.005
 """Wheels stand that have turned by no more since they stopped, however often they tell it: 0.01 m/s for
 `UNWATCHED_S`."""
+RESTED_S: Final = 0.5
+"""So long after the wheels have stopped nothing of what is seen is of a robot that still rolls."""
+STRANGE, STRANGE_S, FORGET_S = 0.1, 0.5, 1.0
+"""By so much more of the evidence than when the wheels stopped speaks against the place, in all for so long, while the
+robot is carried along a corridor. Ten people do not: they hide walls, but let nobody look through them. The third:
+after so long without any it is over."""
 NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
 310 thousand. One that ends there decides nothing, and is made once more with all of that; where that is not enough
@@ -67,13 +74,21 @@ def on_odometry(state: State, record: Odometry) -> None:
     """Take in whether the wheels stand; as long as they tell nothing, they are not known to turn."""
     doubt = state.suspicion
     moved = doubt.moved + record.delta
-    x, y, yaw = moved.tolist()
-    if not math.isfinite(x + y + yaw):
+    if not all(map(math.isfinite, moved.tolist())):
         return
     doubt.moved = moved
-    if math.hypot(x, y) > STILL_M or abs(yaw) > STILL_RAD:
+    if turned(moved):
         doubt.unwatched_s = max(doubt.unwatched_s, record.t_begin - doubt.t_still)
         doubt.t_still, doubt.moved = max(doubt.t_still, record.t_end), np.zeros(3)
+    doubt.rested = doubt.rested + record.delta
+    if turned(doubt.rested) or not doubt.t_rest <= record.t_end:
+        doubt.t_rest, doubt.rested, doubt.against = record.t_end, np.zeros(3), -1.0
+
+
+def turned(moved: Array) -> bool:
+    """Whether wheels that have moved the robot by so much (x, y, yaw) do not stand."""
+    x, y, yaw = moved.tolist()
+    return math.hypot(x, y) > STILL_M or abs(yaw) > STILL_RAD
 
 
 def waits(state: State) -> bool:
@@ -86,9 +101,10 @@ def waits(state: State) -> bool:
 def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
     """Whether the place is to be looked for now; to be asked before the match is fused."""
     doubt, atlas = state.suspicion, state.atlas
+    strange = was_strange(state, scan, points, match)
     if not match.ok or state.local is None:
         return False
-    alone, leapt = unwatched(state), leaps(state, scan, points, match)
+    alone, leapt = unwatched(state), leaps(state, scan, points, match, strange)
     if absolute.tells(state) or atlas.adrift is not None or state.settings.loops is None:
         doubt.end()
         atlas.own = 0
@@ -110,8 +126,39 @@ def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> 
     return doubt.fitted >= ROW and doubt.question is None
 
 
-def leaps(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether what is seen has changed all at once, now or while light still told the place, and not since.
+def was_strange(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
+    """Whether much of what was seen spoke against the place for a while, the wheels standing, and fits it again now.
+
+    It fits where the robot was carried on by hand to where it looks alike: from one scan to the next little changes.
+    What the map has wrong there spoke against it already when the wheels stopped.
+    """
+    doubt, now = state.suspicion, state.fused.t_mono
+    stands = now - doubt.t_rest >= 0.0 and now - state.fused.t_odometry < RESTED_S
+    share = speaking_against(state, scan, points, match) if stands else -1.0
+    doubt.against = share if doubt.against < 0.0 else doubt.against
+    if share > doubt.against + STRANGE and now - doubt.t_rest >= RESTED_S:
+        doubt.strange_s += min(max(0.0, now - state.t_scan), doubt.period_s)
+        doubt.t_strange = now
+        return False
+    enough = doubt.strange_s >= STRANGE_S
+    if enough and not match.ok:
+        return False
+    if enough or not stands or now - doubt.t_strange > FORGET_S:
+        doubt.strange_s = 0.0
+    return enough
+
+
+def speaking_against(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
+    """Share of the evidence that contradicts the local map from where a scan was taken; negative: it shows nothing."""
+    if state.local is None or match.reason in BLIND:
+        return -1.0
+    eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
+    beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
+    return localmap.contradicted(state.local, eye, beams, noise_of(state, scan))
+
+
+def leaps(state: State, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:
+    """Whether what is seen has changed all at once, or was `strange`: now, or while light told the place and not since.
 
     Where the robot is put down there may be no lamp, and for a moment nobody knows that it has been one.
     """
@@ -119,7 +166,7 @@ def leaps(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> b
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
     doubt.leap.take(glance(scan.t_end, eye, beams), noise_of(state, scan), doubt.period_s)
-    if doubt.leap.seen:
+    if doubt.leap.seen or strange:
         doubt.t_leap = scan.t_end
     if absolute.tells(state) or not doubt.t_leap > absolute.told_last(state):
         return False

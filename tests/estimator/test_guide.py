@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from estimator.lights import HELD_S
 from estimator.lights_memory import sensors_known
 from estimator.lights_motion import prior_scales
 from estimator.matching import no_match
+from estimator.pipeline import in_turn
 from estimator.records import Array, Imu, Odometry, Record
 from estimator.result import Fix, MatchResult, Reason
 from estimator.row import LASTING_S
@@ -302,3 +304,20 @@ def test_reset_and_a_given_place_forget_that_lamps_were_a_row() -> None:
         filter_.t_row = 0.0
         forget(filter_)
         assert filter_.t_row == math.inf
+
+
+@pytest.mark.parametrize("guided", [True, False])
+def test_where_matches_tell_the_way_an_epoch_waits_for_the_scan_of_its_time(guided: bool) -> None:
+    """Nobody knows until then how the robot has moved; wheels, and a scan without lamps, are taken as they come."""
+    run = replace(room_run(seed=1, people=0), seconds=1.0)
+    state, (first, second) = lit_state(run), islice(scans(run), 1, 3)
+    assert state.light is not None
+    state.light.guided = (0.0, np.zeros(3)) if guided else None
+    wheels = Odometry(first.t_end, second.t_begin, np.zeros(3))
+    ends = (first.t_end - 0.01, second.t_end - 0.01, second.t_end + 0.01)
+    early, between, late = [replace(next(run.light()), t_end=t) for t in ends]
+    taken = in_turn(state, [late, second, wheels, early, between, first])
+    expected = (
+        [first, early, wheels, second, between, late] if guided else [early, first, wheels, between, second, late]
+    )
+    assert [id(record) for record in taken] == [id(record) for record in expected]

@@ -114,6 +114,27 @@ def test_lamps_that_speak_against_the_pose_end_tracking_or_hold_it_back(kind: st
 
 
 @pytest.mark.jit
+def test_the_heading_survives_a_robot_without_wheels_that_is_carried_off_fast_and_turned_with_the_lidar_open() -> None:
+    """2.4 m/s and 104 deg/s from one moment to the next: light was held against where the old velocity had it."""
+    scene = draw("kidnap_lit", 24)
+    scene.seconds = 30.0
+    rows = run(scene)
+    after = rows[rows[:, AT["t"]] > 25.0]
+    assert not scene.wheels
+    assert np.rad2deg(after[:, AT["error_rad"]].max()) < 2.0
+    assert np.all(after[:, AT["state"]] == State.TRACKING)
+
+
+@pytest.mark.jit
+def test_carried_along_a_corridor_with_the_lidar_open_is_not_tracking_where_it_looks_alike() -> None:
+    scene = draw("kidnap_unlit", 55)
+    scene.seconds = 45.0
+    rows = run(scene)
+    assert rows[-1, AT["error_m"]] > 10.0, "it was found all the same"
+    assert judged("kidnap_unlit-55", rows, np.zeros((0, 2)), (True, False, "")).wrong_s <= 2.0
+
+
+@pytest.mark.jit
 def test_a_start_that_light_holds_back_is_not_tracking_once_the_lamps_are_out() -> None:
     scene = draw("false_lights", 59)
     scene.seconds, scene.dark = 16.0, ((8.0, 16.0),)
