@@ -11,7 +11,7 @@ from daemon.reasons import Reason
 SILENT_PERIODS: Final = 3.0
 """Scan periods without a valid scan after which the lidar is said to be gone."""
 VAGUE_M: Final = 0.15
-VAGUE_RAD: Final = 0.04
+VAGUE_RAD: Final = 0.045
 """One-sigma uncertainty beyond which TRACKING is not said."""
 
 

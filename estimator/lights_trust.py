@@ -15,7 +15,7 @@ from estimator.linear3 import invert3, symmetric
 from estimator.records import Array
 from estimator.result import LightsResult
 
-TRUST, YOUNG, YOUNG_M = 2.0, 2.5, 4.0
+TRUST, YOUNG, YOUNG_M = 2.0, 6.0, 1.0
 """By how much the variance of a position from light is raised: always, because errors of the light model hang together
 farther than it knows; and at the start, fading with the way driven (m), because gains and heading are being found."""
 UNGUIDED = 1.5
