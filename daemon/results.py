@@ -74,13 +74,29 @@ class Folder:
         self.write(_PROBE, b"may be written")
         (path / _PROBE).unlink()
 
+    def demand(self, name: str) -> None:
+        """Try whether a file of that name could be put in place; what is there stays.
+
+        Raises:
+            OutputRefused: it is a folder, the name is too long, or may not be looked at.
+        """
+        final, beside = self._places(name)
+        try:
+            taken = final.is_dir()  # which tells of some errors by raising them
+            beside.touch()
+            beside.unlink()
+        except OSError as error:
+            raise OutputRefused(f"cannot write {final}: {error.strerror}; name another file") from error
+        if taken:
+            raise OutputRefused(f"{final} is a folder; name a file in it")
+
     def write(self, name: str, data: bytes) -> None:
         """Put one file in place.
 
         Raises:
             OutputRefused: no room, no permission; what was there before stays.
         """
-        final, beside = self.path / name, self.path / f".{name}.part"
+        final, beside = self._places(name)
         try:
             beside.write_bytes(data)
             beside.replace(final)
@@ -88,6 +104,10 @@ class Folder:
             with contextlib.suppress(OSError):
                 beside.unlink(missing_ok=True)
             raise OutputRefused(f"cannot write {final}: {error.strerror}; free space or name another folder") from error
+
+    def _places(self, name: str) -> tuple[Path, Path]:
+        """Where a file goes, and where it is written first."""
+        return self.path / name, self.path / f".{name}.part"
 
     def write_each(self, files: Iterable[tuple[str, bytes]]) -> None:
         """Put files in place by name; one that cannot be written keeps none of the others away.

@@ -69,15 +69,15 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; ``args``: the ``time`` as it was typed, ``log`` or None, where to draw (``out``) or None."""
     folder = args.log or recordings_folder(FLIGHT)
     try:
-        if args.out is not None:
-            _try(args.out)
         if args.log is None and not _is_folder(folder):
             looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
             return cli.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
         span, utc, wide = find(spans(folder), args.time, folder)
+        if args.out is not None:
+            _try(args.out)
         told, rerun = moments(span, utc)
         second = whole_second(args.time)
-        sys.stdout.write(whysaid.report(told, utc, span.path.name, second, span.made, wide))
+        sys.stdout.write(whysaid.report(told, utc, span.path.name, wide, second, span.made))
         if rerun.comparison.differ:
             cli.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
@@ -93,9 +93,7 @@ def _try(out: Path) -> None:
     """Whether a picture can be drawn, and put there: known before anything is replayed; raises `OutputRefused`."""
     if find_spec("matplotlib") is None:
         raise OutputRefused(f"pictures need matplotlib: {how_to_install('plot')}")
-    if out.is_dir():
-        raise OutputRefused(f"{out} is a folder; name a file in it")
-    Folder(out.parent)
+    Folder(out.parent).demand(out.name)
 
 
 def _draw(out: Path, told: list[Moment], utc: float, rerun: Rerun) -> None:
@@ -141,7 +139,7 @@ def _span(path: Path) -> Span:
     begin = begun if source.begin is None else source.begin.t_mono
     last = open_recording(recording.segments[-1])
     end = max((frame.t_mono for frame in last.frames(LogReport())), default=begin)
-    return Span(path, utc + begin, utc + end, utc, made_elsewhere(recording.header))
+    return Span(path, round(utc + begin, 6), round(utc + end, 6), utc, made_elsewhere(recording.header))
 
 
 def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:
@@ -157,19 +155,21 @@ def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:
 
 
 def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, float]:
-    """The recording that holds a moment, with most of the time before it, that moment (UTC) and how long it lasts, s.
+    """The recording that holds a moment, and when that is.
 
-    Of a whole second it may hold a part: the moment is not before it begins.
+    Returns:
+        The recording with most of the time before it; the moment (UTC), to the microsecond; and how long it lasts, s,
+        more than 0. Of a whole second a part may be recorded: then it is that part.
 
     Raises:
         NoMoment: none does, or that is no time.
     """
     wide = width(words)
-    asked = [(span, utc, max(utc, span.begin)) for span in recorded for utc in meant(words, span)]
+    asked = [(span, round(utc, 6), round(utc + wide, 6)) for span in recorded for utc in meant(words, span)]
     here = [
-        (min(begin - span.begin, BEFORE_S), span.begin, span, begin, utc + wide - begin)
-        for span, utc, begin in asked
-        if utc <= span.end and span.begin <= utc + wide
+        (min(begin - span.begin, BEFORE_S), span.begin, span, begin, round(end - begin, 6))
+        for span, utc, end in asked
+        if utc <= span.end and (begin := max(utc, span.begin)) < end
     ]
     if here:
         return max(here, key=lambda one: one[:2])[2:]
@@ -183,9 +183,12 @@ def whole_second(words: str) -> bool:
 
 
 def width(words: str) -> float:
-    """Seconds that a time stands for: one of its last digit. So does one that was printed, and cut, mean its cycle."""
-    fraction = re.search("[.,]([0-9]*)", words)
-    return whymoment.SECOND_S * 10.0 ** -min(0 if fraction is None else max(1, len(fraction[1])), DIGITS)
+    """Seconds that a time stands for: one of its fraction's last digit; 1 without one, for a minute or a date, too.
+
+    So does a time that was printed, and cut, mean its cycle.
+    """
+    fraction = re.search("[.,]([0-9]+)", words)
+    return whymoment.SECOND_S * 10.0 ** -min(0 if fraction is None else len(fraction[1]), DIGITS)
 
 
 def meant(words: str, span: Span) -> list[float]:
@@ -198,7 +201,7 @@ def meant(words: str, span: Span) -> list[float]:
         NoMoment: it is no time.
     """
     text = words.strip().replace(",", ".")  # as half of the world writes a fraction, and ISO 8601 too
-    if re.fullmatch(r"[0-9]+(\.[0-9]*)?", text):
+    if re.fullmatch(r"[0-9]+(\.[0-9]+)?", text):
         number = float(text)
         return [number if number > UNIX_S else span.begin + number]
     try:

@@ -17,7 +17,8 @@ from estimator.result import StepResult
 SECOND_S: Final = 1.0
 """A time without a fraction, as the journal writes it, is of all that came in this long."""
 LATE_S: Final = 0.15
-"""The journal has a fault from a heartbeat; the next cycle publishes it, so much later or whenever it comes."""
+"""The journal has a fault from a heartbeat; it is published within this long, or, of a slow lidar, with the next cycle,
+which may begin up to :data:`SECOND_S` later."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,9 +26,10 @@ class Moment:
     """One cycle as it was replayed, with what was published then.
 
     Attributes:
-        utc: when it began. state: as it was published then. snapshot, result: of the replay. scan: number of the scan
-            it took. fresh: whether the result is of this cycle. wheels: what wheels and laser told over the last two
-            seconds, None where that cannot be said. dropped: scans that were not taken.
+        utc: when it began, to the microsecond, so that no boundary is judged otherwise than it is printed. state: as it
+            was published then. snapshot, result: of the replay. scan: number of the scan it took. fresh: whether the
+            result is of this cycle. wheels: what wheels and laser told over the last two seconds, None where that
+            cannot be said. dropped: scans that were not taken.
         told: number of the reason that was published, None in a recording of before reason and faults were kept.
         faults: numbers of those that were published, gravest first.
     """
@@ -54,7 +56,7 @@ class Moment:
 def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle: Cycle) -> Moment:
     """A cycle that has just been repeated."""
     return Moment(
-        utc=utc_at_zero + record.t_mono,
+        utc=round(utc_at_zero + record.t_mono, 6),
         state=State(entry.state),
         snapshot=record.snapshot,
         result=record.result,
@@ -69,9 +71,11 @@ def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle:
 
 
 class Chosen(NamedTuple):
-    """Which cycle is told: its index, and that of the last one whose changes are.
+    """Which cycle is told.
 
-    ``changed``: the cycle of a whole second's first change, None where there is none, and of what is no whole second.
+    Attributes:
+        cycle: its index. last: that of the last one whose changes are told; of what is no whole second it is ``cycle``.
+        changed: that of a whole second's first change, None where there is none, and of what is no whole second.
     """
 
     cycle: int
@@ -94,36 +98,42 @@ def at(told: Sequence[Moment], utc: float) -> int:
     return max((k for k, one in enumerate(told) if one.utc <= utc), default=0)
 
 
-def first_change(told: Sequence[Moment], utc: float, wide: float = SECOND_S) -> int | None:
+def first_change(told: Sequence[Moment], utc: float, wide: float) -> int | None:
     """Index of the first cycle of a second in which state, reason or faults are others than before; None: in none.
 
-    What of it is published a moment after it counts where nothing changes in it. ``wide``: of the second, from ``utc``.
+    What of it is published a moment after it counts where nothing changes in it. The second goes from ``utc`` on for
+    ``wide``, s, which is less where only its end is recorded.
     """
-    for k in range(1, _reach(told, utc + wide) + 1):
+    for k in range(1, _reach(told, end_of(utc, wide)) + 1):
         if told[k].utc >= utc and _key(told[k]) != _key(told[k - 1]):
             return k
     return None
 
 
-def chosen(told: Sequence[Moment], utc: float, second: bool, wide: float = 0.0) -> Chosen:
-    """The cycle that is meant by a time which may stand for all from ``utc`` on that is no longer than ``wide``.
+def chosen(told: Sequence[Moment], utc: float, second: bool, wide: float) -> Chosen:
+    """The cycle that is meant by a time which stands for all from ``utc`` on for ``wide``, s, more than 0.
 
     Of a whole ``second`` it is that of the first change, else its first; of another time, which may be one that was
     printed and cut, the last one that had begun before it ends.
     """
+    end = end_of(utc, wide)
     if not second:
-        k = _before(told, utc + wide) if wide else at(told, utc)
+        k = _before(told, end)
         return Chosen(k, k, None)
-    wide = wide or SECOND_S
     changed = first_change(told, utc, wide)
-    first = next((k for k, one in enumerate(told) if utc <= one.utc < utc + wide), at(told, utc))
+    first = next((k for k, one in enumerate(told) if utc <= one.utc < end), at(told, utc))
     k = first if changed is None else changed
-    return Chosen(k, max(k, _reach(told, utc + wide)), changed)
+    return Chosen(k, max(k, _reach(told, end)), changed)
+
+
+def end_of(utc: float, wide: float) -> float:
+    """When a time ends, as exactly as cycles are told: the sum of two numbers is off by parts of a microsecond."""
+    return round(utc + wide, 6)
 
 
 def _before(told: Sequence[Moment], end: float) -> int:
-    """Index of the last cycle that had begun before an instant, to the microseconds in which times are printed."""
-    return max((k for k, one in enumerate(told) if round(one.utc, 6) < round(end, 6)), default=0)
+    """Index of the last cycle that had begun before an instant."""
+    return max((k for k, one in enumerate(told) if one.utc < end), default=0)
 
 
 def _reach(told: Sequence[Moment], end: float) -> int:

@@ -34,7 +34,7 @@ COLOURS: Final = {
 
 
 def draw(told: Sequence[Moment], utc: float, grid: Grid, kind: str = "png") -> bytes:
-    """A file of that kind: png, svg or pdf; wants matplotlib."""
+    """A file of that kind: png, svg or pdf; ``utc``, s: where its time is zero. Wants matplotlib."""
     from matplotlib.figure import Figure
 
     one = told[at(told, utc)]

@@ -14,15 +14,13 @@ from daemon.faults import FAULTS, Fault
 from daemon.publish.meanings import USES
 from daemon.publish.snapshot import LightLink, LinkUse, Snapshot, State
 from daemon.reasons import REASONS, Reason
-from daemon.whymoment import SECOND_S, Moment, chosen, clock, faults_changed, of_day
+from daemon.whymoment import SECOND_S, Moment, chosen, clock, end_of, faults_changed, of_day
 from estimator import se2
 from estimator.records import Array
 
 AXES: Final = ("x", "y", "heading")
 GAP: Final = 16.27
 """Squared Mahalanobis distance of three components that is beyond chance (1 in 1000)."""
-SILENT_S: Final = 0.5
-"""Without a scan; sooner where the daemon says so, which goes by scan periods."""
 GONE: Final = (Reason.LIDAR_SILENT, Reason.LIDAR_UNREACHABLE)
 """What is published of a laser that is silent, or not steady again, whoever holds the pose meanwhile."""
 MOST: Final = 12
@@ -33,20 +31,18 @@ FITS: Final = 0.2
 """Deviation (ln) below which what is received fits."""
 
 
-def report(
-    told: Sequence[Moment], utc: float, where: str, second: bool = False, made: str = "", wide: float = 0.0
-) -> str:
-    """The text of a time.
+def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: bool = False, made: str = "") -> str:
+    """The text of a time, which lasts from ``utc`` on for ``wide``, s (:func:`daemon.whymoment.chosen`).
 
-    ``second``: a whole one that begins then, of which the first change is told. ``wide``: how long the time lasts that
-    is meant (:func:`daemon.whymoment.chosen`). ``made``: a line on what the recording was made with, where there is
-    something to say of it.
+    ``second``: it is a whole one, of which the first change is told. ``made``: a line on what the recording was made
+    with, where there is something to say of it.
     """
     k, last, changed = chosen(told, utc, second, wide)
-    one, when = told[k], clock(utc)
+    one, begun, apart = told[k], clock(utc), told[k].utc - utc
+    when = begun
     if second:
-        when = f"{when.partition('.')[0]}, the whole second: {_change(one.utc - utc - (wide or SECOND_S), changed)}"
-    begun, apart = when.partition(", the whole")[0], one.utc - utc
+        begun, meant = _named(utc, wide)
+        when = f"{begun}, {meant}: {_change(one.utc - end_of(utc, wide), changed)}"
     if apart > SECOND_S and changed is None:
         when = f"{begun}, no cycle had run yet; the first, {apart:.0f} s later"
     elif apart < -SECOND_S:
@@ -60,6 +56,13 @@ def report(
     lines += ["", f"what changed in the {first}{' and in this second, or just after it' if second else ''}"]
     lines += [f"  {line}" for line in _listed(list(_changes(told[: last + 1])))] or ["  nothing"]
     return "\n".join(lines) + "\n"
+
+
+def _named(utc: float, wide: float) -> tuple[str, str]:
+    """How a second is written that begins then and lasts ``wide``, s, and what it is."""
+    if utc.is_integer():
+        return clock(utc).partition(".")[0], "the whole second"
+    return clock(utc), "the second from then" if wide >= SECOND_S else "the rest of that second"
 
 
 def _change(after_s: float, changed: int | None) -> str:
@@ -147,7 +150,7 @@ def _laser(told: Sequence[Moment], k: int) -> str:
     match, ago = latest.result.match, told[k].utc - latest.utc
     when = f", {ago:.2f} s ago" if ago > 0.3 else ""
     gone = told[k].state is State.NO_LIDAR or told[k].reason in GONE
-    silent = latest is not told[k] and (ago > SILENT_S or told[k].snapshot.lidar_ok is False)
+    silent = latest is not told[k] and told[k].snapshot.lidar_ok is False
     before = f"silent for {ago:.{1 if ago >= 1.0 else 2}f} s; before: "
     if not match.ok:
         said = f"came to nothing: {match.reason.value} ({match.queries} points)"

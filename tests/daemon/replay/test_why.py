@@ -15,7 +15,7 @@ from daemon import blackbox, cli, disk, folders
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
 from daemon.versions import build
-from daemon.why import NoMoment, Span, find, meant, whole_second
+from daemon.why import NoMoment, Span, find, meant, whole_second, width
 from daemon.witness import Told
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
@@ -65,7 +65,20 @@ def test_without_a_zone_it_is_local_time() -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["yesterday", "25:00:00", "21:61", "", "nan", "-5", "2023-13-01T00:00:00Z", "21:14:60", "0001-01-01T00:00"]
+    "words",
+    [
+        "yesterday",
+        "25:00:00",
+        "21:61",
+        "",
+        "nan",
+        "-5",
+        "2023-13-01T00:00:00Z",
+        "21:14:60",
+        "0001-01-01T00:00",
+        "5.",
+        "22:13:25.Z",
+    ],
 )
 def test_what_is_no_time_is_refused_with_the_ways_to_write_one(words: str) -> None:
     with pytest.raises(NoMoment, match="write 21:14:07"):
@@ -136,6 +149,17 @@ def test_a_second_of_which_a_part_is_recorded_is_found_and_an_instant_is_not() -
     assert find([SPAN], "23:13:20Z", Path())[1] - AT == 3600.0
     with pytest.raises(NoMoment, match="not in what is recorded"):
         find([late], "22:13:25.0Z", Path())
+    next_one = Span(Path("next"), AT + 6.0, AT + 60.0, 0.0)
+    with pytest.raises(NoMoment, match="not in what is recorded"):
+        find([next_one], "22:13:25Z", Path())
+
+
+def test_the_last_instant_of_a_recording_is_in_it_however_the_sum_is_rounded() -> None:
+    """Ends are to the microsecond; a number of seconds is added to the beginning."""
+    for k in range(1, 200):
+        span = Span(Path("rec"), AT + 0.4, round(AT + 0.4 + 1e-3 * k, 6), 0.0)
+        _, utc, wide = find([span], f"{1e-3 * k:.3f}", Path())
+        assert (utc, wide) == (span.end, 1e-3)
 
 
 @pytest.mark.parametrize(("wheels_m", "turn", "agree"), [(1.0, 0.0, True), (0.65, 0.0, False), (1.0, 0.4, False)])
@@ -244,10 +268,20 @@ def test_a_time_that_it_has_printed_means_the_same_cycle(recorded: Path, capsys:
 
 
 @pytest.mark.parametrize(
-    ("words", "wide"), [("22:13:25Z", 1.0), ("22:13:25.5Z", 0.1), ("22:13:25,123Z", 1e-3), ("5.0", 0.1), ("5", 1.0)]
+    ("words", "wide"),
+    [
+        ("22:13:25Z", 1.0),
+        ("22:13:25.5Z", 0.1),
+        ("22:13:25,123Z", 1e-3),
+        ("5.0", 0.1),
+        ("5", 1.0),
+        ("22:14Z", 1.0),
+        ("5.1234567", 1e-6),
+    ],
 )
 def test_how_wide_that_is(words: str, wide: float) -> None:
-    assert find([SPAN], words, Path())[2] == pytest.approx(wide, abs=1e-6)
+    assert width(words) == pytest.approx(wide, abs=1e-12)
+    assert find([SPAN], words, Path())[2] == pytest.approx(wide, abs=1e-9)
 
 
 def test_a_run_where_all_is_well_from_a_folder_of_several(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -290,9 +324,51 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
     ):
         assert cli.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == cli.FAILED
         assert problem in capsys.readouterr().err
+    (tmp_path / "closed").mkdir()
+    for name in (f"{248 * 'a'}.png", f"{300 * 'a'}.png"):  # of the first only that beside it is too long
+        assert cli.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == cli.FAILED
+        assert f"cannot write {tmp_path / name}: File name too long; name another file" in capsys.readouterr().err
+    is_dir = Path.is_dir
+
+    def closed(path: Path) -> bool:
+        if path.parent.name == "closed":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return is_dir(path)
+
+    with monkeypatch.context() as there:  # tests may run as root, to whom all is open
+        there.setattr(Path, "is_dir", closed)
+        assert cli.main(["why", "9", str(recorded), "--out", str(tmp_path / "closed" / "why.png")]) == cli.FAILED
+    assert f"cannot write {tmp_path}/closed/why.png: Permission denied; name another file" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["closed", "file", "folder.png"], "nothing stays"
+    assert not list((tmp_path / "closed").iterdir())
     monkeypatch.setattr("daemon.why.find_spec", lambda name: None)
     assert cli.main(["why", "9", str(recorded), "--out", str(tmp_path / "why.png")]) == cli.FAILED
     assert "pictures need matplotlib" in capsys.readouterr().err
+
+
+def test_for_a_time_that_is_none_no_folder_is_made(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["why", "nonsense", str(recorded), "--out", str(tmp_path / "by" / "typo" / "a.png")]) == cli.FAILED
+    assert "not a time" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_picture_is_of_the_cycle_that_is_told(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An instant is its own; a second, and a time that was printed and cut, are those of their cycle."""
+    drawn: list[float] = []
+    monkeypatch.setattr("daemon.whyplot.draw", lambda told, utc, *_: drawn.append(utc) or b"")  # type: ignore[func-returns-value]  # of a list
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
+    out = ("--out", str(tmp_path / "why.png"))
+    for words in ("2023-11-14T22:13:25Z", "2023-11-14T22:13:25.0Z"):
+        head = asked(words, dump, capsys, *out).splitlines()[0]
+        at = head.split("cycle of ")[1].partition(",")[0]
+        seconds = float(at.rpartition(":")[2])
+        assert drawn.pop() - AT + 20.0 == pytest.approx(max(25.0, seconds), abs=1e-3)
+    asked(f"2023-11-14T22:13:{int(1e3 * seconds) / 1e3:06.3f}Z", dump, capsys, *out)
+    assert drawn.pop() - AT + 20.0 == pytest.approx(seconds, abs=1e-3)
 
 
 @pytest.mark.parametrize("lost", [{"t_utc": None}, {"t_mono": "soon"}, {"t_utc": float("nan")}, {"t_utc": 1e300}])
