@@ -64,12 +64,14 @@ def test_what_is_published_after_a_second_counts_for_as_long_as_it_may_be_of_it(
     assert ("fault 101 comes" in report(told, AT + 5.0, "here", 1.0, second=True)) is found
 
 
-def test_a_cycle_that_begins_when_the_last_digit_turns_is_not_meant() -> None:
-    """The sum of that time and a thousandth is a quarter of a microsecond off."""
-    for k in range(1000):
-        turn = round(AT + 5.0 + 1e-3 * (k + 1), 6)
+@pytest.mark.parametrize("digits", range(1, 7))
+def test_a_cycle_that_begins_when_the_last_digit_turns_is_not_meant(digits: int) -> None:
+    """The sum of a time and of how long it lasts may be a quarter of a microsecond beyond."""
+    wide = 10.0**-digits
+    for k in range(123, 223):
+        turn = round(AT + wide * (k + 1), 6)
         told = [replace(WELL, utc=turn - 0.5), replace(WELL, utc=turn)]
-        assert chosen(told, round(AT + 5.0 + 1e-3 * k, 6), second=False, wide=1e-3).cycle == 0, of_day(turn)
+        assert chosen(told, round(AT + wide * k, 6), second=False, wide=wide).cycle == 0, of_day(turn)
 
 
 @pytest.mark.parametrize("begun", [AT + 4.9999998, AT + 5.0000002])
