@@ -30,14 +30,16 @@ from tools.bench.world.judge import Played, judged, pictures
 from tools.bench.world.local import robot
 from tools.bench.world.robotside import write_config
 from tools.bench.world.scenario import BUILT_IN, Scenario, find, load
-from tools.bench.world.stage import CannotPlay, Ends, play
+from tools.bench.world.stage import CannotPlay, Ends, is_port, play
 
 CANNOT: Final = 2
 ELSEWHERE: Final = ("lidar", "modbus", "odometry", "light", "anyone")
-"""Words that say where a robot computer is reached."""
+"""Words that say where a robot computer is reached, and by whom this one is: a daemon of this computer needs none."""
 TCP: Final = "tcp://"
 SERVED: Final = {"lidar": "tcp://0.0.0.0:10940", "light": "tcp://0.0.0.0:7777"}
 """Words that may name an address to serve at, each with one that is good."""
+LIGHT: Final = ("dac:", "unix:", TCP)
+"""Beginnings of what light may come out of."""
 APART_M: Final = 0.01
 LEAST_S, LEAST_M = 2.0, 1.0
 """Of driving until a fault, for two runs to be compared, and so much way with poses that are."""
@@ -132,13 +134,15 @@ def ends_of(options: argparse.Namespace) -> Ends:
     missing = [f"--{name}" for name in ("lidar", "modbus") if not getattr(options, name)]
     if missing:
         raise CannotPlay(f"{' and '.join(missing)} missing (docs/bench.md has the wiring), or --local without any")
-    if port and not port.isdigit():
+    if port and not is_port(port):
         raise CannotPlay(f"--modbus {options.modbus}: expected HOST:PORT, as 192.168.0.20:1502")
     for name, as_here in SERVED.items():
         address = getattr(options, name)
         at, _, number = address.removeprefix(TCP).rpartition(":")
-        if address.startswith(TCP) and not (at and number.isdigit()):
+        if address.startswith(TCP) and not (at and is_port(number)):
             raise CannotPlay(f"--{name} {address}: no port to listen at: expected tcp://HOST:PORT, as {as_here}")
+    if options.light and not any(options.light.startswith(one) and options.light != one for one in LIGHT):
+        raise CannotPlay(f"--light {options.light}: expected dac:/dev/i2c-1@0x60, unix:/path or {SERVED['light']}")
     return Ends(options.lidar, (host, int(port or 1502)), options.odometry, options.light, options.anyone)
 
 

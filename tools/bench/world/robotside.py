@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from tools.bench.world.scenario import Scenario
-from tools.bench.world.stage import CannotPlay, Ends
+from tools.bench.world.stage import CannotPlay, Ends, is_port
 from tools.sim.serve_light import write_plan
 
 CONFIG: Final = "lumiloop.toml"
@@ -94,6 +94,6 @@ def _reached(served: str, bench: str) -> str:
 
 def _port(address: str, scheme: str) -> str:
     host, _, port = address.removeprefix(scheme).rpartition(":")
-    if not (address.startswith(scheme) and host and port.isdigit()):
+    if not (address.startswith(scheme) and host and is_port(port)):
         raise CannotPlay(f"{address}: expected {scheme}HOST:PORT")
     return port

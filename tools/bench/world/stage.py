@@ -70,6 +70,11 @@ class Ends:
     anyone: bool = False
 
 
+def is_port(text: str) -> bool:
+    """Whether that is the number of a port which others can reach."""
+    return text.isdecimal() and 0 < int(text) < 65536
+
+
 class Port(Protocol):
     """A port of this computer that may fail while it is played: ``lost`` says how."""
 
@@ -233,7 +238,7 @@ async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> lis
     """Offer the lidar."""
     if where.startswith("tcp://"):
         host, _, port = where.removeprefix("tcp://").rpartition(":")
-        if not port.isdigit():
+        if not is_port(port):
             raise DeviceRefused(
                 where, "not an address to listen on", "expected tcp://HOST:PORT, as tcp://0.0.0.0:10940"
             )
