@@ -107,7 +107,7 @@ def parse_tcp_name(device: str) -> tuple[str, int]:
         host, port = parts.hostname, parts.port
     except ValueError:
         host, port = None, None
-    if not host or parts.path not in ("", "/") or parts.query or parts.username:
+    if not host or port == 0 or parts.path not in ("", "/") or parts.query or parts.username:
         raise DeviceRefused(device, "not a network address", "expected tcp://host or tcp://host:port")
     return host, port or DEFAULT_TCP_PORT
 
@@ -133,7 +133,7 @@ async def open_tcp_port(device: str, clock: Clock | None = None) -> TcpPort:
 
 def _unnamed(device: str) -> str:
     """Says which port was meant by a name without one."""
-    return "" if urlsplit(device).port else f" at port {DEFAULT_TCP_PORT}, as the name has none"
+    return "" if urlsplit(device).port is not None else f" at port {DEFAULT_TCP_PORT}, as the name has none"
 
 
 async def _resolved(device: str, host: str, number: int) -> list[inet.Address]:

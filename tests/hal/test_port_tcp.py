@@ -101,7 +101,9 @@ def test_names(name: str, parsed: tuple[str, int]) -> None:
     assert parse_tcp_name(name) == parsed
 
 
-@pytest.mark.parametrize("name", ["tcp://", "tcp://host:port", "tcp://host:99999", "tcp://h/path", "tcp://:10940"])
+@pytest.mark.parametrize(
+    "name", ["tcp://", "tcp://host:port", "tcp://host:99999", "tcp://h/path", "tcp://:10940", "tcp://host:0"]
+)
 def test_bad_names(name: str) -> None:
     with pytest.raises(DeviceRefused, match=r"expected tcp://host"):
         parse_tcp_name(name)
