@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import subprocess
@@ -73,7 +74,7 @@ def warm_kernels(request: pytest.FixtureRequest) -> None:
     plugins = request.config.pluginmanager
     terminal, capture = plugins.get_plugin("terminalreporter"), plugins.get_plugin("capturemanager")
     if terminal is not None and not is_warm(lights=False):
-        with capture.global_and_fixture_disabled():
+        with contextlib.nullcontext() if capture is None else capture.global_and_fixture_disabled():
             terminal.ensure_newline()
             terminal.write_line("the kernels of this tree are compiled first, once: that takes a minute or two")
     command = [sys.executable, "-c", "from daemon.warmup import load; load()"]

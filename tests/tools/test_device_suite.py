@@ -1,0 +1,34 @@
+"""The suite on devices (tests/hil): what its options and its table of devices say before the first test."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.hil import conftest
+from tests.hil.test_ends import suite
+
+
+def test_where_nothing_is_captured_that_kernels_are_compiled_is_said_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    code, said, _ = suite(tmp_path, "-p", "no:capture", "-k", "probe_finds_it")
+    assert code == 0, said
+    assert "the kernels of this tree are compiled first, once" in said
+
+
+def test_whatever_opens_a_device_is_known_as_of_it() -> None:
+    """Else a wrong name is said only after kernels were compiled."""
+    opens = {
+        made.name: str(option.value)
+        for made in ast.parse(Path(conftest.__file__).read_text()).body
+        if isinstance(made, ast.FunctionDef) and any("fixture" in ast.unparse(by) for by in made.decorator_list)
+        for call in ast.walk(made)
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "_device"
+        if isinstance(option := call.args[1], ast.Constant)  # it is a variable where this table is gone through
+    }
+    assert opens == conftest.DEVICE_OF
