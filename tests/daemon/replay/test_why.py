@@ -14,7 +14,9 @@ from daemon import blackbox, cli, disk, folders
 from daemon.disk import SegmentWriter
 from daemon.flight import DUMP
 from daemon.versions import build
+from daemon.whymoment import Moment
 from daemon.witness import Told
+from estimator.grid import Grid
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
 from tests.daemon.replay.test_dump import let_write, unplugged
@@ -240,7 +242,12 @@ def test_the_picture_is_of_the_cycle_that_is_told(
 ) -> None:
     """An instant is its own; a second, and a time that was printed and cut, are those of their cycle."""
     drawn: list[float] = []
-    monkeypatch.setattr("daemon.whyplot.draw", lambda told, utc, *_: drawn.append(utc) or b"")  # type: ignore[func-returns-value]  # of a list
+
+    def draw(told: list[Moment], utc: float, grid: Grid, kind: str) -> bytes:
+        drawn.append(utc)
+        return kind.encode()
+
+    monkeypatch.setattr("daemon.whyplot.draw", draw)
     (dump,) = recorded.glob(f"{DUMP}*-fault-101")
     out = ("--out", str(tmp_path / "why.png"))
     for words in ("2023-11-14T22:13:25Z", "2023-11-14T22:13:25.000Z"):
