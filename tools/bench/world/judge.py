@@ -107,7 +107,7 @@ def errors_of(played: Played) -> Errors:
     t = np.array([one.t_pose for one in kept])
     pose = np.array([one.pose for one in kept], dtype=np.float64).reshape(-1, 3)
     start = played.truth(np.zeros(1))[0]
-    told = np.mean(np.array(played.standing, dtype=np.float64).reshape(-1, 3), axis=0)
+    told = middle_of(np.array(played.standing, dtype=np.float64).reshape(-1, 3))
     site = played.truth(t) if len(t) else np.zeros((0, 3))
     truth = seen_from(start, told, site)
     t_site = math.inf
@@ -120,6 +120,14 @@ def errors_of(played: Played) -> Errors:
     off = pose - truth
     off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     return Errors(t, off, pose, np.array([one.sigma_m for one in kept]), t_site)
+
+
+def middle_of(poses: Array) -> Array:
+    """The median (3,) of poses (n, 3) that lie near each other; a heading of pi is near one of -pi."""
+    first = np.array((0.0, 0.0, poses[0, 2]))
+    turned = poses - first
+    turned[:, 2] = np.remainder(turned[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    return np.asarray(np.median(turned, axis=0) + first)
 
 
 def seen_from(at: Array, pose: Array, truth: Array) -> Array:

@@ -39,6 +39,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
+from daemon.faults import Fault
 from tools.bench.world import orders, room
 from tools.clients.read_modbus import STATES
 from tools.sim.buildings import BUILDINGS
@@ -47,6 +48,7 @@ from tools.sim.scene import Scenario as SceneScenario
 from tools.sim.scene import SimulatedScene
 from tools.sim.scene_light import Lights
 
+CODES: Final = frozenset(map(int, Fault))
 BUILT_IN: Final = Path(__file__).parent / "scenarios"
 KINDS: Final = {
     "error": "never further from the truth than `at_most` m and `sigmas` of the published sigma",
@@ -190,7 +192,18 @@ def _in_time(seconds: float, faults: Sequence[Mapping[str, Any]], expect: Sequen
     for path, t in times:
         if t >= seconds:
             raise ValueError(f"{path}: {t:g} s is not before the end of the drive (drive.seconds = {seconds:g})")
+    for k, table in enumerate(faults, 1):
+        if (until := table.get("when", 0.0) + table.get("for", 0.0)) > seconds:
+            raise ValueError(
+                f"[[fault]] number {k}: it lasts until {until:g} s, beyond the end of the drive (drive.seconds = "
+                f"{seconds:g}); leave `for` away where it is to last until then"
+            )
     for k, one in enumerate(expect):
+        if one.until > seconds or one.from_ + one.within > seconds:
+            raise ValueError(
+                f"expect[{k}]: `until`, and `from` with `within`, end with the drive at the latest "
+                f"(drive.seconds = {seconds:g})"
+            )
         if one.until and one.until <= one.from_:
             raise ValueError(f"expect[{k}].until: {one.until:g} s is not after its `from`, {one.from_:g}")
 
@@ -231,13 +244,19 @@ def _expectation(path: str, table: dict[str, Any], world: WorldPart) -> Expectat
     made = Expectation(**values)
     needed = {"error": made.at_most, "age": made.at_most, "share": made.at_least, "answers": made.at_least}
     needed |= {"state": made.within, "fault": made.within, "clear": made.within, "lamps": made.at_least}
+    for key in numbers:
+        if (value := values.get(f"{key}_" if key == "from" else key, 0.0)) < 0.0:
+            raise ValueError(f"{path}.{key}: {value:g} is negative")
     if needed.get(what, 1.0) <= 0.0:
-        raise ValueError(f"{path}: {KINDS[what]}; the number is missing")
+        raise ValueError(f"{path}: {KINDS[what]}; the number is missing, or 0")
     kind = int if what == "fault" else str
     if what in ("state", "never", "share", "fault") and not made.is_:
         raise ValueError(f"{path}.is: {KINDS[what]}")
     if not all(type(one) is kind and (kind is int or one in STATES) for one in made.is_):
         raise ValueError(f"{path}.is: states are {', '.join(STATES)}; faults are numbers")
+    strange = [one for one in made.is_ if what == "fault" and one not in CODES]
+    if strange:
+        raise ValueError(f"{path}.is: there is no fault {strange[0]}; there are {', '.join(map(str, sorted(CODES)))}")
     if what == "lamps" and not world.lamps:
         raise ValueError(f"{path}: lamps are expected, but [world] has lamps = false")
     return made

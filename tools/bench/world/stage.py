@@ -43,6 +43,8 @@ POLL_S: Final = 0.01
 WAIT_S: Final = 0.05
 STANDING_S: Final = 2.0
 """Poses of so long, read while it stands, say where the map lies."""
+STILL_M, STILL_RAD, FEWEST = 0.05, 0.05, 3
+"""They differ by less, and are as many at least: else it is still looking for its place."""
 PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
 LOOKING: Final = ("RELOCATING", "AMBIGUOUS")
 HEARD_A: Final = 1e-9
@@ -275,21 +277,35 @@ async def _roll(scene: SimulatedScene, where: str, stack: AsyncExitStack) -> Non
 async def _settled(
     scenario: Scenario, ends: Ends, ears: Ears, ports: list[Port], say: Callable[[str], None]
 ) -> list[Pose]:
-    """Wait until the standing robot has a place, and hear for a while where it says that is."""
+    """Wait until the standing robot has a place, and says for a while that it is there."""
     host, port = ends.modbus
     say(f"{scenario.title}: waiting for a pose from {host} port {port}")
-    begun, since = time.monotonic(), math.inf
-    while time.monotonic() - max(since, begun) < STANDING_S or since == math.inf:
+    begun = time.monotonic()
+    while (poses := standing(ears.reads, begun)) is None:
         _all_there(ports)
-        last = ears.reads[-1] if ears.reads else Read(0.0, answered=False)
-        if last.pose is None or last.state not in PLACED:
-            since = math.inf
-        elif since == math.inf:
-            since = time.monotonic()
-        if since == math.inf and time.monotonic() - begun > scenario.drive.settle:
+        if time.monotonic() - begun > scenario.drive.settle + STANDING_S:
+            last = ears.reads[-1] if ears.reads else Read(0.0, answered=False)
             raise CannotPlay(why_no_pose(last, ends, scenario.drive.settle))
         await asyncio.sleep(WAIT_S)
-    return [one.pose for one in ears.reads if one.t >= since and one.pose is not None]
+    return poses
+
+
+def standing(reads: list[Read], begun: float) -> list[Pose] | None:
+    """Poses of the latest `STANDING_S`, where the robot has said all that time that it is in one place; else None.
+
+    What stood in the registers when the line was opened, ``begun``, is of a drive before, which ended elsewhere.
+    """
+    latest = reads[-1].t if reads else begun
+    heard = [one for one in reads if one.t >= max(begun, latest - STANDING_S)]
+    if latest - begun < STANDING_S or not all(one.state in PLACED and one.t_pose > begun for one in heard):
+        return None
+    poses = [one.pose for one in heard if one.fresh and one.pose is not None]
+    if len(poses) < FEWEST:
+        return None
+    x, y, yaw = np.array(poses).T
+    turned = np.remainder(yaw - yaw[0] + np.pi, 2.0 * np.pi) - np.pi
+    still = max(np.ptp(x), np.ptp(y)) < STILL_M and np.ptp(turned) < STILL_RAD
+    return poses if still else None
 
 
 def why_no_pose(last: Read, ends: Ends, settle: float) -> str:
@@ -305,6 +321,11 @@ def why_no_pose(last: Read, ends: Ends, settle: float) -> str:
             f"no pose within {settle:g} s: state {last.state}: it looks for its place. Has it started with a map, of "
             'another drive or another building? Stop it, give it [map] folder = "none" (--write-config writes that), '
             "and start it again. Under lamps: does their light arrive?"
+        )
+    if last.pose is not None and last.state in PLACED:
+        return (
+            f"no pose that stays within {settle:g} s: state {last.state}, fault {last.fault}; it "
+            "stands, and its pose must be new, and move by less than 5 cm and 3 deg for 2 s"
         )
     return (
         f"no pose within {settle:g} s: state {last.state}, fault {last.fault}; does its lidar.device name the line "
