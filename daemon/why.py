@@ -12,7 +12,7 @@ import re
 import sys
 import time
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -205,11 +205,12 @@ def meant(words: str, span: Span) -> list[float]:
         number = float(text)
         return [number if number > UNIX_S else span.begin + number]
     try:
-        if re.fullmatch(r"\d{1,2}:\d\d(:\d\d(\.\d+)?)?Z?", text):
-            zone = UTC if text.endswith("Z") else None
+        if told := re.fullmatch(r"(\d{1,2}:\d\d(?::\d\d(?:\.\d+)?)?)(Z|[+-]\d\d:?\d\d)?", text):
+            of_day, offset = told.groups()
+            zone = None if offset is None else datetime.strptime(offset, "%z").tzinfo
             first = datetime.fromtimestamp(span.begin, zone).astimezone(zone)
             days = int((span.end - span.begin) / 86400.0) + 2
-            at = _time_of(text.removesuffix("Z"))
+            at = _time_of(of_day)
             midnight = first.replace(hour=0, minute=0, second=0, microsecond=0)
             return [(midnight + timedelta(days=day) + at).timestamp() for day in range(days)]
         return [datetime.fromisoformat(text).astimezone().timestamp()]  # without a zone: local time
