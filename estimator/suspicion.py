@@ -7,7 +7,7 @@ is suspected where physics says that something else than driving has happened:
 * the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
   seen afterwards is not what was seen before;
 * what is seen changes from one scan to the next, all at once (`leap`);
-* the wheels stand, and for a while much of what is seen speaks against the place (`strange`).
+* the wheels stand, and for a while much of what is seen speaks against the place (`was_strange`).
 
 One look in the whole map then decides: if another place fits nearly as well the robot is adrift, and after a leap also
 if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the local

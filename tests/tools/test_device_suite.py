@@ -11,14 +11,16 @@ from tests.hil import conftest
 from tests.hil.test_ends import suite
 
 
-def test_where_nothing_is_captured_that_kernels_are_compiled_is_said_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("capture", [(), ("-p", "no:capture")])
+def test_that_kernels_are_compiled_is_said_also_where_nothing_is_captured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture: tuple[str, ...]
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    code, said, _ = suite(tmp_path, "-p", "no:capture", "-k", "probe_finds_it")
+    code, said, _ = suite(tmp_path, *capture, "-k", "probe_finds_it")
     assert code == 0, said
-    assert "the kernels of this tree are compiled first, once" in said
+    assert "the kernels of this tree are compiled first, once: that takes a minute or two" in said
+    assert list(tmp_path.glob("cache/*/warm-*"))
 
 
 def test_whatever_opens_a_device_is_known_as_of_it() -> None:
