@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections.abc import Callable
@@ -92,7 +93,7 @@ class Playing:
         self.broken_off = broken_off
         self.machine = self
         self.life = (0, 0)
-        self.worked = 0.0
+        self.worked, self.slower = 0.0, 1.0
 
     def __enter__(self) -> Playing:
         return self
@@ -157,6 +158,42 @@ def test_a_computer_that_dies_leaves_a_report_of_what_was_and_what_was_not_run(
     assert "not run: the emulated computer had ended" in said
     assert "spelt wrongly" in said
     assert (tmp_path / "journal-2.log").read_text() == "the journal"
+
+
+@pytest.mark.parametrize(("slower", "at_once"), [(1.0, 3), (2.5, 2)])
+def test_a_slow_emulation_runs_two_computers_at_a_time(
+    slower: float, at_once: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running, most, lock = 0, 0, threading.Lock()
+    met = threading.Barrier(at_once)
+
+    def meets(bench: bench.Bench) -> str:
+        """It is there when the others are; the last of three alone is not waited for."""
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        with contextlib.suppress(threading.BrokenBarrierError):
+            met.wait(1.0)
+        bench.machine.broken_off.wait(0.2)
+        with lock:
+            running -= 1
+        return "seen"
+
+    def made(booted: Booted, folder: Path, broken_off: threading.Event, nice: int) -> Playing:
+        playing = Playing(broken_off)
+        playing.slower = slower
+        return playing
+
+    monkeypatch.setattr(guests, "bench", made)
+    monkeypatch.setattr(guests, "LOOK_S", 0.01)
+    (tmp_path / "work").mkdir()
+    said: list[str] = []
+    three = [Guest(k, [like(passes), like(meets)]) for k in (1, 2, 3)]
+    assert run_all(three, kept(tmp_path), tmp_path / "work", tmp_path, said.append)
+    assert all(one.passed for guest in three for one in guest.results)
+    assert most == at_once
+    assert any("2.5 times slower than usual: 2 computers at a time" in line for line in said) == (slower > 1.4)
 
 
 def test_what_the_emulation_has_worked_is_told_with_each_scenario(

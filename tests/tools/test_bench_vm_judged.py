@@ -76,6 +76,34 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
             less.setattr(trying_system, name, 0.011)
             with pytest.raises(Order, match="late by: 12"):
                 trying_system.agrees_with_outside(driven(5.0))
+
+
+def test_a_drive_whose_end_was_left_undone_agrees_until_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = np.arange(0.0, 20.0, 0.05)
+    monkeypatch.setattr(trying_system, "outside", lambda: Trace(way, np.zeros((len(way), 2))))
+
+    def astray(metres: float, since: int, undone: int) -> Bench:
+        """Led 5 cm astray from a pose on; cycles are over their budget from another on."""
+        bench = driven(metres)
+        for k, one in enumerate(bench.memory["drive"]):
+            off = 0.05 if k >= since else 0.0
+            said = replace(one, pose=(0.1 * k, off, 0.0), overruns=int(k >= undone))
+            bench.memory["drive"][k] = said
+        return bench
+
+    seen = trying_system.agrees_with_outside(astray(9.0, since=60, undone=60))
+    assert isinstance(seen, Seen)
+    assert seen.said.startswith("60 poses, until work was left undone (meanwhile 0 scans missed, 1 cycles")
+    assert round(seen.figures[1].value, 1) == 5.9
+    for since, undone in ((60, 10_000), (60, 70), (20, 20)):  # nothing was; too late to be why; too little is left
+        with pytest.raises(Order, match=r"apart, largest: 50|way compared: 1\."):
+            trying_system.agrees_with_outside(astray(9.0, since, undone))
+    whole = trying_system.agrees_with_outside(astray(9.0, since=10_000, undone=3))
+    assert isinstance(whole, Seen)
+    assert round(whole.figures[1].value) == 9  # what changed nothing cuts nothing short
+
+
+def test_a_place_that_nobody_claims_is_compared_with_nothing() -> None:
     nowhere = driven(5.0)
     nowhere.memory["drive"] = [Heard(0.2, 0.2, 1, None, 0.0)] * 20
     with pytest.raises(Order, match="no pose of the drive claims a place"):

@@ -116,6 +116,9 @@ def inverse_then(frame: Pose, pose: Pose) -> Pose:
 class Bench:
     """The whole of it. Made by :func:`bench`."""
 
+    slower = 1.0
+    """So many times as long as on the machine of the page's figures its emulated processor takes for the same work."""
+
     def __init__(self, machine: Machine, world: subprocess.Popen[str], folder: Path, there: dict[str, Any]) -> None:
         self.machine, self.world, self.folder, self.there = machine, world, folder, there
         self.booted_s = 0.0
@@ -186,8 +189,10 @@ class Bench:
         """Wait until it happens; returns how long it took. Raises `Order` with the daemon's log.
 
         While the emulated processor waits for one of this computer's, its time does not run: ``seconds`` are those in
-        which it could have done something. ``every``: between two looks, which cost it something where it is asked.
+        which it could have done something, more of them where it is slower than usual. ``every``: between two looks,
+        which cost it something where it is asked.
         """
+        seconds *= max(1.0, self.slower)
         begun, waited = time.monotonic(), self.machine.waited_s()
         while not happens():
             took = time.monotonic() - begun

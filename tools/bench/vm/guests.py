@@ -22,6 +22,11 @@ from tools.bench.vm.places import BrokenOff, CannotBench
 JOURNAL: Final = ("journalctl", "--no-pager", "-o", "short-monotonic", "-n", "3000")
 BEHIND: Final = {2: 5, 3: 5}
 """Which computer stands back (nice(1)): the first one's drive is compared with one outside, to a centimetre."""
+SIDE_BY_SIDE: Final = 2
+"""So many computers of three, where the emulation is slow: a third one would starve them of their two processors."""
+SLOW: Final = 1.4
+"""From so many times the usual seconds for the same work."""
+LOOK_S: Final = 0.1
 Say = Callable[[str], None]
 
 
@@ -70,11 +75,15 @@ def _lost(scenario: Scenario, bench: Bench) -> str:
 
 @dataclass(slots=True)
 class Guest:
-    """One emulated computer, its share, and what has come of it so far."""
+    """One emulated computer, its share, and what has come of it so far.
+
+    ``slower``: than usual by so many times, known once it is up.
+    """
 
     number: int
     share: list[Scenario]
     results: list[Result] = field(default_factory=list)
+    slower: float | None = None
     broken_off: threading.Event = field(default_factory=threading.Event)
 
     def run(self, booted: Booted, folder: Path, out: Path, say: Say) -> None:
@@ -92,6 +101,7 @@ class Guest:
                         one = replace(one, figures=(*one.figures, worked))
                     self.results.append(one)
                     self._tell(self.results[-1], say)
+                    self.slower = whole.slower
                 with contextlib.suppress(Order, OSError):
                     (out / f"journal-{self.number}.log").write_text(whole.machine.run(*JOURNAL, seconds=120))
         except BrokenOff:
@@ -118,7 +128,11 @@ class Guest:
 
 
 def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: Say) -> bool:
-    """Run them side by side; what they show is in them. False: somebody has broken it off (SIGINT, SIGTERM)."""
+    """Run them side by side; what they show is in them. False: somebody has broken it off (SIGINT, SIGTERM).
+
+    Where the emulation is found to be slow, no more than `SIDE_BY_SIDE` run at once: what a computer leaves undone for
+    want of its processor would be told of the daemon in it.
+    """
     broken_off = threading.Event()
 
     def break_off(number: int, frame: object) -> None:
@@ -132,14 +146,27 @@ def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: S
     for number in before:
         signal.signal(number, break_off)
     try:
-        threads = [
-            threading.Thread(target=one.run, args=(booted, folder / str(one.number), out, say)) for one in guests
-        ]
-        for thread in threads:
-            thread.start()
+        threads: list[threading.Thread] = []
+        for one in guests:
+            _wait_for_room(guests, threads, say)
+            threads.append(threading.Thread(target=one.run, args=(booted, folder / str(one.number), out, say)))
+            threads[-1].start()
         for thread in threads:
             thread.join()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     return not broken_off.is_set()
+
+
+def _wait_for_room(guests: list[Guest], threads: list[threading.Thread], say: Say) -> None:
+    """Until one more may run: fewer than `SIDE_BY_SIDE` do, or those that run are found to be fast enough."""
+    told = False
+    while sum(thread.is_alive() for thread in threads) >= SIDE_BY_SIDE:
+        known = [guest.slower for guest in guests if guest.slower is not None]
+        if known and max(known) <= SLOW:
+            return
+        if known and not told:
+            say(f"the emulation is {max(known):.1f} times slower than usual: {SIDE_BY_SIDE} computers at a time")
+            told = True
+        time.sleep(LOOK_S)
