@@ -110,7 +110,10 @@ def _run(parser: argparse.ArgumentParser) -> None:
 
 
 def _minutes(text: str) -> float:
-    minutes = float(text)
+    try:
+        minutes = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of minutes: name 1 to {LONGEST_RING:.0f}") from None
     if not 1.0 <= minutes <= LONGEST_RING:
         raise argparse.ArgumentTypeError(f"{text} minutes: name 1 to {LONGEST_RING:.0f}")
     return minutes

@@ -176,7 +176,11 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "read the log, which names it: is the port, or the stream's socket, taken by another program or daemon? can "
         "all of `pose.receivers` be reached (the network's cable, a name)?",
     ),
-    Fault.RECORDER_FAILED: ("the recording cannot be written", "free disk space, or name another directory"),
+    Fault.RECORDER_FAILED: (
+        "the recording cannot be written",
+        "free disk space, let the daemon write there (owner, mode, a disk that is mounted read-only), or name another "
+        "directory; the log says which",
+    ),
     Fault.MAP_NOT_SAVED: (
         "the map cannot be saved; what was saved before stays",
         "read the log; free disk space, end another daemon that keeps its maps there, or name another `map.folder`",

@@ -78,8 +78,8 @@ class Comparison:
     """What a recording says that was published, against its replay.
 
     Attributes:
-        cycles: compared. differ: whose pose, state, reason or inputs are not the same to the last bit. first: says how
-            the first did.
+        cycles: that were recorded. differ: whose pose, state, reason or inputs are not the same to the last bit, or
+            which cannot be run again. first: says how the first did.
         judged: those of which state and reason were compared; of older recordings none.
         faults: by number, in how many of those it was published. Not compared: a replay has no devices.
     """
@@ -257,6 +257,7 @@ class Rerun:
         try:
             record = self._run()
         except LookupError as error:
+            self.comparison.cycles += 1
             self.comparison.note(entry.cycle, str(error))
         else:
             self._compare(entry, record)

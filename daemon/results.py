@@ -71,8 +71,13 @@ class Folder:
             raise OutputRefused(f"{path} is a file; name a folder for the results") from error
         except OSError as error:
             raise OutputRefused(f"cannot make {path}: {error.strerror}; name a folder that you may write") from error
-        self.write(_PROBE, b"may be written")
-        (path / _PROBE).unlink()
+        try:
+            (path / _PROBE).write_bytes(b"may be written")
+            (path / _PROBE).unlink()
+        except OSError as error:
+            raise OutputRefused(
+                f"cannot write to {path}: {error.strerror}; free space or name another folder"
+            ) from error
 
     def demand(self, name: str) -> None:
         """Try whether a file of that name could be put in place; what is there stays.

@@ -23,10 +23,9 @@ def checked(entry: Entry, root: Path | None) -> golden.Verdict:
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
     try:
-        blessed = golden.load(entry.name)
+        return golden.compared(entry.name, ledger.final(), [loop for _, loop in ledger.loops], entry.every)
     except golden.Damaged as error:
         return golden.Verdict(False, str(error))
-    return golden.judged(blessed, ledger.final(), [loop for _, loop in ledger.loops], entry.every)
 
 
 def main(arguments: list[str] | None = None) -> int:

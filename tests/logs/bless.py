@@ -1,6 +1,8 @@
 """``python -m tests.logs.bless --reason TEXT [NAME ...]``: make today's trajectories the golden ones.
 
 Prints by how much each differs from the one before. Commit the files together with the change that moved them.
+``--here`` instead of a reason keeps them as this machine's own reference (``out/golden``), for a change to be held
+against to the micrometre on a machine that the committed ones are not of.
 """
 
 from __future__ import annotations
@@ -19,21 +21,22 @@ from tests.logs.catalog import BY_NAME, ENTRIES, Entry, OtherLog, ledger_of, ori
 NO_DATA = "LUMILOOP_DATA does not name the folder of real logs"
 
 
-def bless(entry: Entry, root: Path | None, reason: str) -> str:
-    """Write one golden file; returns what changed, for people."""
+def bless(entry: Entry, root: Path | None, reason: str, into: Path | None = None) -> str:
+    """Write one golden file, or this machine's own ``into`` a folder; returns what changed, for people."""
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
     trajectory, loops = ledger.final(), [loop for _, loop in ledger.loops]
-    before = golden.FOLDER / f"{entry.name}.txt"
+    before = (into or golden.FOLDER) / f"{entry.name}.txt"
     moved = "new"
     if before.exists():
         try:
-            moved = _moved(golden.load(entry.name), entry, trajectory, loops)
+            moved = _moved(golden.load(entry.name, into), entry, trajectory, loops)
         except golden.Damaged as error:
             moved = f"new, what was there is damaged: {error}"
         if not moved:
             return f"{entry.name}: unchanged"
-    golden.save(entry.name, trajectory, entry.every, golden.facts_of(trajectory, loops, origin(entry), reason))
+    facts = golden.facts_of(trajectory, loops, origin(entry), reason)
+    golden.save(entry.name, trajectory, entry.every, facts, into)
     return f"{entry.name}: {moved}"
 
 
@@ -49,10 +52,16 @@ def _moved(old: golden.Golden, entry: Entry, trajectory: Trajectory, loops: list
 def main() -> int:
     """The command; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.logs.bless", description=__doc__.split("\n")[0])
-    parser.add_argument("--reason", required=True, help="why the trajectories have changed; kept in the files")
+    why = parser.add_mutually_exclusive_group(required=True)
+    why.add_argument("--reason", help="why the trajectories have changed; kept in the files")
+    why.add_argument(
+        "--here", action="store_true", help="keep them as this machine's own reference, not to be committed"
+    )
     parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
     args = parser.parse_args()
-    if len(args.reason.strip()) <= 10:
+    folder = golden.HERE if args.here else None
+    reason = "reference of this machine" if args.here else args.reason
+    if len(reason.strip()) <= 10:
         parser.error(f"--reason {args.reason!r} says nothing to whoever reads the file in a year: 11 letters at least")
     unknown = sorted(set(args.name) - set(BY_NAME))
     if unknown:
@@ -66,7 +75,7 @@ def main() -> int:
             sys.stdout.write(f"{entry.name}: left as it is, {NO_DATA}\n")
             continue
         try:
-            sys.stdout.write(bless(entry, Path(data) if data else None, args.reason) + "\n")
+            sys.stdout.write(bless(entry, Path(data) if data else None, reason, folder) + "\n")
         except OtherLog as error:
             sys.stdout.write(f"{entry.name}: left as it is, {error}\n")
             left.append(entry.name)

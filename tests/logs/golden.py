@@ -2,7 +2,8 @@
 
 A change of the estimator changes them; the change is then looked at, and blessed in the same commit with its reason.
 The file holds one pose in many and a digest of all. Kernels compiled for another processor round differently, so the
-tight tolerance counts only where versions and processor are those of the blessing.
+tight tolerance counts only where versions and processor are those of the blessing. On another machine the tight one
+counts against a reference of its own, where one was made (``bless --here``); it is not committed.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from estimator.result import Loop
 Array = npt.NDArray[np.float64]
 
 FOLDER: Final = Path(__file__).parent / "golden"
+HERE: Final = Path(__file__).parents[2] / "out" / "golden"
+"""References of this machine."""
 TIGHT_M: Final = 1e-6
 REMEDY: Final = "python -m tests.logs.bless --reason TEXT"
 LOOSE_M: Final = 1e-3
@@ -93,6 +96,22 @@ def judged(blessed: Golden, trajectory: Trajectory, loops: Sequence[Loop], every
     return Verdict(not wrong, said)
 
 
+def compared(name: str, trajectory: Trajectory, loops: Sequence[Loop], every: int) -> Verdict:
+    """With the committed file; where that is of another machine also with this one's reference, if there is one.
+
+    Raises:
+        Damaged: one of the files is none.
+    """
+    blessed = load(name)
+    verdict = judged(blessed, trajectory, loops, every)
+    if blessed.facts["environment"] == environment():
+        return verdict
+    if not (HERE / f"{name}.txt").exists() or (own := load(name, HERE)).facts["environment"] != environment():
+        return Verdict(verdict.same, f"{verdict.said} (to 1 mm only; bless --here keeps a reference of this one)")
+    here = judged(own, trajectory, loops, every)
+    return Verdict(verdict.same and here.same, f"{verdict.said}; by this machine's own reference, {here.said}")
+
+
 def digest(trajectory: Trajectory) -> str:
     """Of the whole trajectory as it is written, so to 1e-6 m."""
     return hashlib.sha256(tum(trajectory)).hexdigest()
@@ -104,13 +123,14 @@ def thinned(trajectory: Trajectory, every: int) -> tuple[Array, Array]:
     return trajectory.stamps[chosen], trajectory.poses[chosen]
 
 
-def save(name: str, trajectory: Trajectory, every: int, facts: dict[str, str]) -> Path:
-    """Write a golden file."""
+def save(name: str, trajectory: Trajectory, every: int, facts: dict[str, str], folder: Path | None = None) -> Path:
+    """Write a golden file; ``folder``: other than the committed ones'."""
     stamps, poses = thinned(trajectory, every)
     lines = [f"# {key}: {value}" for key, value in facts.items()]
     lines += [f"{t:.6f} {x:.6f} {y:.6f} {yaw:.6f}" for t, (x, y, yaw) in zip(stamps, poses.tolist(), strict=True)]
-    FOLDER.mkdir(exist_ok=True)
-    path = FOLDER / f"{name}.txt"
+    folder = folder or FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.txt"
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -122,13 +142,13 @@ class Damaged(Exception):
 FACTS: Final = ("environment", "poses", "loops", "digest", "reason")
 
 
-def load(name: str) -> Golden:
-    """Read a golden file.
+def load(name: str, folder: Path | None = None) -> Golden:
+    """Read a golden file; ``folder``: other than the committed ones'.
 
     Raises:
         Damaged: it is none.
     """
-    path = FOLDER / f"{name}.txt"
+    path = (folder or FOLDER) / f"{name}.txt"
     facts = {}
     for line in path.read_text().splitlines():
         if line.startswith("# "):

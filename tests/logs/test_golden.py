@@ -26,7 +26,7 @@ def cases() -> list[object]:
 def test_the_trajectory_is_the_blessed_one(entry: Entry, outcome_of: Replayed) -> None:
     ledger = ledger_of(outcome_of(entry.name))
     loops = [loop for _, loop in ledger.loops]
-    verdict = golden.judged(golden.load(entry.name), ledger.final(), loops, entry.every)
+    verdict = golden.compared(entry.name, ledger.final(), loops, entry.every)
     assert verdict.same, f"{entry.name}: {verdict.said}; look at the change; if it is meant: {golden.REMEDY}"
 
 
@@ -58,13 +58,13 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
     for where, off_m in ((golden.environment(), 1e-5), ("another processor", 1.1e-3)):  # wherever this runs
         facts = {**blessed.facts, "environment": where}
         moved = replace(blessed, facts=facts, poses=blessed.poses + np.array((off_m, 0.0, 0.0)))
-        monkeypatch.setattr(golden, "load", lambda name, moved=moved: moved)
+        monkeypatch.setattr(golden, "load", lambda name, folder=None, moved=moved: moved)
         assert main(["room"]) == 1
         told = capsys.readouterr().out
         assert "MOVED" in told
         assert f"first at stamp {blessed.stamps[0]:.6f} by {off_m:.6f} m" in told
     near = replace(moved, poses=blessed.poses + np.array((0.9e-3, 0.0, 0.0)))
-    monkeypatch.setattr(golden, "load", lambda name: near)
+    monkeypatch.setattr(golden, "load", lambda name, folder=None: near)
     assert main(["room"]) == 0
     assert "another processor, or other versions: 0.0009" in capsys.readouterr().out
 
@@ -91,6 +91,35 @@ def test_a_golden_file_that_somebody_has_edited_is_told_and_can_be_blessed(
     assert blessed in bless.bless(entry, None, "it had been edited")
     assert command.checked(entry, None).same
     assert "unchanged" in bless.bless(entry, None, "it had been edited")
+
+
+def test_another_machine_keeps_a_reference_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(golden, "HERE", tmp_path / "out" / "golden")
+    committed = golden.FOLDER / "room.txt"
+    before = committed.read_bytes()
+    monkeypatch.setattr(golden, "environment", lambda: "this machine")
+    assert main(["room"]) == 0
+    assert "to 1 mm only; bless --here keeps a reference" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["bless", "--here", "room"])
+    assert bless.main() == 0
+    assert "room: new" in capsys.readouterr().out
+    assert committed.read_bytes() == before
+    assert main(["room"]) == 0
+    assert "by this machine's own reference, same machine: 0.00000" in capsys.readouterr().out
+    own = tmp_path / "out" / "golden" / "room.txt"
+    text = own.read_text()
+    own.write_text(text.replace("# digest: ", "# digest: 0"))
+    assert main(["room"]) == 1, "a micrometre between two kept poses"
+    assert "poses between those that are kept differ" in capsys.readouterr().out
+    monkeypatch.setattr(golden, "environment", lambda: "a third machine")
+    assert main(["room"]) == 0
+    assert "to 1 mm only" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["bless", "--here", "--reason", "a machine needs no reason", "room"])
+    with pytest.raises(SystemExit):
+        bless.main()
+    assert "--here" in capsys.readouterr().err
 
 
 def test_real_logs_that_are_left_out_are_said_and_fail_where_all_are_demanded(

@@ -55,7 +55,7 @@ def say(text: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m tools.bench.world", description=__doc__.split("\n")[0])
     add = made.add_argument
-    add("scenario", nargs="*", help="files, or names of those that come with the bench")
+    add("scenario", nargs="*", help="files, or names of those that come with the bench (default: lap)")
     add("--list", action="store_true", help="say which come with it")
     add(
         "--lidar", default="", help="line that the lidar is to come out of: /dev/ttyGS0, /dev/ttyUSB0@115200, tcp://..."
@@ -176,7 +176,11 @@ def configured(options: argparse.Namespace, scenarios: list[Scenario]) -> int:
         raise CannotPlay(
             f"--write-config takes one scenario, and {len(scenarios)} are named ({names}): name one of them"
         )
-    files = write_config(options.write_config, scenarios[0], ends_of(options))
+    try:
+        files = write_config(options.write_config, scenarios[0], ends_of(options))
+    except OSError as error:
+        where = f"--write-config {options.write_config}"
+        raise CannotPlay(f"{where}: {error.strerror}: name a folder that can be made and written") from error
     for file in files:
         say(f"written: {file}")
     say("Look through it, copy all of it to the robot computer's /etc/lumiloop, and there: systemctl restart lumiloop")
