@@ -14,6 +14,9 @@ RUN    := $(BIN)/python -W default
 
 .DEFAULT_GOAL := help
 
+# Asserts rewritten by pytest are kept as bytecode, or each of five suites rewrites 400 files anew: 20 s each.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Suites share the processors, and what is judged against the wall clock wants them alone: no two at once, -j or not.
 .NOTPARALLEL:
 
@@ -59,10 +62,12 @@ test: check  ## everything quick (no root, <= 12 minutes)
 
 # What is judged against the wall clock has the machine to itself. ARGS may choose none of one half (5).
 ORDERLY := system and not slow
+# Only files with such tests are read, unless ARGS names others.
+ONLY_IN = $(if $(findstring tests/,$(ARGS)),,$$(grep -rlE 'mark\.(system|realtime)|"(system|realtime)"' tests --include='test_*.py' | sort))
 NONE = $(if $(ARGS),|| [ $$? = 5 ])
 test-system: venv  ## real processes, real ttys, real time, fault and fuzz samples (root, <= 20 minutes)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$(ORDERLY) and not realtime" $(ARGS) $(NONE)
-	$(BIN)/python -m pytest -q -m "$(ORDERLY) and realtime" $(ARGS) $(NONE)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$(ORDERLY) and not realtime" $(ONLY_IN) $(ARGS) $(NONE)
+	$(BIN)/python -m pytest -q -m "$(ORDERLY) and realtime" $(ONLY_IN) $(ARGS) $(NONE)
 
 LONG = $(BIN)/python -m pytest -q --durations=15
 test-all: test test-system  ## all of it, the long ones included (root, about three quarters of an hour)

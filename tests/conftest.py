@@ -22,7 +22,13 @@ UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")
 as long, and reach hardly one that the other tests do not (`tools.floors` tells). The estimator's are traced in the row
 without the compiler."""
 
-FIRST = ("tools/test_soak.py", "faults/test_matrix.py", "systemd/test_container.py")
+FIRST = (
+    "tools/test_soak.py",
+    "faults/test_matrix.py",
+    "systemd/test_container.py",
+    "tools/experiments/test_integrity.py",
+    "logs/test_figures.py",
+)
 """Files that take minutes, longest first: where files are shared out to the cores none of them is begun last."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -15,3 +16,21 @@ def test_no_two_targets_run_at_once(tmp_path: Path) -> None:
     command = ["make", "-s", "-j4", "-f", str(path), "one", "two"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["begin one", "end one", "begin two", "end two"]
+
+
+def test_the_orderly_suites_read_every_file_with_such_tests() -> None:
+    """`make test-system` reads the files that its ``grep`` finds; a mark that is given elsewhere would go unseen."""
+    said = subprocess.run(["make", "-n", "test-system"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    (found,) = set(re.findall(r"\$\((grep .* \| sort)\)", said))
+    read = set(subprocess.run(["sh", "-c", found], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split())
+    marked = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "tests").rglob("*.py")
+        if re.search(r"mark\.(system|realtime)\b", path.read_text())
+    }
+    assert "tests/systemd/test_container.py" in read
+    assert marked <= read
+    named = subprocess.run(
+        ["make", "-n", "test-system", "ARGS=tests/hil -x"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    assert "grep" not in named

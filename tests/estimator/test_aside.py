@@ -154,7 +154,8 @@ def test_until_that_is_decided_the_stored_map_is_what_there_is_to_be_saved() -> 
     assert len(image.frames) == len(list(drive.image.keyframes()))
 
 
-@pytest.mark.parametrize("localise", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("localise", [False, True])
 def test_half_of_the_building_is_found_on_the_way_and_laid_to_where_it_belongs(localise: bool) -> None:
     """The pose does not jump for that; what is only used is not let go of by being found."""
     drive = Drive(made(HOUSE, 60.0, 40.0), 20.0, settings=Settings(localise=localise))
@@ -179,6 +180,7 @@ def test_half_of_the_building_is_found_on_the_way_and_laid_to_where_it_belongs(l
     assert set(drive.state.keyframes) <= {key for keys in drive.state.places.values() for key in keys}
 
 
+@pytest.mark.slow
 def test_a_map_of_another_building_is_let_go_of_when_as_much_was_driven_as_it_is_of() -> None:
     drive = Drive(made(OTHER, 0.0, 15.0), 60.0)
     drive.on(9.0)
@@ -249,7 +251,7 @@ def test_a_kept_state_holds_what_was_put_aside() -> None:
     assert all(frame.submap.key in stored.submaps for frame in stored.frames.values())
 
 
-@pytest.mark.parametrize(("begin", "soon_s"), [(30.0, 7.0), (100.0, 15.0)])
+@pytest.mark.parametrize(("begin", "soon_s"), [pytest.param(30.0, 7.0, marks=pytest.mark.slow), (100.0, 15.0)])
 def test_lamps_that_were_moved_and_surveyed_anew_cost_neither_the_map_nor_the_place(
     begin: float, soon_s: float
 ) -> None:

@@ -104,6 +104,7 @@ def test_a_hidden_lamp_leads_no_robot_astray_that_stands_after_its_start() -> No
     assert error < 3.0 * math.sqrt(result.covariance[0, 0] + result.covariance[1, 1])
 
 
+@pytest.mark.slow
 def test_exchanged_lamps_lead_no_robot_astray_that_stands_after_its_start() -> None:
     """What does not fit says the same in every epoch: it must not pull at the place as often."""
     rng, deviations = np.random.default_rng(0), []

@@ -145,6 +145,7 @@ def test_a_lamp_known_by_its_own_word_only_is_not_missed() -> None:
     assert LinkState.MISSING not in {link.state for result in results for link in result.links}
 
 
+@pytest.mark.slow
 def test_lamps_known_by_their_own_word_only_are_forgotten_when_long_unheard() -> None:
     filter_ = lf.new_lights(SURVEY)
     room = Room()

@@ -104,6 +104,7 @@ def test_a_row_for_a_moment_leaves_nothing() -> None:
 
 
 @pytest.mark.jit
+@pytest.mark.slow
 def test_a_lamp_that_hangs_elsewhere_does_not_lead_a_robot_away_whose_place_the_laser_holds() -> None:
     """Light that began anew below one of two such lamps had taken the pose 2 m and 17 deg along (RMSE)."""
     case = next(case for case in ISLANDS if case.name.startswith("two moved"))

@@ -1,4 +1,7 @@
-"""Figures that the replay of real logs has to reach, on the trajectory at the end and on what was published live."""
+"""Every log gives the trajectory that was blessed, and real ones reach their figures, at the end and published live.
+
+In one file, which one process runs: each log is replayed once for all that looks at it.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,22 @@ import pytest
 
 from hal.odometry import RawOdometry
 from hal.replay.carmen import read_carmen
-from tests.logs.catalog import ledger_of
+from tests.logs import golden
+from tests.logs.catalog import ENTRIES, Entry, ledger_of
 from tests.logs.conftest import Replayed
 from tools.relations import evaluate, read_relations
+
+
+def cases() -> list[object]:
+    return [pytest.param(entry, id=entry.name, marks=[pytest.mark.slow] if entry.heavy else []) for entry in ENTRIES]
+
+
+@pytest.mark.parametrize("entry", cases())
+def test_the_trajectory_is_the_blessed_one(entry: Entry, outcome_of: Replayed) -> None:
+    ledger = ledger_of(outcome_of(entry.name))
+    loops = [loop for _, loop in ledger.loops]
+    verdict = golden.compared(entry.name, ledger.final(), loops, entry.every)
+    assert verdict.same, f"{entry.name}: {verdict.said}; look at the change; if it is meant: {golden.REMEDY}"
 
 
 def test_intel_against_relations_found_by_hand(outcome_of: Replayed, log_root: Path) -> None:

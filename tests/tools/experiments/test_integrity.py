@@ -100,7 +100,8 @@ def test_every_kind_can_be_drawn_and_repeats(kind: str) -> None:
     ("kind", "seed", "until"),
     [
         ("kidnap_lit", 18, 29.0),  # carried off in no time to where an office looks alike
-        ("kidnap_lit", 46, 36.0),  # the same; for the lamps in use were one row, light took long to say so itself
+        # the same; for the lamps in use were one row, light took long to say so itself
+        pytest.param("kidnap_lit", 46, 36.0, marks=pytest.mark.slow),
         ("false_lights", 59, 17.0),  # two codes exchanged from the start: the heading came 7 deg off, light found it
     ],
 )
