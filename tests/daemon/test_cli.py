@@ -128,3 +128,14 @@ def test_an_interrupt_that_is_ignored_stays_ignored() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0
     assert "[modbus]" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "says"), [("ten", "'ten' is no number of minutes"), ("0", "0 minutes"), ("1441", "1441")]
+)
+def test_a_ring_that_is_none_is_said_with_what_may_be(text: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["run", "--record", "x", "--last", text])
+    said = capsys.readouterr().err
+    assert f"{says}" in said
+    assert "name 1 to 1440" in said

@@ -103,6 +103,10 @@ def test_the_robot_computers_files_are_written(tmp_path: Path, capsys: pytest.Ca
         words = ["lap", *ends, *odd, "--write-config", str(tmp_path / "odd")]
         assert main(words) == 2
         assert not (tmp_path / "odd").exists(), "nothing is written where something is wrong"
+    (tmp_path / "file").touch()
+    capsys.readouterr()
+    assert main(["lap", *ends, "--write-config", str(tmp_path / "file" / "robot")]) == 2
+    assert f"--write-config {tmp_path}/file/robot: Not a directory: name a folder that" in capsys.readouterr().out
     assert main(["lap", "cable", *ends, "--write-config", str(tmp_path / "two")]) == 2
     assert "takes one scenario, and 2 are named" in capsys.readouterr().out
 

@@ -85,3 +85,8 @@ def test_a_switch_under_lamps_is_in_the_dump_and_is_repeated(tmp_path: Path, mon
     assert not (dump / "000000.lumirec").exists(), "it begins in the middle of the run"
     said = replayed(dump, tmp_path / "out")["recorded_run"]
     assert said["differ"] == 0, said
+    whole = said["cycles"]
+    next(dump.glob(flight.SWITCHED)).unlink()
+    said = replayed(dump, tmp_path / "without")["recorded_run"]
+    assert "cannot be used" in said["first_difference"]
+    assert 0 < said["differ"] <= said["cycles"] == whole, "what cannot be run again was recorded all the same"
