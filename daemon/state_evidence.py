@@ -12,7 +12,8 @@ SILENT_PERIODS: Final = 3.0
 """Scan periods without a valid scan after which the lidar is said to be gone."""
 VAGUE_M: Final = 0.15
 VAGUE_RAD: Final = 0.045
-"""One-sigma uncertainty beyond which TRACKING is not said."""
+"""One-sigma uncertainty beyond which TRACKING is not said. The heading's is half of the 5 deg that TRACKING must not be
+off by (docs/integrity.md): of those that were less sure, some were."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -274,8 +274,9 @@ class Suspicion:
             turned meanwhile (x, y, yaw). unwatched_s: the longest time since that match for which they stood, and
             turned then.
         t_rest: since when the wheels stand, whether matches come or not; rested: by what they have turned meanwhile.
-        against: share of the evidence that spoke against the place when they stopped, negative before the first scan.
-        strange_s: for so long more of it has since; t_strange: when it last did.
+        through: share of what should be in view that was looked through when they stopped, negative before the first
+            scan; gone: how far they have turned since then. strange_s: for so long more of it has been since;
+            t_strange: when it last was.
         period_s: usual time between two matches, 0 before it is known.
         question: what the look under way decides, None: there is none. job: its ID. t_asked: when it was asked for.
         again: the next one may search more.
@@ -293,7 +294,8 @@ class Suspicion:
     unwatched_s: float = 0.0
     t_rest: float = math.inf
     rested: Array = field(default_factory=lambda: np.zeros(3))
-    against: float = -1.0
+    through: float = -1.0
+    gone: Array = field(default_factory=lambda: np.zeros(3))
     strange_s: float = 0.0
     t_strange: float = -math.inf
     period_s: float = 0.0

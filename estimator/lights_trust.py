@@ -17,7 +17,9 @@ from estimator.result import LightsResult
 
 TRUST, YOUNG, YOUNG_M = 2.0, 6.0, 1.0
 """By how much the variance of a position from light is raised: always, because errors of the light model hang together
-farther than it knows; and at the start, fading with the way driven (m), because gains and heading are being found."""
+farther than it knows; and at the start, fading with the way driven (m), because gains and heading are being found: 8.0
+times where it begins, 4.2 after 1 m, 2.8 after 2 m. In 26 starts under lamps the heading was off by 1.5, 1.4, 1.0 and
+0.9 deg (rms) after 1, 2, 3 and 4 m, and said to be sure to 5.7, 3.1, 2.0 and 1.6 (docs/integrity.md)."""
 UNGUIDED = 1.5
 """By how much that variance is raised further where no wheels tell `lights` how the robot moves."""
 ANY_HEADING = math.pi**2 / 3.0

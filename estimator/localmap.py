@@ -263,6 +263,14 @@ def speaking_against(
     return through / max(1, there + through)
 
 
+def looked_through(local: LocalMap, T_odom_lidar: Array, beams: Beams, sigma: float) -> float:
+    """Share of the elements in view that a scan from this pose looks through, of about 400 samples.
+
+    Half of what `contradicted` counts: whoever steps up hangs in space, but opens no walls.
+    """
+    return speaking_against(local.elements, T_odom_lidar, beams, T_odom_lidar, UNSEEN, MARGIN + 5.0 * sigma)
+
+
 def contradicted(local: LocalMap, T_odom_lidar: Array, beams: Beams, sigma: float) -> float:
     """Share of the evidence that speaks against a scan being from this pose, of about 400 + 400 samples.
 

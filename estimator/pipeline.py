@@ -60,7 +60,7 @@ FLOOR = np.diag((0.005**2, 0.005**2, 0.003**2))
 
 
 def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
-    """Take the records since the last step, in the order in which they were true, and return the pose after them.
+    """Take the records since the last step, in the order in which they were true (`in_turn`), and return the pose then.
 
     Never raises for what a sensor delivers: a scan that cannot be matched leaves the prediction and says why.
     """
@@ -136,21 +136,27 @@ def in_turn(state: State, records: Iterable[Record]) -> list[Record]:
 
     Until the scan has been matched nobody knows how the robot has moved since the one before, and light would be held
     against where the velocity has carried it: of a robot that is suddenly pushed and turned that is wrong by more than
-    light is, and what light then says of the place turns its heading.
+    light is, and what light then says of the place turns its heading. No epoch waits where there is no scan, nor for a
+    scan behind an order that came later than it; nor for the paper's matcher, which begins where light has it.
     """
     told = sorted(records, key=order)
-    if state.light is None or state.light.guided is None or state.settings.matcher is not Matcher.LINE:
+    guided = state.light is not None and state.light.guided is not None and state.settings.matcher is Matcher.LINE
+    if not guided or not any(isinstance(record, Scan) for record in told):
         return told
     waiting: list[Record] = []
     taken: list[Record] = []
     for record in told:
-        if isinstance(record, SampleBlock | LightEpoch):
-            waiting.append(record)
-            continue
-        taken.append(record)
-        if isinstance(record, Scan):
-            taken += waiting
-            waiting = []
+        match record:
+            case SampleBlock() | LightEpoch():
+                waiting.append(record)
+            case Scan():
+                taken += [record, *waiting]
+                waiting = []
+            case Command():
+                taken += [*waiting, record]
+                waiting = []
+            case _:
+                taken.append(record)
     return taken + waiting
 
 

@@ -7,7 +7,7 @@ is suspected where physics says that something else than driving has happened:
 * the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
   seen afterwards is not what was seen before;
 * what is seen changes from one scan to the next, all at once (`leap`);
-* the wheels stand, and for a while much of what is seen speaks against the place (`was_strange`).
+* the wheels stand, and for a while much of the map is looked through that should be in view (`was_strange`).
 
 One look in the whole map then decides: if another place fits nearly as well the robot is adrift, and after a leap also
 if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the local
@@ -55,12 +55,18 @@ LEARNING: Final = 0.1
 STILL_M, STILL_RAD = 0.005, 0.005
 """Wheels stand that have turned by no more since they stopped, however often they tell it: 0.01 m/s for
 `UNWATCHED_S`."""
-RESTED_S: Final = 0.5
-"""So long after the wheels have stopped nothing of what is seen is of a robot that still rolls."""
+ROLLS_S, RESTED_S = 0.25, 0.5
+"""So long after the wheels have last turned what is seen may be of a robot that still rolls; from then until the second
+it is seen what is usual here. So long after they have last told anything it is not known, either, that they stand."""
+GONE_M, GONE_RAD = 0.05, 0.05
+"""What was seen when the wheels stopped is of another place once they have turned by more: one that is jostled as the
+robot is lifted, or that drifts, turns by less."""
 STRANGE, STRANGE_S, FORGET_S = 0.1, 0.5, 1.0
-"""By so much more of the evidence than when the wheels stopped speaks against the place, in all for so long, while the
-robot is carried along a corridor. Ten people do not: they hide walls, but let nobody look through them. The third:
-after so long without any it is over."""
+"""By so much more of what should be in view than when the wheels stopped is looked through, in all for so long, while
+the robot is carried along a corridor (0.2 to 0.39). People do not show in it, however many step up and leave: they
+hide walls, and nobody looks through walls for them. The third: after so long without any it is over."""
+LASTING_S: Final = 3.0
+"""After so long it is told though it goes on: the robot may have been put down where not all is alike."""
 NODES: Final = 1_000_000
 """A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
 310 thousand. One that ends there decides nothing, and is made once more with all of that; where that is not enough
@@ -80,15 +86,17 @@ def on_odometry(state: State, record: Odometry) -> None:
     if turned(moved):
         doubt.unwatched_s = max(doubt.unwatched_s, record.t_begin - doubt.t_still)
         doubt.t_still, doubt.moved = max(doubt.t_still, record.t_end), np.zeros(3)
-    doubt.rested = doubt.rested + record.delta
+    doubt.rested, doubt.gone = doubt.rested + record.delta, doubt.gone + record.delta
     if turned(doubt.rested) or not doubt.t_rest <= record.t_end:
-        doubt.t_rest, doubt.rested, doubt.against = record.t_end, np.zeros(3), -1.0
+        doubt.t_rest, doubt.rested = record.t_end, np.zeros(3)
+    if turned(doubt.gone, GONE_M, GONE_RAD):
+        doubt.gone, doubt.through = np.zeros(3), -1.0
 
 
-def turned(moved: Array) -> bool:
+def turned(moved: Array, most_m: float = STILL_M, most_rad: float = STILL_RAD) -> bool:
     """Whether wheels that have moved the robot by so much (x, y, yaw) do not stand."""
     x, y, yaw = moved.tolist()
-    return math.hypot(x, y) > STILL_M or abs(yaw) > STILL_RAD
+    return math.hypot(x, y) > most_m or abs(yaw) > most_rad
 
 
 def waits(state: State) -> bool:
@@ -127,34 +135,37 @@ def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> 
 
 
 def was_strange(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether much of what was seen spoke against the place for a while, the wheels standing, and fits it again now.
+    """Whether for a while much of the map was looked through, the wheels standing, and is not now, or still is.
 
-    It fits where the robot was carried on by hand to where it looks alike: from one scan to the next little changes.
-    What the map has wrong there spoke against it already when the wheels stopped.
+    So it is where the robot was carried on by hand to where it looks alike: from one scan to the next little changes.
+    What the map has wrong there was looked through already when the wheels stopped. Told once.
     """
     doubt, now = state.suspicion, state.fused.t_mono
-    stands = now - doubt.t_rest >= 0.0 and now - state.fused.t_odometry < RESTED_S
-    share = speaking_against(state, scan, points, match) if stands else -1.0
-    doubt.against = share if doubt.against < 0.0 else doubt.against
-    if share > doubt.against + STRANGE and now - doubt.t_rest >= RESTED_S:
-        doubt.strange_s += min(max(0.0, now - state.t_scan), doubt.period_s)
+    rests_s, silent = now - doubt.t_rest, now - state.fused.t_odometry >= RESTED_S
+    share = looked_through(state, scan, points, match) if rests_s >= ROLLS_S and not silent else -1.0
+    if share >= 0.0 and (doubt.through < 0.0 or rests_s < RESTED_S):
+        doubt.through = share if doubt.through < 0.0 else min(doubt.through, share)
+    if share > doubt.through + STRANGE:
+        doubt.strange_s += min(max(0.0, now - state.t_scan), doubt.period_s, STRANGE_S / ROW)
         doubt.t_strange = now
-        return False
+        if doubt.strange_s < LASTING_S or not match.ok:
+            return False
+        doubt.through = share
     enough = doubt.strange_s >= STRANGE_S
     if enough and not match.ok:
         return False
-    if enough or not stands or now - doubt.t_strange > FORGET_S:
+    if enough or silent or now - doubt.t_strange > FORGET_S:
         doubt.strange_s = 0.0
     return enough
 
 
-def speaking_against(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
-    """Share of the evidence that contradicts the local map from where a scan was taken; negative: it shows nothing."""
+def looked_through(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
+    """Share of the local map in view that a scan looks through from where it was taken; negative: it shows nothing."""
     if state.local is None or match.reason in BLIND:
         return -1.0
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-    return localmap.contradicted(state.local, eye, beams, noise_of(state, scan))
+    return localmap.looked_through(state.local, eye, beams, noise_of(state, scan))
 
 
 def leaps(state: State, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:

@@ -41,19 +41,41 @@ def test_carried_along_a_corridor_to_where_it_looks_alike_as_the_scans_in_betwee
     assert robot.off()[0] > 9.0, "it fits as well where it was"
 
 
-def test_people_who_step_about_a_robot_that_stands_are_nothing_strange() -> None:
-    """They hide walls; through none of these is looked."""
+def crowd(at: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(4 * count, 4) sides of people, 0.35 m wide, who shuffle about a robot in a corridor."""
+    x, y, _ = at.tolist()
+    sides = []
+    for _ in range(count):
+        cx, cy = x + rng.choice((-1.0, 1.0)) * rng.uniform(0.6, 2.5), y + rng.uniform(-0.8, 0.8)
+        corners = [(cx - 0.17, cy - 0.17), (cx + 0.17, cy - 0.17), (cx + 0.17, cy + 0.17), (cx - 0.17, cy + 0.17)]
+        sides += [(*a, *b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+    return np.array(sides)
+
+
+def test_people_who_step_up_to_a_robot_that_stands_and_leave_are_nothing_strange(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They hide walls, and hang in what was free; but nobody looks through a wall for them."""
+    told: list[bool] = []
+    usual = suspicion.was_strange
+
+    def heard(*words: object) -> bool:
+        told.append(usual(*words))  # type: ignore[arg-type]
+        return told[-1]
+
     robot = driven(niches(), ((2.0, 0.0), (38.0, 0.0), (22.5, 0.0)))
     assert robot.T is not None
-    here, asked = robot.T, robot.state.suspicion.t_asked
+    here, empty, rng = robot.T, robot.scene, np.random.default_rng(3)
     stand(robot, here, 10)
-    x, y, _ = here.tolist()
-    empty = robot.scene
-    for k in range(60):
-        legs = [(x - 1.2 + 0.04 * k, y + side, x - 1.0 + 0.04 * k, y + side) for side in (-0.7, 0.5, 0.8)]
-        robot.scene = Scene(np.vstack((empty.walls, np.array(legs))), empty.low, empty.high)
-        assert robot.at(here, carried=True).places is None
-    assert robot.state.suspicion.t_asked == asked
+    monkeypatch.setattr(suspicion, "was_strange", heard)
+    for k in range(80):
+        if k % 5 == 0:
+            about = [crowd(here, min(10, k // 5), rng)] if 0 < k < 60 else []
+            robot.scene = Scene(np.vstack((empty.walls, *about)), empty.low, empty.high)
+        robot.at(here, carried=True)
+        assert robot.state.suspicion.strange_s == 0.0
+    assert len(told) == 80
+    assert not any(told)
 
 
 class Looker:
@@ -62,16 +84,19 @@ class Looker:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, period: float = 0.1) -> None:
         self.state, self.t, self.period, self.against, self.usual = new_state(), 0.0, period, False, 0.0
         self.state.suspicion.period_s = period
-        monkeypatch.setattr(suspicion, "speaking_against", lambda *_: 0.25 if self.against else self.usual)
+        self.share = 0.25
+        monkeypatch.setattr(suspicion, "looked_through", lambda *_: self.share if self.against else self.usual)
 
-    def scans(self, count: int, against: bool, ok: bool = True, way: float | None = 0.0) -> list[bool]:
-        """What is said of so many; ``way``: that the wheels make meanwhile, each time; None: they tell nothing."""
+    def scans(
+        self, count: int, against: bool, ok: bool = True, way: float | None = 0.0, yaw: float = 0.0
+    ) -> list[bool]:
+        """What is said of so many; ``way``, ``yaw``: of the wheels meanwhile, each time; None: they tell nothing."""
         self.against, said = against, []
         for _ in range(count):
             begin, self.t = self.t, self.t + self.period
             if way is not None:
                 self.state.fused.t_odometry = self.t
-                suspicion.on_odometry(self.state, Odometry(begin, self.t, np.array((way, 0.0, 0.0))))
+                suspicion.on_odometry(self.state, Odometry(begin, self.t, np.array((way, 0.0, yaw))))
             self.state.fused.t_mono, self.state.t_scan = self.t, begin
             scan = scan_in(IMAGE, se2.identity(), BEAMS, np.random.default_rng(0), t=self.t)
             points = points_of(scan, se2.identity(), 80.0, 0.0)
@@ -106,9 +131,12 @@ def test_where_wheels_turn_or_tell_nothing_nothing_is_strange(
 
 def test_what_has_just_stopped_still_rolls(monkeypatch: pytest.MonkeyPatch) -> None:
     looker = Looker(monkeypatch)
+    for strange in (2, 5):
+        looker.scans(10, False, way=0.1)
+        assert not any(looker.scans(strange, True) + looker.scans(10, False))
+        assert looker.state.suspicion.t_strange == -np.inf
     looker.scans(10, False, way=0.1)
-    assert not any(looker.scans(8, True) + looker.scans(1, False))
-    looker.scans(10, False)
+    looker.scans(4, False)
     looker.scans(6, True)
     assert looker.scans(1, False) == [True]
 
@@ -131,3 +159,110 @@ def test_what_was_strange_is_told_though_the_wheels_turn_by_then(monkeypatch: py
     looker.scans(10, False)
     looker.scans(6, True)
     assert looker.scans(2, True, way=0.1) == [True, False]
+
+
+@pytest.mark.parametrize("every", [7, 10, 100])
+def test_wheels_that_are_jostled_while_the_robot_is_carried_hide_nothing(
+    monkeypatch: pytest.MonkeyPatch, every: int
+) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(10, False)
+    for k in range(21):
+        looker.scans(1, True, way=0.006 if k % every == 2 else 0.0)
+    assert looker.scans(1, False) == [True]
+
+
+@pytest.mark.parametrize("rad_s", [0.0005, 0.002])
+def test_a_heading_that_drifts_while_the_robot_stands_hides_nothing(
+    monkeypatch: pytest.MonkeyPatch, rad_s: float
+) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(600, False, yaw=0.1 * rad_s)
+    looker.scans(15, True, yaw=0.1 * rad_s)
+    assert looker.scans(1, False, yaw=0.1 * rad_s) == [True]
+
+
+@pytest.mark.parametrize("period", [0.25, 0.5, 1.0, 2.0])
+def test_of_a_slow_lidar_s_scans_two_are_not_for_a_while(monkeypatch: pytest.MonkeyPatch, period: float) -> None:
+    looker = Looker(monkeypatch, period)
+    looker.scans(10, False)
+    assert not any(looker.scans(2, True) + looker.scans(10, False))
+    looker.scans(3, True)
+    assert looker.scans(1, False) == [True]
+
+
+def test_what_stays_strange_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put down where it looks alike but for a table: it would not be over before the robot drives."""
+    looker = Looker(monkeypatch)
+    looker.scans(10, False)
+    said = looker.scans(60, True)
+    assert said.index(True) in (29, 30)
+    assert sum(said) == 1
+    assert not any(looker.scans(10, True, ok=False) + looker.scans(10, False))
+
+
+def test_what_stays_strange_is_not_told_of_a_scan_that_is_not_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(10, False)
+    assert not any(looker.scans(60, True, ok=False))
+    assert looker.scans(1, True) == [True]
+
+
+def test_wheels_that_fall_silent_are_not_known_to_stand(monkeypatch: pytest.MonkeyPatch) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(10, False)
+    assert not any(looker.scans(30, True, way=None) + looker.scans(5, False, way=None))
+
+
+def test_a_gap_between_scans_does_not_count_as_strange(monkeypatch: pytest.MonkeyPatch) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(10, False)
+    for _ in range(3):
+        looker.scans(1, True)
+        looker.period = 0.4
+        looker.scans(1, True)
+        looker.period = 0.1
+    assert looker.state.suspicion.strange_s == pytest.approx(0.6)  # six scans
+    looker.state.suspicion.strange_s = 0.0
+    late = looker.t
+    looker.scans(1, True)
+    looker.state.t_scan = looker.t = late  # a scan that is no later than the one before
+    assert looker.state.suspicion.strange_s == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("between", "told"), [(8, True), (12, False)])
+def test_what_was_strange_a_second_ago_is_forgotten(monkeypatch: pytest.MonkeyPatch, between: int, told: bool) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(10, False)
+    looker.scans(4, True)
+    looker.scans(between, False)
+    looker.scans(2, True)
+    assert looker.scans(1, False) == [told]
+
+
+@pytest.mark.parametrize(("more", "told"), [(0.09, False), (0.11, True)])
+def test_a_tenth_more_than_when_the_wheels_stopped_is_strange(
+    monkeypatch: pytest.MonkeyPatch, more: float, told: bool
+) -> None:
+    looker = Looker(monkeypatch)
+    looker.usual, looker.share = 0.1, 0.1 + more
+    looker.scans(10, False)
+    looker.scans(8, True)
+    assert looker.scans(1, False) == [told]
+
+
+def test_one_blurred_scan_when_the_wheels_stop_is_not_what_is_usual(monkeypatch: pytest.MonkeyPatch) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(5, False, way=0.1)
+    looker.scans(3, True)  # the last of them is looked at, as the first one
+    looker.scans(8, False)
+    looker.scans(8, True)
+    assert looker.scans(1, False) == [True]
+
+
+def test_stamps_of_the_wheels_that_go_back_begin_the_rest_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    looker = Looker(monkeypatch)
+    looker.scans(5, False, way=0.1)
+    assert looker.state.suspicion.t_rest == 0.5
+    suspicion.on_odometry(looker.state, Odometry(0.2, 0.3, np.zeros(3)))
+    assert looker.state.suspicion.t_rest == 0.3

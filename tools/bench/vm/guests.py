@@ -164,7 +164,7 @@ def _wait_for_room(guests: list[Guest], threads: list[threading.Thread], say: Sa
     told = False
     while sum(thread.is_alive() for thread in threads) >= SIDE_BY_SIDE:
         known = [guest.slower for guest in guests if guest.slower is not None]
-        if known and max(known) <= SLOW:
+        if len(known) >= SIDE_BY_SIDE and max(known) <= SLOW:
             return
         if known and not told:
             say(f"the emulation is {max(known):.1f} times slower than usual: {SIDE_BY_SIDE} computers at a time")

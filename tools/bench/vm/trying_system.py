@@ -171,8 +171,11 @@ def agrees_with_outside(bench: Bench) -> Seen:
     # a drive without some scans or map work is another one: the two must agree until the emulated processor left it
     undone = next((k for k, one in enumerate(drive) if _work_left(drive[0], one) != (0, 0)), None)
     if not agree and undone is not None:
+        after = _largest(seen)
         seen, agree = _compared(bench, drive[:undone])
-        seen = replace(seen, said=f"{seen.said}, until work was left undone ({_trouble(drive)})")
+        whole = Figure("inside and outside: apart, largest of the whole drive", after, "mm")
+        told = f"{seen.said}, until work was left undone ({_trouble(drive)})"
+        seen = replace(seen, said=told, figures=(*seen.figures, whole))
     need(agree, "; ".join([*map(str, seen.figures), _trouble(drive)]))
     return seen
 
@@ -191,9 +194,16 @@ def _compared(bench: Bench, drive: list[Heard]) -> tuple[Seen, bool]:
     figures, plots = apart(trace_of(t - late, poses, truth_t, truth), outside(), "inside and outside")
     spread = Figure("inside: lateness changes by", 1e3 * float(np.ptp(late)), "ms", "more", 0.5, 5.0)
     figures = (Figure("inside: late by", 1e3 * float(late.max()), "ms", "more", 0.5, 5.0), *figures, spread)
-    way, largest = figures[1].value, figures[3].value
+    way = figures[1].value
+    seen = Seen(f"{len(placed)} poses", figures, plots)
+    largest = _largest(seen)
     agree = late.max() <= LATE_S and np.ptp(late) <= SPREAD_S and way >= AGREE_WAY_M and largest <= 1e3 * AGREE_M
-    return Seen(f"{len(placed)} poses", figures, plots), bool(agree)
+    return seen, bool(agree)
+
+
+def _largest(seen: Seen) -> float:
+    """How far the two were apart at most, mm."""
+    return float(next(one.value for one in seen.figures if one.name.endswith("apart, largest")))
 
 
 def _work_left(first: Heard, one: Heard) -> tuple[int, int]:
