@@ -298,7 +298,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 @pytest.mark.system
 @pytest.mark.realtime
 def test_half_a_minute(tmp_path: Path) -> None:
-    demo = start(tmp_path, "--seconds", "22")
+    demo = start(tmp_path, "--seconds", "30")
     text, _ = demo.communicate(timeout=240)
     assert demo.returncode == 0, text
     assert "TRACKING" in text
