@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Suites share the processors, and what is judged against the wall clock wants them alone: no two at once, -j or not.
 .NOTPARALLEL:
 
-.PHONY: help venv demo test test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
+.PHONY: help venv demo test cover test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -44,16 +44,20 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff check --quiet .
 	$(BIN)/mypy
 
-# Compiled kernels are invisible to coverage, so the estimator is also run without the compiler, beside the compiling;
-# that row is silent unless it fails. The rest is shared out to the cores file by file.
 QUICK := not slow and not system
-COVER := $(BIN)/python -m coverage
 test: check  ## everything quick (no root, <= 12 minutes)
+	@$(BIN)/python -c "from daemon.warmup import load; load()"
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "$(QUICK)" $(ARGS)
+
+# Compiled kernels are invisible to coverage, so the estimator is also run without the compiler, beside the compiling;
+# that row is silent unless it fails. Of the rest only what is traced (tests/conftest.py) is run once more.
+COVER := $(BIN)/python -m coverage
+cover: venv  ## the floors of coverage, and the estimator without the compiler
 	@mkdir -p out; rm -f .coverage .coverage.* out/plain.coverage
 	@NUMBA_DISABLE_JIT=1 $(COVER) run --data-file=out/plain.coverage -m pytest -q -p no:cacheprovider \
 		-m "not jit and $(QUICK)" tests/estimator > out/plain.txt 2>&1 & plain=$$!; trap "kill $$plain" INT TERM; \
 	$(BIN)/python -c "from daemon.warmup import load; load()" && \
-	$(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report= -m "$(QUICK)" $(ARGS); tests=$$?; \
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report= -m "$(QUICK) and not no_cover"; tests=$$?; \
 	wait $$plain; plain=$$?; echo "the estimator without the compiler:"; \
 	if [ $$plain = 0 ]; then grep -h " passed" out/plain.txt; else cat out/plain.txt; fi; \
 	exit $$(( tests || plain ))
@@ -70,7 +74,7 @@ test-system: venv  ## real processes, real ttys, real time, fault and fuzz sampl
 	$(BIN)/python -m pytest -q -m "$(ORDERLY) and realtime" $(ONLY_IN) $(ARGS) $(NONE)
 
 LONG = $(BIN)/python -m pytest -q --durations=15
-test-all: test test-system  ## all of it, the long ones included (root, about three quarters of an hour)
+test-all: test cover test-system  ## all of it, the long ones included (root, about three quarters of an hour)
 	$(LONG) -n auto --dist load -m "slow and not realtime" $(ARGS) $(NONE)
 	$(LONG) -m "slow and realtime" $(ARGS) $(NONE)
 
