@@ -78,15 +78,15 @@ def test_the_driver_survives_any_server(tmp_path: Path) -> None:
         chance = random.Random(1)
         writer.write(frames.hello(time.monotonic(), "", "liar"))
         splitter = frames.Splitter()
-        while data := await reader.read(4096):
-            for _, body in splitter.feed(data):
-                number, messages = frames.parse_transfer(body)
-                lengths = [chance.choice((m.length, m.length, m.length, 1, 0)) for m in messages if m.length]
-                now = time.monotonic()
-                code = chance.choice((0, 0, 0, 0, 0, 5, 6, 110, 9999))
-                reads = tuple(chance.randbytes(n) for n in lengths[: chance.choice((1, 1, 1, 0))])
-                writer.write(frames.done(frames.Done(number, code, now, now, now + 1e-3, now + 1e-3, reads)))
-        writer.close()
+        with closing(writer):  # also where it is ended in the middle
+            while data := await reader.read(4096):
+                for _, body in splitter.feed(data):
+                    number, messages = frames.parse_transfer(body)
+                    lengths = [chance.choice((m.length, m.length, m.length, 1, 0)) for m in messages if m.length]
+                    now = time.monotonic()
+                    code = chance.choice((0, 0, 0, 0, 0, 5, 6, 110, 9999))
+                    reads = tuple(chance.randbytes(n) for n in lengths[: chance.choice((1, 1, 1, 0))])
+                    writer.write(frames.done(frames.Done(number, code, now, now, now + 1e-3, now + 1e-3, reads)))
 
     async def main() -> None:
         liar = await asyncio.start_unix_server(lying, str(path))
