@@ -45,8 +45,9 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/mypy
 
 QUICK := not slow and not system
-test: check  ## everything quick (no root, <= 12 minutes)
-	@$(BIN)/python -c "from daemon.warmup import load; load()"
+test: venv  ## everything quick (no root, <= 12 minutes)
+	@$(BIN)/python -c "from daemon.warmup import load; load()" & warm=$$!; trap "kill $$warm" INT TERM; \
+	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked  # each keeps one processor busy
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "$(QUICK)" $(ARGS)
 
 # Compiled kernels are invisible to coverage, so the estimator is also run without the compiler, beside the compiling;

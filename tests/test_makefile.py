@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -18,11 +19,17 @@ def test_no_two_targets_run_at_once(tmp_path: Path) -> None:
     assert done.stdout.splitlines() == ["begin one", "end one", "begin two", "end two"]
 
 
+def shown(*words: str) -> str:
+    """What a command writes; a ``make`` that runs these tests hands its own words down by the environment."""
+    own = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKEOVERRIDES", "ARGS")}
+    return subprocess.run(words, cwd=ROOT, env=own, capture_output=True, text=True, check=True).stdout
+
+
 def test_the_orderly_suites_read_every_file_with_such_tests() -> None:
     """`make test-system` reads the files that its ``grep`` finds; a mark that is given elsewhere would go unseen."""
-    said = subprocess.run(["make", "-n", "test-system"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    said = shown("make", "-n", "test-system")
     (found,) = set(re.findall(r"\$\((grep .* \| sort)\)", said))
-    read = set(subprocess.run(["sh", "-c", found], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split())
+    read = set(shown("sh", "-c", found).split())
     marked = {
         str(path.relative_to(ROOT))
         for path in (ROOT / "tests").rglob("*.py")
@@ -30,7 +37,4 @@ def test_the_orderly_suites_read_every_file_with_such_tests() -> None:
     }
     assert "tests/systemd/test_container.py" in read
     assert marked <= read
-    named = subprocess.run(
-        ["make", "-n", "test-system", "ARGS=tests/hil -x"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
-    assert "grep" not in named
+    assert "grep" not in shown("make", "-n", "test-system", "ARGS=tests/hil -x")
