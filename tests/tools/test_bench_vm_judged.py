@@ -95,6 +95,7 @@ def test_a_drive_whose_end_was_left_undone_agrees_until_then(monkeypatch: pytest
     assert isinstance(seen, Seen)
     assert seen.said.startswith("60 poses, until work was left undone (meanwhile 0 scans missed, 1 cycles")
     assert round(seen.figures[1].value, 1) == 5.9
+    assert str(seen.figures[-1]) == "inside and outside: apart, largest of the whole drive: 50 mm", "what came after"
     for since, undone in ((60, 10_000), (60, 70), (20, 20)):  # nothing was; too late to be why; too little is left
         with pytest.raises(Order, match=r"apart, largest: 50|way compared: 1\."):
             trying_system.agrees_with_outside(astray(9.0, since, undone))
