@@ -180,7 +180,7 @@ class SegmentWriter:
     def _fail(self, error: Exception, batches: list[Batch]) -> None:
         reason = reason_of(error)
         if not self.error:
-            line = "recording into %s has stopped: %s; it goes on when there is room"
+            line = "recording into %s has stopped: %s; it goes on when it can be written again"
             log.error(line, self.folder, reason, exc_info=defect_in(error))
         self.error = f"{self.folder}: {reason}"
         self._lose(batches)

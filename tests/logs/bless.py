@@ -36,8 +36,8 @@ def bless(entry: Entry, root: Path | None, reason: str, into: Path | None = None
         if not moved:
             return f"{entry.name}: unchanged"
     facts = golden.facts_of(trajectory, loops, origin(entry), reason)
-    golden.save(entry.name, trajectory, entry.every, facts, into)
-    return f"{entry.name}: {moved}"
+    path = golden.save(entry.name, trajectory, entry.every, facts, into)
+    return f"{entry.name}: {moved}; {path}"
 
 
 def _moved(old: golden.Golden, entry: Entry, trajectory: Trajectory, loops: list[Loop]) -> str:

@@ -81,6 +81,9 @@ def test_what_cannot_be_played_is_said_with_the_remedy(tmp_path: Path, capsys: p
         ("lap --local --modbus 192.168.0.20", "without --modbus: leave one or the other out"),
         ("lap --local --lidar pty:x --anyone", "without --lidar, --anyone: leave one or the other out"),
         ("lap --local --write-config DIR", "--write-config is for a robot computer"),
+        ("lap --lidar foo --modbus 127.0.0.1 --write-config DIR", "--lidar foo: not a line: expected /dev/ttyUSB0"),
+        ("lap --lidar /dev/ttyUSB0@fast --modbus 127.0.0.1", "--lidar /dev/ttyUSB0@fast: not a line"),
+        ("lap --write-config DIR", "--lidar and --modbus missing (docs/bench.md has the wiring)\n"),
         (
             "lap cable --lidar pty:x --modbus 127.0.0.1 --write-config DIR",
             "takes one scenario, and 2 are named (lap, cable): name one of them",

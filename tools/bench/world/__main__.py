@@ -30,7 +30,7 @@ from tools.bench.world.judge import Played, judged, pictures
 from tools.bench.world.local import robot
 from tools.bench.world.robotside import write_config
 from tools.bench.world.scenario import BUILT_IN, Scenario, find, load
-from tools.bench.world.stage import CannotPlay, Ends, is_port, play
+from tools.bench.world.stage import LINES, CannotPlay, Ends, is_line, is_port, play
 
 CANNOT: Final = 2
 ELSEWHERE: Final = ("lidar", "modbus", "odometry", "light", "anyone")
@@ -133,7 +133,10 @@ def ends_of(options: argparse.Namespace) -> Ends:
     host, _, port = options.modbus.partition(":")
     missing = [f"--{name}" for name in ("lidar", "modbus") if not getattr(options, name)]
     if missing:
-        raise CannotPlay(f"{' and '.join(missing)} missing (docs/bench.md has the wiring), or --local without any")
+        either = "" if options.write_config is not None else ", or --local without any"
+        raise CannotPlay(f"{' and '.join(missing)} missing (docs/bench.md has the wiring){either}")
+    if not (options.lidar.startswith(("pty:", TCP)) or is_line(options.lidar)):
+        raise CannotPlay(f"--lidar {options.lidar}: not a line: expected {LINES}")
     if port and not is_port(port):
         raise CannotPlay(f"--modbus {options.modbus}: expected HOST:PORT, as 192.168.0.20:1502")
     for name, as_here in SERVED.items():

@@ -39,6 +39,7 @@ from tools.sim.hands import Hands
 from tools.sim.scene import SimulatedScene
 from tools.sim.serve_light import BUS, converter
 
+LINES: Final = "/dev/ttyUSB0, /dev/ttyUSB0@115200, pty:PATH or tcp://HOST:PORT"
 POLL_S: Final = 0.01
 WAIT_S: Final = 0.05
 STANDING_S: Final = 2.0
@@ -236,6 +237,12 @@ async def _light(scene: SimulatedScene, ends: Ends, targets: dict[str, Target], 
     return []
 
 
+def is_line(where: str) -> bool:
+    """Whether it is a serial line by its form: a path, and a rate if there is one."""
+    path, at, baud = where.partition("@")
+    return path.startswith("/") and (not at or baud.isdigit())
+
+
 async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> list[Port]:
     """Offer the lidar."""
     if where.startswith("tcp://"):
@@ -252,11 +259,9 @@ async def _connect(device: FakeHokuyo, where: str, stack: AsyncExitStack) -> lis
         pty = PtyServer(device, Path(where.removeprefix("pty:")))
         stack.callback(pty.close)
         return []
+    if not is_line(where):
+        raise DeviceRefused(where, "not a line", f"expected {LINES}")
     path, _, baud = where.partition("@")
-    if not path.startswith("/") or (baud and not baud.isdigit()):
-        raise DeviceRefused(
-            where, "not a line", "expected /dev/ttyUSB0, /dev/ttyUSB0@115200, pty:PATH or tcp://HOST:PORT"
-        )
     line = SerialEnd(device, path, int(baud or 115200))
     stack.callback(line.close)
     return [line]
