@@ -56,7 +56,7 @@ def test_the_graph_is_drawn(tmp_path: Path) -> None:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("days", ["0.3", pytest.param("1", marks=pytest.mark.slow)])
 def test_nothing_grows_in_a_day(days: str, tmp_path: Path) -> None:
-    """Seven hours of it where a suite has minutes: the slope counts from half an hour on."""
+    """Seven hours of it where a suite has minutes: the slope counts from a third of it on."""
     command = [sys.executable, "-m", "tools.soak", "--days", days, "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -117,7 +117,7 @@ class Bench:
     """The whole of it. Made by :func:`bench`."""
 
     slower = 1.0
-    """So many times as long as on the machine of the page's figures its emulated processor takes for the same work."""
+    """So many times as long as is reckoned with its emulated processor takes for a fixed piece of work."""
 
     def __init__(self, machine: Machine, world: subprocess.Popen[str], folder: Path, there: dict[str, Any]) -> None:
         self.machine, self.world, self.folder, self.there = machine, world, folder, there

@@ -166,7 +166,7 @@ def _wait_for_room(guests: list[Guest], threads: list[threading.Thread], say: Sa
         known = [guest.slower for guest in guests if guest.slower is not None]
         if len(known) >= SIDE_BY_SIDE and max(known) <= SLOW:
             return
-        if known and not told:
+        if known and max(known) > SLOW and not told:
             say(f"the emulation is {max(known):.1f} times slower than usual: {SIDE_BY_SIDE} computers at a time")
             told = True
         time.sleep(LOOK_S)
