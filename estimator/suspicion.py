@@ -63,8 +63,9 @@ GONE_M, GONE_RAD = 0.05, 0.05
 robot is lifted, or that drifts, turns by less."""
 STRANGE, STRANGE_S, FORGET_S = 0.1, 0.5, 1.0
 """By so much more of what should be in view than when the wheels stopped is looked through, in all for so long, while
-the robot is carried along a corridor (up to 0.22 in that of `tests/estimator/test_strange.py`). People do not show in it, however many step up and leave: they
-hide walls, and nobody looks through walls for them. The third: after so long without any it is over."""
+the robot is carried along a corridor (up to 0.22 in that of `tests/estimator/test_strange.py`). People do not show in
+it, however many step up and leave: they hide walls, and nobody looks through walls for them. The third: after so long
+without any it is over."""
 LASTING_S: Final = 3.0
 """After so long it is told though it goes on: the robot may have been put down where not all is alike."""
 NODES: Final = 1_000_000

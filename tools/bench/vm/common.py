@@ -25,8 +25,8 @@ RIGHT_S: Final = 2.0
 """Ten poses, driven over more than a metre."""
 PACE: Final = "i=0; while [ $i -lt 20000 ]; do i=$((i+1)); done"
 USUAL_S: Final = 0.5
-"""What `PACE` may take inside on a usual machine: estimated, not measured there yet (docs/bench.md). Two slow ones beside
-each other took 1.3 and 1.9 s, on a machine that boots in 27 s what took 15 on a usual one."""
+"""What `PACE` may take inside on a usual machine: estimated, not measured there yet (docs/bench.md). Two computers
+beside each other took 1.3 and 1.9 s on a machine that boots in 27 s what took 15 on a usual one."""
 
 
 def scenario(daemon: Daemon = "same") -> Callable[[Scenario], Scenario]:
