@@ -1,4 +1,4 @@
-"""Turns a cycle's time budget into caps, from measured time per iteration; nothing below the cycle reads a clock.
+"""Turns a cycle's time budget into caps, from measured times; nothing below the cycle reads a clock.
 
 Order of degradation when time is short (`estimator.records.Rung`): first the scan is thinned and iterations are cut,
 then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off for good.
@@ -20,6 +20,10 @@ ENOUGH_ITERATIONS: Final = 12
 """Iterations that a match hardly ever exceeds; thinning the scan starts where these do not fit any more."""
 FEWEST_ITERATIONS: Final = 3
 FEWEST_POINTS: Final = 120
+FIXED: Final = 15_000
+"""What a match costs beside its iterations, in passes of one point through one iteration: cutting both saves only the
+rest. Measured: 682 points in 5 iterations take 82 us of the 434 us of a match, 114 points in 3 iterations 23 of 400; a
+pass is 24 ns. Interpreter and kernels become slower together, so the ratio is taken to hold on other computers."""
 LONGEST_MAP_WAIT: Final = 20
 """Cycles in a row that may put off map work: a quarter of a metre, a keyframe, at 40 Hz and half a metre a second."""
 PROBE_EVERY: Final = 40
@@ -114,14 +118,14 @@ class RecordedBudget:
 
 
 class MeasuredBudget:
-    """Real time: what an iteration, map work, light, and all the rest cost, tracked from cycle to cycle by stage.
+    """Real time: what a match, map work, light, and all the rest cost, tracked from cycle to cycle by stage.
 
     What is left of the budget after light and the rest is for matching and the map. Cycles with light and those without
     have a ladder each, so that scans are not thinned, nor map work put off, in the ones for the sake of the others.
     """
 
     def __init__(self) -> None:
-        self._iteration, self._map, self._light, self._rest = _Cost(), _Cost(), _Cost(), _Cost()
+        self._pass, self._map, self._light, self._rest = _Cost(), _Cost(), _Cost(), _Cost()
         self._code_us = 0.0
         self._queries = 0
         self._waited = 0
@@ -131,7 +135,7 @@ class MeasuredBudget:
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         """Caps for a step of a cycle that may take ``budget_us``; none for matching until something was measured."""
         codes = self._codes(budget_us)
-        if self._iteration.us <= 0.0:
+        if self._pass.us <= 0.0:
             return replace(UNLIMITED, codes=codes)
         left_us = budget_us - self._rest.us - (self._light.us if light else 0.0)
         rung = self._ladder(light).take(self._fits(left_us))
@@ -146,10 +150,14 @@ class MeasuredBudget:
     def _ladder(self, light: bool) -> Ladder:
         return self._lit if light else self._plain
 
+    def _match_us(self, iterations: int, points: int) -> float:
+        """What a match costs that takes so many of both."""
+        return self._pass.us * (FIXED + iterations * min(points, self._queries))
+
     def _fits(self, left_us: float) -> Rung:
         """The best rung that so many microseconds allow."""
-        least_us = FEWEST_ITERATIONS * self._iteration.us * min(1.0, FEWEST_POINTS / max(1, self._queries))
-        if left_us >= ENOUGH_ITERATIONS * self._iteration.us + self._map.us:
+        least_us = self._match_us(FEWEST_ITERATIONS, FEWEST_POINTS)
+        if left_us >= self._match_us(ENOUGH_ITERATIONS, self._queries) + self._map.us:
             return Rung.FULL
         if left_us >= least_us + self._map.us:
             return Rung.THINNED
@@ -162,14 +170,13 @@ class MeasuredBudget:
 
     def _matching(self, left_us: float, with_map: bool) -> tuple[int, int]:
         """Iterations and points that fit: first the scan is thinned, then iterations are cut."""
-        matching_us = ENOUGH_ITERATIONS * self._iteration.us
         if with_map:
-            left_us = max(left_us - self._map.us, 0.0)
+            left_us -= self._map.us
+        passes = max(0.0, left_us / self._pass.us - FIXED)
         points = UNLIMITED.points
-        if matching_us > left_us:
-            points = max(FEWEST_POINTS, int(self._queries * left_us / matching_us))
-        per_iteration = self._iteration.us * min(1.0, points / max(1, self._queries))
-        iterations = math.floor(max(left_us, 0.0) / per_iteration)
+        if ENOUGH_ITERATIONS * self._queries > passes:
+            points = max(FEWEST_POINTS, int(passes / ENOUGH_ITERATIONS))
+        iterations = math.floor(passes / max(1, min(points, self._queries)))
         return min(UNLIMITED.icp_iterations, max(FEWEST_ITERATIONS, iterations)), points
 
     def _codes(self, budget_us: float) -> int:
@@ -183,7 +190,7 @@ class MeasuredBudget:
         self._code_us = code_us
 
     def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
-        """Take in one cycle. Steps without a match teach nothing about iterations."""
+        """Take in one cycle. Steps without a match teach nothing about its cost."""
         self._waited = 0 if limits.update_map else self._waited + 1
         us = spent.us if "match" in spent.us else {**spent.us, "match": spent.us.get("step", 0.0), "step": 0.0}
         if spent.light and "lights" in us:
@@ -193,7 +200,7 @@ class MeasuredBudget:
         if match is not None and match.iterations > 0 and match.queries > 0:
             # cost grows with the points; it is kept for the fullest scan seen lately, so that a thinned one teaches too
             self._queries = max(match.queries, int(0.999 * self._queries))
-            self._iteration.learn(us.get("match", 0) / match.iterations * (self._queries / match.queries))
+            self._pass.learn(us.get("match", 0) / (FIXED + match.iterations * match.queries))
         if result.keyframe >= 0 and "map" in us:
             self._map.learn(us["map"])
         saving = {Rung.FULL: us.get("match", 0), Rung.THINNED: us.get("map", 0), Rung.NO_MAP: us.get("match", 0)}
