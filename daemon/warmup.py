@@ -220,7 +220,10 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
         cold = compiled
         if cold:
             count = kernel_count(lights is not None)
-            log.info("first start of this version: compiling %d kernels, which takes a minute or two", count)
+            log.info(
+                "first start of this version: compiling its %d kernels, or what is missing of them (a minute or two)",
+                count,
+            )
 
         def missing() -> None:
             """A kernel is not there, whatever the mark says."""

@@ -173,7 +173,10 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
     ]
     if here:
         return max(here, key=lambda one: one[:2])[2:]
-    there = "\n".join(f"  {whymoment.clock(s.begin)} to {whymoment.clock(s.end)}  {s.path.name}" for s in recorded)
+    there = "\n".join(
+        f"  {whymoment.clock(s.begin)} to {whymoment.clock(s.end)}, {s.end - s.begin:.0f} s  {s.path.name}"
+        for s in recorded
+    )
     raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n{there}")
 
 

@@ -7,19 +7,30 @@ blessed: ``python -m tests.logs.bless --reason TEXT [NAME ...]``.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from tests.logs import golden
-from tests.logs.bless import NO_DATA
-from tests.logs.catalog import BY_NAME, ENTRIES, Entry, OtherLog, ledger_of, replayed
+from tests.logs.entries import BY_NAME, ENTRIES, NO_DATA, Entry, NotThere, chosen, data_folder
+
+if TYPE_CHECKING:  # loaded once what was asked for can be done: with it comes the estimator, which is compiled at first
+    from tests.logs import golden
+
+
+def load_estimator() -> None:
+    """Say that it is compiled, where it is."""
+    from daemon import cli, warmup
+
+    warmup.load_aloud(cli.say, "warm", warmup.load)
 
 
 def checked(entry: Entry, root: Path | None) -> golden.Verdict:
     """Replay one."""
+    from tests.logs import golden
+    from tests.logs.catalog import ledger_of, replayed
+
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
     try:
@@ -34,21 +45,23 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
     parser.add_argument("--all", action="store_true", help="real logs that are not here fail, too")
     args = parser.parse_args(arguments)
-    unknown = sorted(set(args.name) - set(BY_NAME))
-    if unknown:
-        parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
-    data = os.environ.get("LUMILOOP_DATA")
+    try:
+        entries, data = chosen(args.name), data_folder()
+    except NotThere as error:
+        parser.error(str(error))
+    load_estimator()
+    from tests.logs import golden
+    from tests.logs.catalog import OtherLog
+
     moved, missing, left = [], [], []
-    for entry in ENTRIES:
-        if args.name and entry.name not in args.name:
-            continue
-        if entry.source and not data:
+    for entry in entries:
+        if entry.source and data is None:
             left.append(entry.name)
             sys.stdout.write(f"{entry.name:<6} not replayed: {NO_DATA}\n")
             continue
         begun = time.monotonic()
         try:
-            verdict = checked(entry, Path(data) if data else None)
+            verdict = checked(entry, data)
         except OtherLog as error:
             missing.append(entry.name)
             sys.stdout.write(f"{entry.name:<6} not replayed: {error}\n")

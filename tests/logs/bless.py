@@ -8,21 +8,25 @@ against to the micrometre on a machine that the committed ones are not of.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from daemon.results import Trajectory
-from estimator.result import Loop
-from tests.logs import golden
-from tests.logs.catalog import BY_NAME, ENTRIES, Entry, OtherLog, ledger_of, origin, replayed
+from tests.logs.__main__ import load_estimator
+from tests.logs.entries import BY_NAME, NO_DATA, Entry, NotThere, chosen, data_folder
 
-NO_DATA = "LUMILOOP_DATA does not name the folder of real logs"
+if TYPE_CHECKING:
+    from daemon.results import Trajectory
+    from estimator.result import Loop
+    from tests.logs import golden
 
 
 def bless(entry: Entry, root: Path | None, reason: str, into: Path | None = None) -> str:
     """Write one golden file, or this machine's own ``into`` a folder; returns what changed, for people."""
+    from tests.logs import golden
+    from tests.logs.catalog import ledger_of, origin, replayed
+
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
     trajectory, loops = ledger.final(), [loop for _, loop in ledger.loops]
@@ -42,6 +46,8 @@ def bless(entry: Entry, root: Path | None, reason: str, into: Path | None = None
 
 def _moved(old: golden.Golden, entry: Entry, trajectory: Trajectory, loops: list[Loop]) -> str:
     """By how much; empty where the file may stay as it is, to the last digit."""
+    from tests.logs import golden
+
     if old.facts["digest"] == golden.digest(trajectory) and golden.judged(old, trajectory, loops, entry.every).same:
         return ""
     far = golden.largest_difference(old, trajectory, entry.every)
@@ -59,23 +65,25 @@ def main() -> int:
     )
     parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
     args = parser.parse_args()
-    folder = golden.HERE if args.here else None
     reason = "reference of this machine" if args.here else args.reason
     if len(reason.strip()) <= 10:
         parser.error(f"--reason {args.reason!r} says nothing to whoever reads the file in a year: 11 letters at least")
-    unknown = sorted(set(args.name) - set(BY_NAME))
-    if unknown:
-        parser.error(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
-    data = os.environ.get("LUMILOOP_DATA")
+    try:
+        entries, data = chosen(args.name), data_folder()
+    except NotThere as error:
+        parser.error(str(error))
+    load_estimator()
+    from tests.logs import golden
+    from tests.logs.catalog import OtherLog
+
+    folder = golden.HERE if args.here else None
     left = []
-    for entry in ENTRIES:
-        if args.name and entry.name not in args.name:
-            continue
-        if entry.source and not data:
+    for entry in entries:
+        if entry.source and data is None:
             sys.stdout.write(f"{entry.name}: left as it is, {NO_DATA}\n")
             continue
         try:
-            sys.stdout.write(bless(entry, Path(data) if data else None, reason, folder) + "\n")
+            sys.stdout.write(bless(entry, data, reason, folder) + "\n")
         except OtherLog as error:
             sys.stdout.write(f"{entry.name}: left as it is, {error}\n")
             left.append(entry.name)

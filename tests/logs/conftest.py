@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from daemon.replay import Outcome
-from tests.logs.catalog import BY_NAME, replayed
+from tests.logs.catalog import replayed
+from tests.logs.entries import BY_NAME
 
 Replayed = Callable[[str], Outcome]
 

@@ -14,8 +14,9 @@ import pytest
 from hal.odometry import RawOdometry
 from hal.replay.carmen import read_carmen
 from tests.logs import golden
-from tests.logs.catalog import ENTRIES, Entry, ledger_of
+from tests.logs.catalog import ledger_of
 from tests.logs.conftest import Replayed
+from tests.logs.entries import ENTRIES, Entry
 from tools.relations import evaluate, read_relations
 
 

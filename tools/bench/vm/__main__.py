@@ -63,13 +63,13 @@ def main() -> int:
     parser.add_argument("--image-only", action="store_true", help="make the image and stop")
     parser.add_argument("--list", action="store_true", help="say what is tried")
     options = parser.parse_args()
-    if options.list:
-        for one in SCENARIOS:
-            say(f"{one.__name__}: {(one.__doc__ or '').splitlines()[0]}")
-        return 0
     begun = time.monotonic()
     try:
         shares = chosen(options.scenario)
+        if options.list:
+            for one in (one for share in shares for one in share):
+                say(f"{one.__name__}: {(one.__doc__ or '').splitlines()[0]}")
+            return 0
         before = None
         if options.against is not None:  # what is wrong with it is told now, not in eight minutes
             before = read(options.against, NAME)
