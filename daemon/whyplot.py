@@ -21,6 +21,8 @@ _INCHES: Final = (14.0, 8.0)
 _MARGIN_M: Final = 4.0
 LAST_S: Final = 0.05
 """How long the last cycle is drawn."""
+LABEL: Final = 0.06
+"""Part of the time shown that a fault's numbers take, which the next ones near it leave free."""
 COLOURS: Final = {
     State.TRACKING: "tab:green",
     State.MAPPING: "tab:blue",
@@ -122,11 +124,14 @@ def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
                 axes.barh(axis + 1, end - begin, left=begin, color="tab:red", height=0.8)
         if laser_dissents(moment):
             axes.barh(4, end - begin, left=begin, color="tab:red", height=0.8)
+    free, rows = -math.inf, 0
     for (before, moment), begin in zip(pairwise(told), seconds[1:].tolist(), strict=True):
         if changed := faults_changed(before, moment):
-            said = "\n".join(f"{sign}{fault}" for sign, fault in changed)
+            rows = rows if begin < free else 0
+            said = "\n" * rows + "\n".join(f"{sign}{fault}" for sign, fault in changed)
             axes.axvline(begin, color="tab:red", linestyle=":", linewidth=0.8)
             axes.text(begin, 4.4, said, color="tab:red", fontsize=7, va="top", clip_on=True)
+            free, rows = begin + LABEL * float(ends[-1] - seconds[0]), rows + len(changed)
     axes.set_yticks(range(5), ["state", *(f"{name} unknown" for name in AXES), "scan refused"], fontsize=8)
     axes.set_ylim(-0.5, 4.5)
 
@@ -143,28 +148,41 @@ def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     axes.legend(fontsize=7)
 
 
+def _two_scales(axes: Any, seconds: Array, left: tuple[str, list[float]], right: tuple[str, list[float]]) -> Any:
+    """A curve to the left axis and one to the right one, which is returned; each has the unit in its name."""
+    other = axes.twinx()
+    lines = [*axes.plot(seconds, left[1], "C0", label=left[0]), *other.plot(seconds, right[1], "C1", label=right[0])]
+    for side, colour in ((axes, "C0"), (other, "C1")):
+        side.tick_params(axis="y", colors=colour, labelsize=7)
+        side.set_ylim(bottom=0.0)
+    axes.legend(handles=lines, fontsize=7, loc="upper left")
+    return other
+
+
 def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
-    apart = np.array([(math.nan, math.nan) if one.wheels is None else one.wheels.apart for one in told])
-    odd = np.array([one.wheels is not None and not one.wheels.agree for one in told])
-    if np.isnan(apart).all():
+    """Nothing where a witness is silent: what it told last is no comparison."""
+    both = [None if False in (one.snapshot.odometry_ok, one.snapshot.lidar_ok) else one.wheels for one in told]
+    metres = [math.nan if said is None else said.apart[0] for said in both]
+    turned = [math.nan if said is None else math.degrees(said.apart[1]) for said in both]
+    if np.isnan(metres).all():
         _empty(axes, "wheels and laser could not be compared")
         return
-    axes.plot(seconds, apart[:, 0], label="wheels from laser, m")
-    axes.plot(seconds, apart[:, 1], label="rad")
-    axes.plot(seconds[odd], apart[odd, 0], ".", color="tab:red", label="they dissent")
-    axes.legend(fontsize=7)
+    _two_scales(axes, seconds, ("wheels from laser, m", metres), ("degrees", turned))
+    odd = np.array([said is not None and not said.agree for said in both])
+    axes.plot(seconds[odd], np.array(metres)[odd], ".", color="tab:red")
 
 
 def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     if all(one.snapshot.light is None for one in told):
         _empty(axes, "no photodiode")
         return
-    away = [math.nan if (far := light_apart(one)) is None else far[0] for one in told]
-    gap = [math.nan if (g := one.snapshot.trust.gap) is None else math.sqrt(g) for one in told]
+    speaks = [one.snapshot.adc_ok is not False for one in told]
+    places = [light_apart(one) if said else None for one, said in zip(told, speaks, strict=True)]
+    away = [math.nan if far is None else far[0] for far in places]
+    gaps = [one.snapshot.trust.gap if said else None for one, said in zip(told, speaks, strict=True)]
+    gap = [math.nan if g is None else math.sqrt(g) for g in gaps]
     if np.isnan([*away, *gap]).all():
         _empty(axes, "light told no place")
         return
-    axes.plot(seconds, away, label="light from pose, m")
-    axes.plot(seconds, gap, label="in deviations")
-    axes.axhline(math.sqrt(GAP), color="tab:red", linewidth=0.8)
-    axes.legend(fontsize=7)
+    other = _two_scales(axes, seconds, ("light from pose, m", away), ("in deviations", gap))
+    other.axhline(math.sqrt(GAP), color="tab:red", linewidth=0.8)
