@@ -17,6 +17,8 @@ _LAG_LASTS_S: Final = 3.0  # a lag that came slowly and still lasts: the sensor'
 _QUEUE_LASTS_S: Final = 600.0  # a lag that came at once: by then the rate's error (3e-5) has added up to a lag's worth
 _AT_ONCE_S: Final = 1.0  # from a quarter of LAG_S to all of it: ten times faster than a clock may be off (SLOPE_LIMIT)
 _BRIDGED: Final = 1e-4  # of the time without an edge: what its slope may have been off by
+_TELLS_S: Final = 10.0  # edges over so long tell the rate half: ways differ by 4 ms, rates of sensors by 4e-4
+_NEAR_S: Final = 1.0  # so far ahead of the last edge the line is the edges' own
 _BIN_S: Final = 0.25
 _WINDOW_S: Final = 30.0
 _LOOK_BACK_S: Final = 2.0
@@ -39,7 +41,7 @@ class Envelope:
         """Forget all points."""
         self._bins: deque[tuple[float, float]] = deque()  # lowest point of each quarter second: (x, delay)
         self._bin_end = -math.inf
-        self._slope = 0.0
+        self._slope = self._rate = 0.0
         self._base = 0.0
         self._x0 = 0.0
         self._lagging_since = math.inf
@@ -67,8 +69,14 @@ class Envelope:
         return x - self._bins[-1][0] if self._bins else 0.0
 
     def delay(self, x: float) -> float:
-        """Arrival less stamp of an undelayed scan, at sensor time ``x``; seconds."""
-        return self._base + self._slope * (x - self._x0)
+        """Arrival less stamp of an undelayed scan, at sensor time ``x``; seconds.
+
+        Where all has come late for a while the line goes on as the clocks do, as far as that is known: the slope of a
+        few seconds is that of the way's own changes, and would lead it off by a millisecond a second.
+        """
+        ahead = x - self._x0
+        near = min(ahead, _NEAR_S)
+        return self._base + self._slope * near + self._rate * (ahead - near)
 
     def feed(self, x: float, delay: float) -> float:
         """Take a point; returns its excess over the edge as now known, >= 0, in seconds."""
@@ -129,6 +137,7 @@ class Envelope:
             if x1 >= under:
                 break
         self._slope = min(max(slope, -SLOPE_LIMIT), SLOPE_LIMIT)
+        self._rate = self._slope / (1.0 + (_TELLS_S / max(last - first, _BIN_S)) ** 2)
         self._x0 = self._bins[-1][0]
         self._base = min(y + self._slope * (self._x0 - x) for x, y in hull)
 

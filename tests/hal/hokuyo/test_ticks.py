@@ -331,3 +331,15 @@ def test_the_envelope_lies_under_every_point_and_touches_one(points: list[tuple[
         gaps = [delay - envelope.delay(at) for at, delay in seen]
         assert min(gaps) > -1.5e-3 * 0.25 - 2e-3  # within a quarter second only the lowest point is kept
         assert min(gaps) < 1e-9
+
+
+def test_a_lag_soon_after_the_start_does_not_lead_the_stamps_off() -> None:
+    """Four seconds tell the way's jitter, not the clock's rate: by that slope stamps came to be 55 ms early."""
+    earliest = 0.0
+    for seed in range(40):
+        rng, envelope = np.random.default_rng(seed), Envelope(0.2)
+        for x in np.arange(0.0, 60.0, 0.2).tolist():
+            delay = 0.010 + (0.032 if x > 4.0 else 0.0) + float(rng.exponential(0.004))
+            envelope.feed(x, delay)
+            earliest = min(earliest, envelope.delay(x) - 0.010)
+    assert earliest > -0.010
