@@ -1,6 +1,6 @@
 """Turns a cycle's time budget into caps, from measured times; nothing below the cycle reads a clock.
 
-Order of degradation when time is short (`estimator.records.Rung`): first the scan is thinned and iterations are cut,
+Order of degradation when time is short (`estimator.records.Rung`): first iterations are cut and the scan is thinned,
 then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off for good.
 """
 
@@ -17,13 +17,20 @@ from estimator.records import UNLIMITED, Limits, Rung
 from estimator.result import StepResult
 
 ENOUGH_ITERATIONS: Final = 12
-"""Iterations that a match hardly ever exceeds; thinning the scan starts where these do not fit any more."""
-FEWEST_ITERATIONS: Final = 3
+"""Iterations that a match hardly ever exceeds: more are cut first, for they are those of a second opinion; where these
+do not fit, the scan is thinned."""
 FEWEST_POINTS: Final = 120
-FIXED: Final = 15_000
+DENSE: Final = 400
+COARSE: Final = 4
+"""Scans of more points are matched on every fourth one at first: as in `estimator.matching.MatchSettings`, which is not
+asked, for the compiler comes with it (a test holds them equal)."""
+FIXED: Final = 6500
 """What a match costs beside its iterations, in passes of one point through one iteration: cutting both saves only the
-rest. Measured: 682 points in 5 iterations take 82 us of the 434 us of a match, 114 points in 3 iterations 23 of 400; a
-pass is 24 ns. Interpreter and kernels become slower together, so the ratio is taken to hold on other computers."""
+rest. Measured with Debian's Python on x86: 682 points in 5 iterations, most on every fourth point, take 82 us of the
+434 us of a match, 114 in 3 iterations 23 of 400: 53 and 67 ns a pass, 6600 and 5600 of them beside. Another interpreter
+or processor shifts that; what is then cut in vain, or too late, overruns tell."""
+HOPELESS: Final = 2.0
+"""A match that takes so many times what is left takes the whole period, of which the budget is half: scans are lost."""
 LONGEST_MAP_WAIT: Final = 20
 """Cycles in a row that may put off map work: a quarter of a metre, a keyframe, at 40 Hz and half a metre a second."""
 PROBE_EVERY: Final = 40
@@ -150,18 +157,21 @@ class MeasuredBudget:
     def _ladder(self, light: bool) -> Ladder:
         return self._lit if light else self._plain
 
-    def _match_us(self, iterations: int, points: int) -> float:
-        """What a match costs that takes so many of both."""
-        return self._pass.us * (FIXED + iterations * min(points, self._queries))
+    def _match_us(self, points: int) -> float:
+        """What a match of so many points, or all there are, costs."""
+        return self._pass.us * (FIXED + passes(ENOUGH_ITERATIONS, min(points, self._queries)))
 
     def _fits(self, left_us: float) -> Rung:
-        """The best rung that so many microseconds allow."""
-        least_us = self._match_us(FEWEST_ITERATIONS, FEWEST_POINTS)
-        if left_us >= self._match_us(ENOUGH_ITERATIONS, self._queries) + self._map.us:
+        """The best rung that so many microseconds allow.
+
+        A match that does not fit is no reason to leave the laser out unless it is hopeless: overruns are (`Ladder`).
+        """
+        least_us = self._match_us(FEWEST_POINTS)
+        if left_us >= self._match_us(self._queries) + self._map.us:
             return Rung.FULL
         if left_us >= least_us + self._map.us:
             return Rung.THINNED
-        return Rung.NO_MAP if left_us >= least_us else Rung.CARRIED
+        return Rung.NO_MAP if HOPELESS * left_us >= least_us else Rung.CARRIED
 
     def _pass_over(self) -> bool:
         """Whether a scan is passed over: now and then a few are not, or it would never be known that there is time."""
@@ -169,15 +179,16 @@ class MeasuredBudget:
         return self._passed % PROBE_EVERY >= PROBES
 
     def _matching(self, left_us: float, with_map: bool) -> tuple[int, int]:
-        """Iterations and points that fit: first the scan is thinned, then iterations are cut."""
+        """Iterations and points that fit: first iterations beyond enough are cut, then the scan is thinned."""
         if with_map:
             left_us -= self._map.us
-        passes = max(0.0, left_us / self._pass.us - FIXED)
+        room = max(0.0, left_us / self._pass.us - FIXED)
         points = UNLIMITED.points
-        if ENOUGH_ITERATIONS * self._queries > passes:
-            points = max(FEWEST_POINTS, int(passes / ENOUGH_ITERATIONS))
-        iterations = math.floor(passes / max(1, min(points, self._queries)))
-        return min(UNLIMITED.icp_iterations, max(FEWEST_ITERATIONS, iterations)), points
+        if passes(ENOUGH_ITERATIONS, self._queries) > room:
+            points = max(FEWEST_POINTS, int(room / ENOUGH_ITERATIONS))
+        taken = min(points, self._queries)
+        iterations = math.floor((room - passes(0, taken)) / (passes(1, taken) - passes(0, taken)))
+        return min(UNLIMITED.icp_iterations, max(ENOUGH_ITERATIONS, iterations)), points
 
     def _codes(self, budget_us: float) -> int:
         if self._code_us <= 0.0:
@@ -198,14 +209,23 @@ class MeasuredBudget:
         self._rest.learn(sum(took for stage, took in us.items() if stage not in _APART))
         match = result.match
         if match is not None and match.iterations > 0 and match.queries > 0:
-            # cost grows with the points; it is kept for the fullest scan seen lately, so that a thinned one teaches too
+            # of the fullest scan seen lately: thinned ones tell the cost of a pass, not how many a full one takes
             self._queries = max(match.queries, int(0.999 * self._queries))
-            self._pass.learn(us.get("match", 0) / (FIXED + match.iterations * match.queries))
+            self._pass.learn(us.get("match", 0) / (FIXED + passes(match.iterations, match.queries)))
         if result.keyframe >= 0 and "map" in us:
             self._map.learn(us["map"])
-        saving = {Rung.FULL: us.get("match", 0), Rung.THINNED: us.get("map", 0), Rung.NO_MAP: us.get("match", 0)}
+        thinning_us = self._match_us(self._queries) - self._match_us(FEWEST_POINTS)
+        mapping_us = us.get("map", 0)
+        saving = {Rung.FULL: max(thinning_us, mapping_us), Rung.THINNED: mapping_us, Rung.NO_MAP: us.get("match", 0)}
         helps = saving.get(Rung(limits.rung), 0) > WORTH_IT * spent.budget_us
         self._ladder(spent.light).ended(sum(us.values()) > spent.budget_us, helps)
+
+
+def passes(iterations: int, points: int) -> float:
+    """Points that all iterations pass through: of a dense scan every fourth one, and all of them at last."""
+    if points <= DENSE:
+        return iterations * points
+    return iterations * points / COARSE + points
 
 
 _APART: Final = ("lights", "match", "map")
