@@ -22,7 +22,9 @@ _MARGIN_M: Final = 4.0
 LAST_S: Final = 0.05
 """How long the last cycle is drawn."""
 LABEL: Final = 0.06
-"""Part of the time shown that a fault's numbers take, which the next ones near it leave free."""
+"""Part of the time shown that a fault's number takes: the next one goes below it."""
+LABELS: Final = 8
+"""Rows of them; where all are taken they begin anew."""
 COLOURS: Final = {
     State.TRACKING: "tab:green",
     State.MAPPING: "tab:blue",
@@ -124,14 +126,16 @@ def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
                 axes.barh(axis + 1, end - begin, left=begin, color="tab:red", height=0.8)
         if laser_dissents(moment):
             axes.barh(4, end - begin, left=begin, color="tab:red", height=0.8)
-    free, rows = -math.inf, 0
+    free = [-math.inf] * LABELS  # until when each row of labels is taken
     for (before, moment), begin in zip(pairwise(told), seconds[1:].tolist(), strict=True):
-        if changed := faults_changed(before, moment):
-            rows = rows if begin < free else 0
-            said = "\n" * rows + "\n".join(f"{sign}{fault}" for sign, fault in changed)
-            axes.axvline(begin, color="tab:red", linestyle=":", linewidth=0.8)
-            axes.text(begin, 4.4, said, color="tab:red", fontsize=7, va="top", clip_on=True)
-            free, rows = begin + LABEL * float(ends[-1] - seconds[0]), rows + len(changed)
+        if not (changed := faults_changed(before, moment)):
+            continue
+        axes.axvline(begin, color="tab:red", linestyle=":", linewidth=0.8)
+        for sign, fault in changed:
+            row = next((row for row, until in enumerate(free) if until <= begin), 0)
+            free[row] = begin + LABEL * float(ends[-1] - seconds[0])
+            said, y = f"{sign}{fault}", 4.4 - 5.0 * row / LABELS
+            axes.text(begin, y, said, color="tab:red", fontsize=7, va="top", clip_on=True)
     axes.set_yticks(range(5), ["state", *(f"{name} unknown" for name in AXES), "scan refused"], fontsize=8)
     axes.set_ylim(-0.5, 4.5)
 
@@ -148,14 +152,19 @@ def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     axes.legend(fontsize=7)
 
 
-def _two_scales(axes: Any, seconds: Array, left: tuple[str, list[float]], right: tuple[str, list[float]]) -> Any:
-    """A curve to the left axis and one to the right one, which is returned; each has the unit in its name."""
+def _two_scales(
+    axes: Any, seconds: Array, left: tuple[str, list[float]], right: tuple[str, list[float]], more: Sequence[Any] = ()
+) -> Any:
+    """A curve to the left axis and one to the right one, which is returned; each has the unit in its name.
+
+    ``more``: of the left one, to be named as well.
+    """
     other = axes.twinx()
     lines = [*axes.plot(seconds, left[1], "C0", label=left[0]), *other.plot(seconds, right[1], "C1", label=right[0])]
     for side, colour in ((axes, "C0"), (other, "C1")):
         side.tick_params(axis="y", colors=colour, labelsize=7)
         side.set_ylim(bottom=0.0)
-    axes.legend(handles=lines, fontsize=7, loc="upper left")
+    axes.legend(handles=[*lines, *more], fontsize=7, loc="upper left")
     return other
 
 
@@ -167,9 +176,11 @@ def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     if np.isnan(metres).all():
         _empty(axes, "wheels and laser could not be compared")
         return
-    _two_scales(axes, seconds, ("wheels from laser, m", metres), ("degrees", turned))
     odd = np.array([said is not None and not said.agree for said in both])
-    axes.plot(seconds[odd], np.array(metres)[odd], ".", color="tab:red")
+    dots = (
+        axes.plot(seconds[odd], np.array(metres)[odd], ".", color="tab:red", label="they dissent") if odd.any() else []
+    )
+    _two_scales(axes, seconds, ("wheels from laser, m", metres), ("degrees", turned), dots)
 
 
 def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
@@ -185,4 +196,6 @@ def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
         _empty(axes, "light told no place")
         return
     other = _two_scales(axes, seconds, ("light from pose, m", away), ("in deviations", gap))
-    other.axhline(math.sqrt(GAP), color="tab:red", linewidth=0.8)
+    most = math.sqrt(GAP)
+    other.axhline(most, color="tab:red", linewidth=0.8)
+    other.set_ylim(0.0, max(other.get_ylim()[1], 1.1 * most))  # how far it is from there is what one looks for

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from tests.logs.entries import BY_NAME, ENTRIES, NO_DATA, Entry, NotThere, chosen, data_folder
 
-if TYPE_CHECKING:  # loaded once what was asked for can be done: with it comes the estimator, which is compiled at first
+if TYPE_CHECKING:  # loaded once it is known what is to be replayed: with it comes the estimator, compiled at first
     from tests.logs import golden
 
 
@@ -46,10 +46,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--all", action="store_true", help="real logs that are not here fail, too")
     args = parser.parse_args(arguments)
     try:
-        entries, data = chosen(args.name), data_folder()
+        entries = chosen(args.name)
+        data = data_folder(entries)
     except NotThere as error:
         parser.error(str(error))
-    load_estimator()
+    if data is not None or not all(entry.source for entry in entries):
+        load_estimator()
     from tests.logs import golden
     from tests.logs.catalog import OtherLog
 

@@ -69,10 +69,12 @@ def main() -> int:
     if len(reason.strip()) <= 10:
         parser.error(f"--reason {args.reason!r} says nothing to whoever reads the file in a year: 11 letters at least")
     try:
-        entries, data = chosen(args.name), data_folder()
+        entries = chosen(args.name)
+        data = data_folder(entries)
     except NotThere as error:
         parser.error(str(error))
-    load_estimator()
+    if data is not None or not all(entry.source for entry in entries):
+        load_estimator()
     from tests.logs import golden
     from tests.logs.catalog import OtherLog
 

@@ -54,17 +54,17 @@ BY_NAME: Final = {entry.name: entry for entry in ENTRIES}
 
 
 class NotThere(Exception):
-    """What is to be the folder of real logs is none; the text says so."""
+    """There is no log of that name, or what is to be the folder of real ones is none; the text says so."""
 
 
-def data_folder() -> Path | None:
-    """Where real logs are, as the environment says; None: it does not.
+def data_folder(entries: list[Entry]) -> Path | None:
+    """Where real logs are, as the environment says; None: it does not, or none of these is one.
 
     Raises:
         NotThere: what it names is no folder.
     """
     named = os.environ.get(VARIABLE)
-    if not named:
+    if not named or not any(entry.source for entry in entries):
         return None
     if not Path(named).is_dir():
         raise NotThere(

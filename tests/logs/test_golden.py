@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -198,3 +201,20 @@ def test_what_moved_says_where_that_began(tmp_path: Path, monkeypatch: pytest.Mo
     assert "kept stamp 5 is the first that differs: no more, 149.000000 when" in said(stamps[:41], poses[:41])
     moved[30, 0] = np.nan
     assert "first at stamp 120.000000" in said(stamps, moved)
+
+
+def test_what_cannot_be_done_is_said_before_anything_is_loaded() -> None:
+    code = (
+        "import sys\nfrom tests.logs.__main__ import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    print(end.code, 'numba' in sys.modules)"
+    )
+
+    def said(*words: str, **names: str) -> tuple[str, str]:
+        command = [sys.executable, "-c", code, *words]
+        done = subprocess.run(command, env={**os.environ, **names}, capture_output=True, text=True, check=True)
+        return done.stdout.splitlines()[-1], done.stderr
+
+    assert said("--help")[0] == "0 False"
+    last, error = said("intel", LUMILOOP_DATA="/nowhere")
+    assert last == "2 False"
+    assert "LUMILOOP_DATA=/nowhere: no such folder" in error

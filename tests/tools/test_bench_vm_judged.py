@@ -13,7 +13,7 @@ import pytest
 
 from tools.bench.report import About, Figure, Result, Seen, write
 from tools.bench.vm import __main__ as command
-from tools.bench.vm import trying_removal, trying_system
+from tools.bench.vm import common, trying_removal, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.machine import Order
 from tools.bench.world import agreement
@@ -76,6 +76,34 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
             less.setattr(trying_system, name, 0.011)
             with pytest.raises(Order, match="late by: 12"):
                 trying_system.agrees_with_outside(driven(5.0))
+
+
+@pytest.mark.parametrize(
+    ("slower", "late_s", "right"), [(0.8, 0.019, True), (0.8, 0.021, False), (2.0, 0.03, True), (2.0, 0.045, False),
+                                    (9.0, 0.049, True), (9.0, 0.051, False)],
+)  # fmt: skip
+def test_a_slower_computer_may_be_later(
+    slower: float, late_s: float, right: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    way = np.arange(0.0, 20.0, 0.05)
+    monkeypatch.setattr(trying_system, "outside", lambda: Trace(way, np.zeros((len(way), 2))))
+    monkeypatch.setattr(agreement, "lateness", lambda *_: np.full(51, late_s))
+    monkeypatch.setattr(trying_system, "AGREE_M", 1.0)  # of poses that were not late
+    bench = driven(5.0)
+    bench.slower = slower
+    if right:
+        trying_system.agrees_with_outside(bench)
+    else:
+        with pytest.raises(Order, match="late by: "):
+            trying_system.agrees_with_outside(bench)
+
+
+def test_what_a_busy_computer_keeps_waiting_is_slow_too() -> None:
+    told = {"worked": iter([3.0, 3.5]), "waited": iter([1.0, 1.3])}
+    machine = SimpleNamespace(
+        run=lambda *_: "", worked_s=lambda: next(told["worked"]), waited_s=lambda: next(told["waited"])
+    )
+    assert common.pace(machine) == pytest.approx(0.8)  # type: ignore[arg-type]  # all that is asked
 
 
 def test_a_drive_whose_end_was_left_undone_agrees_until_then(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 from tools.bench.report import Seen
 from tools.bench.vm.bench import PLACED, UNIT, Bench, Heard
-from tools.bench.vm.machine import Order, all_well
+from tools.bench.vm.machine import Machine, Order, all_well
 
 Scenario = Callable[[Bench], str | Seen]
 WRITTEN: Final[list[Scenario]] = []
@@ -25,8 +25,8 @@ RIGHT_S: Final = 2.0
 """Ten poses, driven over more than a metre."""
 PACE: Final = "i=0; while [ $i -lt 20000 ]; do i=$((i+1)); done"
 USUAL_S: Final = 0.4
-"""Processor time that the emulation may take for `PACE` on a usual machine. Measured: 0.67 s on one that boots in 24 s;
-usual ones boot in 15, so this is reckoned from that (docs/bench.md)."""
+"""What `pace` tells of a usual machine. Measured: 0.67 s on one that boots in 24 s; usual ones boot in 15, so this is
+reckoned from that (docs/bench.md)."""
 
 
 def scenario(daemon: Daemon = "same") -> Callable[[Scenario], Scenario]:
@@ -82,15 +82,18 @@ def map_id(bench: Bench) -> int:
     return int(struct.unpack(">I", bench.registers(46, 2))[0])
 
 
+def pace(machine: Machine) -> float:
+    """Seconds that `PACE` takes: of the emulation's processor time, with the time it had to wait for a processor."""
+    worked, waited = machine.worked_s(), machine.waited_s()
+    machine.run("sh", "-c", PACE)
+    return (machine.worked_s() or 0.0) - (worked or 0.0) + machine.waited_s() - waited
+
+
 def come_up(bench: Bench) -> str:
     """Go on with the system inside as it came up when its image was made; raises `Order` if a unit has failed."""
     seconds = bench.machine.go_on()
     all_well(bench.machine)
-    before = bench.machine.worked_s()
-    bench.machine.run("sh", "-c", PACE)
-    after = bench.machine.worked_s()
-    if before is not None and after is not None:
-        bench.slower = (after - before) / USUAL_S
+    bench.slower = pace(bench.machine) / USUAL_S
     return (
         f"up {bench.booted_s:.0f} s after it was switched on, when the image was made; going on after {seconds:.1f} s; "
         f"a fixed piece of work takes it {bench.slower:.1f} times as long as is reckoned with"
