@@ -13,17 +13,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tests.logs.entries import BY_NAME, ENTRIES, NO_DATA, Entry, NotThere, chosen, data_folder
+from tests.logs.entries import BY_NAME, ENTRIES, NO_DATA, Entry, asked
 
 if TYPE_CHECKING:  # loaded once it is known what is to be replayed: with it comes the estimator, compiled at first
     from tests.logs import golden
-
-
-def load_estimator() -> None:
-    """Say that it is compiled, where it is."""
-    from daemon import cli, warmup
-
-    warmup.load_aloud(cli.say, "warm", warmup.load)
 
 
 def checked(entry: Entry, root: Path | None) -> golden.Verdict:
@@ -45,13 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("name", nargs="*", help=f"which logs; default: all of {', '.join(BY_NAME)}")
     parser.add_argument("--all", action="store_true", help="real logs that are not here fail, too")
     args = parser.parse_args(arguments)
-    try:
-        entries = chosen(args.name)
-        data = data_folder(entries)
-    except NotThere as error:
-        parser.error(str(error))
-    if data is not None or not all(entry.source for entry in entries):
-        load_estimator()
+    entries, data = asked(parser, args.name)
     from tests.logs import golden
     from tests.logs.catalog import OtherLog
 

@@ -13,8 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tests.logs.__main__ import load_estimator
-from tests.logs.entries import BY_NAME, NO_DATA, Entry, NotThere, chosen, data_folder
+from tests.logs.entries import BY_NAME, NO_DATA, Entry, asked
 
 if TYPE_CHECKING:
     from daemon.results import Trajectory
@@ -68,13 +67,7 @@ def main() -> int:
     reason = "reference of this machine" if args.here else args.reason
     if len(reason.strip()) <= 10:
         parser.error(f"--reason {args.reason!r} says nothing to whoever reads the file in a year: 11 letters at least")
-    try:
-        entries = chosen(args.name)
-        data = data_folder(entries)
-    except NotThere as error:
-        parser.error(str(error))
-    if data is not None or not all(entry.source for entry in entries):
-        load_estimator()
+    entries, data = asked(parser, args.name)
     from tests.logs import golden
     from tests.logs.catalog import OtherLog
 

@@ -1,7 +1,8 @@
-"""Which logs are watched. Loads nothing of the estimator, so that a command can tell its names before that."""
+"""Which logs are watched. Imports nothing of the estimator: a command tells its names before that is compiled."""
 
 from __future__ import annotations
 
+import argparse
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,3 +83,20 @@ def chosen(names: list[str]) -> list[Entry]:
     if unknown := sorted(set(names) - set(BY_NAME)):
         raise NotThere(f"no such log: {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
     return [entry for entry in ENTRIES if not names or entry.name in names]
+
+
+def asked(parser: argparse.ArgumentParser, names: list[str]) -> tuple[list[Entry], Path | None]:
+    """What a command was asked for, and where real logs are; ends it with a text where one of them is not there.
+
+    The estimator is loaded with it, which says that it is compiled where it is, unless nothing can be replayed.
+    """
+    try:
+        entries = chosen(names)
+        data = data_folder(entries)
+    except NotThere as error:
+        parser.error(str(error))
+    if data is not None or not all(entry.source for entry in entries):
+        from daemon import cli, warmup
+
+        warmup.load_aloud(cli.say, "warm", warmup.load)
+    return entries, data
