@@ -29,8 +29,6 @@ FIXED: Final = 6500
 rest. Measured with Debian's Python on x86: 682 points in 5 iterations, most on every fourth point, take 82 us of the
 434 us of a match, 114 in 3 iterations 23 of 400: 53 and 67 ns a pass, 6600 and 5600 of them beside. Another interpreter
 or processor shifts that; what is then cut in vain, or too late, overruns tell."""
-HOPELESS: Final = 2.0
-"""A match that takes so many times what is left takes the whole period, of which the budget is half: scans are lost."""
 LONGEST_MAP_WAIT: Final = 20
 """Cycles in a row that may put off map work: a quarter of a metre, a keyframe, at 40 Hz and half a metre a second."""
 PROBE_EVERY: Final = 40
@@ -145,13 +143,13 @@ class MeasuredBudget:
         if self._pass.us <= 0.0:
             return replace(UNLIMITED, codes=codes)
         left_us = budget_us - self._rest.us - (self._light.us if light else 0.0)
-        rung = self._ladder(light).take(self._fits(left_us))
+        rung = self._ladder(light).take(self._fits(left_us, budget_us))
         if rung is Rung.CARRIED and not (carrier and self._pass_over()):
             rung = Rung.NO_MAP
         update_map = rung < Rung.NO_MAP or (rung is Rung.NO_MAP and self._waited >= LONGEST_MAP_WAIT)
         if update_map:
             rung = min(rung, Rung.THINNED)
-        iterations, points = self._matching(left_us, update_map and self._fits(left_us) < Rung.NO_MAP)
+        iterations, points = self._matching(left_us, update_map and self._fits(left_us, budget_us) < Rung.NO_MAP)
         return Limits(iterations, points, update_map, codes, rung)
 
     def _ladder(self, light: bool) -> Ladder:
@@ -161,17 +159,18 @@ class MeasuredBudget:
         """What a match of so many points, or all there are, costs."""
         return self._pass.us * (FIXED + passes(ENOUGH_ITERATIONS, min(points, self._queries)))
 
-    def _fits(self, left_us: float) -> Rung:
+    def _fits(self, left_us: float, budget_us: float) -> Rung:
         """The best rung that so many microseconds allow.
 
-        A match that does not fit is no reason to leave the laser out unless it is hopeless: overruns are (`Ladder`).
+        A match that does not fit is no reason to leave the laser out: overruns are (`Ladder`), or a cycle that would
+        take twice its budget, which is the whole period: scans would be lost.
         """
         least_us = self._match_us(FEWEST_POINTS)
         if left_us >= self._match_us(self._queries) + self._map.us:
             return Rung.FULL
         if left_us >= least_us + self._map.us:
             return Rung.THINNED
-        return Rung.NO_MAP if HOPELESS * left_us >= least_us else Rung.CARRIED
+        return Rung.NO_MAP if left_us + budget_us >= least_us else Rung.CARRIED
 
     def _pass_over(self) -> bool:
         """Whether a scan is passed over: now and then a few are not, or it would never be known that there is time."""
