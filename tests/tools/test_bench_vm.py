@@ -43,7 +43,8 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) >= 25
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
     names = [[part.__name__.rpartition("_")[2] for part in parts] for parts in PARTS]
-    assert names == [["system", "devices"], ["photodiode", "process"], ["computer", "surroundings", "removal"]]
+    third = ["process", "computer", "surroundings", "removal"]
+    assert names == [["system", "devices"], ["photodiode"], third]
 
 
 def test_scenarios_up_to_the_named_ones_and_only_the_computers_that_they_take() -> None:
@@ -171,11 +172,11 @@ def test_what_was_published_inside_is_compared_with_outside() -> None:
         return agreement.trace_of(stamps, made.pose[part], fine, scene.truth(fine))
 
     count, every = len(made.t_mono), slice(None)
-    assert agreement.differences(traced(every, np.zeros(count)), outside)[1].max() > 0.005
+    assert agreement.differences(traced(every, np.zeros(count)), outside)[1].max() > 0.0045, "12 ms at 0.4 m/s"
     late = agreement.lateness(np.arange(0.0, 0.04, 0.001), traced, count, outside)
     assert late[-1] == pytest.approx(0.012, abs=0.0011)
     assert np.median(late[made.t_mono < made.t_mono[0] + 9.0][-10:]) == pytest.approx(0.004, abs=0.0011)
-    assert agreement.differences(traced(every, late), outside)[1].max() < 5e-3, "one group has both"
+    assert agreement.differences(traced(every, late), outside)[1].max() < 3.5e-3, "one group has both"
 
 
 class Agent(Machine):

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from tools.bench.plots import Plot
+from tools.bench.report import Figure, Seen
 from tools.bench.vm import bench, common, guests, places
 from tools.bench.vm.booted import Booted
-from tools.bench.vm.guests import Guest, run_all, tried
+from tools.bench.vm.guests import Guest, Turns, run_all, tried
 from tools.bench.vm.image import Image
 
 
@@ -39,6 +41,7 @@ def like(function: Callable[[bench.Bench], str], daemon: common.Daemon = "same")
 def _only_the_lists_own_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(common, "AFTER", dict(common.AFTER))
     monkeypatch.setattr(guests, "AFTER", common.AFTER)
+    monkeypatch.setattr(guests, "ALONE", set())
 
 
 def passes(bench: bench.Bench) -> str:
@@ -55,6 +58,18 @@ def test_a_scenario_that_builds_on_one_that_failed_fails_itself() -> None:
     result = tried(like(needs_more), Lived((0, 0)))  # type: ignore[arg-type]  # all that is looked at
     assert not result.passed
     assert result.said == "what it builds on has not been seen: KeyError('drive')"
+
+
+def falls_short(bench: bench.Bench) -> str:
+    """It is not what it should be."""
+    raise common.Unmet("12 mm", Seen("150 poses", (Figure("apart", 12.0, "mm"),), (Plot("apart", "m", "mm", ()),)))
+
+
+def test_what_falls_short_is_reported_with_its_figures_and_plots() -> None:
+    result = tried(like(falls_short), Lived((0, 0)))  # type: ignore[arg-type]  # all that is looked at
+    assert not result.passed
+    assert result.said == "12 mm"
+    assert ([str(one) for one in result.figures], [one.title for one in result.plots]) == (["apart: 12 mm"], ["apart"])
 
 
 @pytest.mark.parametrize(
@@ -197,6 +212,63 @@ def test_a_slow_emulation_runs_two_computers_at_a_time(
     assert told == (["the emulation is 2.5 times slower than usual: 2 computers at a time"] if slower > 1.4 else [])
 
 
+@pytest.mark.parametrize(("slower", "beside"), [(1.0, True), (2.5, False)])
+def test_a_drive_that_is_compared_has_a_slow_machine_to_itself(
+    slower: float, beside: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second computer has one scenario after the other; none of them in the first one's drive, where it is slow."""
+    running: set[str] = set()
+    seen: list[set[str]] = []
+    lock, known = threading.Lock(), threading.Barrier(2)
+
+    def comes_up(bench: bench.Bench) -> str:
+        """Both know how fast they are before either goes on."""
+        known.wait(20.0)
+        return "up"
+
+    def goes(name: str, seconds: float) -> common.Scenario:
+        def scenario(bench: bench.Bench) -> str:
+            """It takes a while."""
+            with lock:
+                running.add(name)
+                seen.append(set(running))
+            bench.machine.broken_off.wait(seconds)
+            with lock:
+                seen.append(set(running))
+                running.discard(name)
+            return "seen"
+
+        return like(scenario)
+
+    def made(booted: Booted, folder: Path, broken_off: threading.Event, nice: int) -> Playing:
+        playing = Playing(broken_off)
+        playing.slower = slower
+        return playing
+
+    drives, others = goes("drives", 0.3), [goes(f"other {k}", 0.05) for k in range(20)]
+    monkeypatch.setattr(guests, "bench", made)
+    monkeypatch.setattr(guests, "ALONE", {drives})
+    monkeypatch.setattr(guests, "LOOK_S", 0.01)
+    (tmp_path / "work").mkdir()
+    both = [Guest(1, [like(comes_up), drives]), Guest(2, [comes_up, *others])]
+    assert run_all(both, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    assert all(one.passed for guest in both for one in guest.results)
+    assert any(len(names) == 2 for names in seen if "drives" in names) is beside
+    assert any("drives" in names for names in seen)
+
+
+def test_who_waits_for_a_turn_can_be_broken_off_and_holds_up_nobody_then() -> None:
+    turns, broken_off = Turns(), threading.Event()
+    broken_off.set()
+    with turns.taken(False, threading.Event()):
+        with pytest.raises(places.BrokenOff), turns.taken(True, broken_off):
+            pass
+        with turns.taken(False, threading.Event()):  # nobody wants to be alone any more
+            pass
+    with turns.taken(True, broken_off), pytest.raises(places.BrokenOff), turns.taken(False, broken_off):
+        pass
+
+
 def test_what_the_emulation_has_worked_is_told_with_each_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -220,7 +292,7 @@ def test_a_computer_without_a_folder_to_work_in_says_what_was_not_run(tmp_path: 
     told: list[str] = []
     guest = Guest(1, [like(passes), passes])
     with pytest.raises(FileNotFoundError):
-        guest.run(kept(tmp_path), tmp_path / "gone" / "1", tmp_path, told.append)
+        guest.run(kept(tmp_path), tmp_path / "gone" / "1", tmp_path, told.append, Turns())
     assert [one.outcome for one in guest.results] == ["skipped", "skipped"]
     assert all("the bench has met an error of its own" in text for text in told)
     assert len(told) == 2

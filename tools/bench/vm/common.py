@@ -18,23 +18,27 @@ Daemon = Literal["same", "anew", "restarted", "gone"]
 AFTER: Final[dict[Scenario, Daemon]] = {}
 """What the daemon is after each: the same process as before; one that a person or the computer's start has started,
 and which has lived since; one that the service manager has restarted once; none."""
+ALONE: Final[set[Scenario]] = set()
+"""Those during which no other computer is to take its processor, where the emulation is slow."""
 TRACKING_S: Final = 60.0
 WORST_M: Final = 0.10
 RESTING_M: Final = 0.05
 RIGHT_S: Final = 2.0
-"""Ten poses, driven over more than a metre."""
+"""Ten poses, driven over 0.8 m."""
 PACE: Final = "i=0; while [ $i -lt 20000 ]; do i=$((i+1)); done"
 USUAL_S: Final = 0.4
 """What `pace` tells of a usual machine. Measured: 0.67 s on one that boots in 24 s; usual ones boot in 15, so this is
 reckoned from that (docs/bench.md)."""
 
 
-def scenario(daemon: Daemon = "same") -> Callable[[Scenario], Scenario]:
-    """A decorator: it is one of the list, and leaves the daemon so."""
+def scenario(daemon: Daemon = "same", alone: bool = False) -> Callable[[Scenario], Scenario]:
+    """A decorator: it is one of the list, and leaves the daemon so; ``alone``: see :data:`ALONE`."""
 
     def kept(function: Scenario) -> Scenario:
         WRITTEN.append(function)
         AFTER[function] = daemon
+        if alone:
+            ALONE.add(function)
         return function
 
     return kept
@@ -54,6 +58,14 @@ def unnoticed(bench: Bench, wanted: Daemon) -> str:
         return ""
     told = " has become ".join(f"process {pid} with {count} restarts" for pid, count in (before, now))
     return f"the daemon has died unnoticed: {told} ({wanted} was expected)\n{bench.log(20)}"
+
+
+class Unmet(Order):
+    """What was seen is not what it should be; it is reported with its figures and plots all the same."""
+
+    def __init__(self, text: str, seen: Seen) -> None:
+        super().__init__(text)
+        self.seen = seen
 
 
 def need(holds: object, text: str | Callable[[], str]) -> None:

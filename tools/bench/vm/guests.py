@@ -7,7 +7,8 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -15,13 +16,16 @@ from typing import Final
 from tools.bench.report import Figure, Result, Seen
 from tools.bench.vm.bench import Bench, bench
 from tools.bench.vm.booted import Booted
-from tools.bench.vm.common import AFTER, Scenario, unnoticed
+from tools.bench.vm.common import AFTER, ALONE, Scenario, Unmet, unnoticed
 from tools.bench.vm.machine import Order
 from tools.bench.vm.places import BrokenOff, CannotBench
 
 JOURNAL: Final = ("journalctl", "--no-pager", "-o", "short-monotonic", "-n", "3000")
-BEHIND: Final = {2: 5, 3: 5}
-"""Which computer stands back (nice(1)): the first one's drive is compared with one outside, to a centimetre."""
+BEHIND: Final = {2: 10, 3: 5}
+"""Which computer stands back (nice(1)): the first one's drive is compared with one outside, to a centimetre; the third
+one has most to do."""
+LONGEST: Final = 3
+"""The computer that has most to do is the first to be switched on."""
 SIDE_BY_SIDE: Final = 2
 """So many computers of three, where the emulation is slow: a third one would starve them of their two processors."""
 SLOW: Final = 1.4
@@ -52,6 +56,8 @@ def tried(scenario: Scenario, bench: Bench) -> Result:
         seen = told if isinstance(told, Seen) else Seen(told)
     except (CannotBench, BrokenOff):
         raise
+    except Unmet as error:
+        seen, passed = replace(error.seen, said=f"{error}"), False
     except LookupError as error:
         seen, passed = Seen(f"what it builds on has not been seen: {error!r}"), False
     except (Order, OSError, ValueError, StopIteration) as error:
@@ -73,6 +79,44 @@ def _lost(scenario: Scenario, bench: Bench) -> str:
         return f"what has become of the daemon is not known: {error}"
 
 
+class Turns:
+    """Who tries a scenario: several at once, or one that wants to be alone.
+
+    Who wants that waits until the others have ended theirs, and they wait with their next ones from then on: they are
+    between two scenarios, where nothing is asked of their daemons.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Condition()
+        self._running = 0
+        self._alone = False
+
+    @contextmanager
+    def taken(self, alone: bool, broken_off: threading.Event) -> Iterator[None]:
+        """A turn; raises `BrokenOff` instead where the run is to end."""
+        with self._lock:
+            self._wait(lambda: not self._alone, broken_off)
+            self._alone = alone
+            try:
+                self._wait(lambda: not (alone and self._running), broken_off)
+            except BrokenOff:
+                self._alone = False
+                raise
+            self._running += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._running -= 1
+                self._alone = self._alone and not alone
+                self._lock.notify_all()
+
+    def _wait(self, free: Callable[[], bool], broken_off: threading.Event) -> None:
+        while not self._lock.wait_for(free, LOOK_S):
+            if broken_off.is_set():
+                raise BrokenOff
+
+
 @dataclass(slots=True)
 class Guest:
     """One emulated computer, its share, and what has come of it so far.
@@ -86,15 +130,17 @@ class Guest:
     slower: float | None = None
     broken_off: threading.Event = field(default_factory=threading.Event)
 
-    def run(self, booted: Booted, folder: Path, out: Path, say: Say) -> None:
+    def run(self, booted: Booted, folder: Path, out: Path, say: Say, turns: Turns) -> None:
         """Try them, until it ends or is broken off; its console and its journal stay in ``out``."""
         why = "the bench has met an error of its own, which it has written"
         try:
             folder.mkdir()
             with bench(booted, folder, self.broken_off, BEHIND.get(self.number, 0)) as whole:
                 for scenario in self.share:
-                    before = whole.machine.worked_s()
-                    one = tried(scenario, whole)
+                    alone = scenario in ALONE and self.slower is not None and self.slower > SLOW
+                    with turns.taken(alone, self.broken_off):
+                        before = whole.machine.worked_s()
+                        one = tried(scenario, whole)
                     after = whole.machine.worked_s()
                     if before is not None and after is not None:
                         worked = Figure("work of the emulation", after - before, "CPU s")
@@ -133,7 +179,7 @@ def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: S
     Where the emulation is found to be slow, no more than `SIDE_BY_SIDE` run at once: what a computer leaves undone for
     want of its processor would be told of the daemon in it.
     """
-    broken_off = threading.Event()
+    broken_off, turns = threading.Event(), Turns()
 
     def break_off(number: int, frame: object) -> None:
         for one in before:  # a second one in the middle of this would wait for ever for what the first one holds
@@ -147,9 +193,10 @@ def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: S
         signal.signal(number, break_off)
     try:
         threads: list[threading.Thread] = []
-        for one in guests:
+        for one in sorted(guests, key=lambda one: one.number != LONGEST):
             _wait_for_room(guests, threads, say)
-            threads.append(threading.Thread(target=one.run, args=(booted, folder / str(one.number), out, say)))
+            words = (booted, folder / str(one.number), out, say, turns)
+            threads.append(threading.Thread(target=one.run, args=words))
             threads[-1].start()
         for thread in threads:
             thread.join()

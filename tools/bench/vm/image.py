@@ -30,6 +30,8 @@ PACKAGES = ("systemd", "systemd-sysv", "dbus", "udev", "python3", "kmod", "iprou
 ONLY_TO_BUILD = ("linux-headers-amd64", "gcc", "make")
 SMALL_RAM_DISK = "MODULES=list\nCOMPRESS=lz4\n"
 IN_RAM_DISK = "virtio_pci\nvirtio_blk\next4\n"
+INIT_HOOK = '#!/bin/sh\n[ "$1" = prereqs ] || cp /usr/share/bench/init "$DESTDIR/bench-init"\n'
+"""Of initramfs-tools: puts `guest/init` beside Debian's own, and QEMU's command line says which one runs."""
 UNUSED = (
     "gpu",
     "net/wireless",
@@ -104,8 +106,8 @@ def digest(*paths: Path, extra: str = "") -> str:
 
 def base_key() -> str:
     """What the base depends on."""
-    recipe = json.dumps([SUITE, PACKAGES, ONLY_TO_BUILD, SMALL_RAM_DISK, IN_RAM_DISK, UNUSED])
-    return digest(GUEST / "fakei2c.c", GUEST / "Kbuild", extra=recipe)
+    recipe = json.dumps([SUITE, PACKAGES, ONLY_TO_BUILD, SMALL_RAM_DISK, IN_RAM_DISK, INIT_HOOK, UNUSED])
+    return digest(GUEST / "fakei2c.c", GUEST / "Kbuild", GUEST / "init", extra=recipe)
 
 
 def image_key() -> str:
@@ -196,6 +198,7 @@ def _hooks(folder: Path) -> list[str]:
     """What is done to the base once its packages are there ("$1": its root)."""
     (folder / "initramfs").write_text(SMALL_RAM_DISK)
     (folder / "modules").write_text(IN_RAM_DISK)
+    (folder / "hook").write_text(INIT_HOOK)
     module = "/usr/src/fakei2c"
     inside = 'chroot "$1" sh -e -c'
     modules = "/lib/modules/$(basename /lib/modules/*-amd64)"
@@ -208,6 +211,8 @@ def _hooks(folder: Path) -> list[str]:
         f"{inside} 'rm -rf {unused} && depmod -a $(basename {modules})'",
         f'cp {folder}/initramfs "$1/etc/initramfs-tools/conf.d/bench"',
         f'cp {folder}/modules "$1/etc/initramfs-tools/modules"',
+        f'install -D -m 755 {GUEST}/init "$1/usr/share/bench/init"',
+        f'install -m 755 {folder}/hook "$1/etc/initramfs-tools/hooks/bench"',
         f"{inside} 'update-initramfs -u'",
     ]
 

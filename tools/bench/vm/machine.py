@@ -35,7 +35,7 @@ UNUSED = (
 NOBODYS = "ahci,libahci,libata,cfg80211,kvm,kvm_amd,iTCO_wdt,aesni_intel,ghash_clmulni_intel,powernow_k8,psmouse,pcspkr"
 """Modules of devices that nothing here needs."""
 COMMAND_LINE = " ".join([
-    "root=/dev/vda rw console=ttyS0 net.ifnames=0 panic=5 mitigations=off highres=off norandmaps",
+    "rdinit=/bench-init console=ttyS0 net.ifnames=0 panic=5 mitigations=off highres=off norandmaps",
     "systemd.show_status=false",
     f"modprobe.blacklist={NOBODYS}",
     *(f"systemd.mask={unit}" for unit in UNUSED),

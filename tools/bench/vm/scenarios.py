@@ -25,8 +25,8 @@ from tools.bench.vm.common import WRITTEN, Scenario
 
 PARTS: Final = (
     (trying_system, trying_devices),
-    (trying_photodiode, trying_process),
-    (trying_computer, trying_surroundings, trying_removal),
+    (trying_photodiode,),
+    (trying_process, trying_computer, trying_surroundings, trying_removal),
 )
 SHARES: Final[list[list[Scenario]]] = [
     [one for part in parts for one in WRITTEN if one.__module__ == part.__name__] for parts in PARTS

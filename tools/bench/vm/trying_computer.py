@@ -6,18 +6,10 @@ import time
 from typing import Final
 
 from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench
-from tools.bench.vm.common import RIGHT_S, begin, come_up, map_id, need, right, scenario, start
+from tools.bench.vm.common import RIGHT_S, map_id, need, right, scenario
 
 LOADING_S: Final = 12.0
 """By then the daemon has been started, and has not come to look for its place."""
-
-
-@scenario("anew")
-def comes_up_once_more(bench: Bench) -> str:
-    """A third computer: its map begins where it stands."""
-    said = come_up(bench)
-    seconds = start(bench)
-    return f"{said}; READY after {seconds:.1f} s; {1e3 * begin(bench):.0f} mm at most"
 
 
 def _up_again(bench: Bench, states: tuple[str, ...], sets_off: bool = False) -> str:

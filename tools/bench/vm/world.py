@@ -30,17 +30,20 @@ from tools.bench.world.stage import ForeignSender
 from tools.sim.feed import UdpSender, feed_odometry, feed_truth
 from tools.sim.hands import Hands
 from tools.sim.odometry import Wheels
+from tools.sim.robot import Body
 from tools.sim.scene import Scenario, SimulatedScene
 
 BUS = "bench"
 DWELL_S = 4.0
 WHEELS_HZ = 20.0
 """Each datagram costs the emulated processor a millisecond."""
+ROBOT = Body(speed=0.4, turn_rate=0.6)
+"""Slow: what a pose is late by is way, and the emulated computer hears of a scan when its processor comes to it."""
 
 
 def scenario() -> Scenario:
     """What is driven; also outside of the emulated computer, to compare with."""
-    return Scenario(lidar=LIDAR, people=False, dwell_s=DWELL_S, wheels=Wheels(rate_hz=WHEELS_HZ))
+    return Scenario(lidar=LIDAR, people=False, dwell_s=DWELL_S, body=ROBOT, wheels=Wheels(rate_hz=WHEELS_HZ))
 
 
 async def serve(odometry: int, truth: int, control: Path) -> None:
