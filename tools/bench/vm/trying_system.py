@@ -27,8 +27,9 @@ AGREE_WAY_M: Final = 4.0
 MOST: Final = 0.9
 """Of the scans: at the ends of the time that is listened, one more or less may fall into it."""
 LATE_S: Final = 0.02
-SPREAD_S: Final = 0.015
-"""By so much lateness may change in a drive: 3 mm to either side at 0.4 m/s, which is what it may hide."""
+SPREAD_S: Final = 0.0205
+"""By so much lateness, which is found in whole milliseconds, may change in a drive: 4 mm to either side at 0.4 m/s, which
+is what it may hide."""
 SLOWEST: Final = 2.5
 """So many times more lateness is allowed at most where the emulation is slower."""
 LATER: Final = np.arange(0.0, (SLOWEST + 0.5) * LATE_S, 0.001)
