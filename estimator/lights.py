@@ -108,9 +108,18 @@ def in_a_row(lights: Lights, t_mono: float) -> bool:
     """Whether the lamps in use have been one row for long enough to count as such.
 
     What a row tells of the distance from it, and of the heading, is the same mistake in every epoch: who also knows the
-    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing.
+    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing; nor does a row lead astray who
+    stands under it, or turns on the spot, and knows the place by others.
     """
+    if lights.course.way - lights.way_row < row.LASTING_M:
+        return False
     return t_mono - lights.t_row >= row.LASTING_S and t_mono - lights.t_used < HELD_S
+
+
+def begin_row(lights: Lights, t_mono: float) -> None:
+    """Note since when, and from which place of the way on, the lamps in use are a row; inf: they are none."""
+    if math.isinf(t_mono) or math.isinf(lights.t_row):
+        lights.t_row, lights.way_row = t_mono, lights.course.way
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:
@@ -237,7 +246,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         age(lights, track, way, dt)
         if len(lights.tracks) == 1 and lights.result is not None:
             narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
-            lights.t_row = min(lights.t_row, middle) if narrow > row.SLIGHT else math.inf
+            begin_row(lights, middle if narrow > row.SLIGHT else math.inf)
             if lights.course.wheels and in_a_row(lights, middle):
                 row.loosen(narrow, angle, track.P)
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))

@@ -21,9 +21,9 @@ ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2
 SIDE_M, SIDE_RAD = 0.5, 0.2
 """What no number of looks at a row makes surer than: beside walls a heading was led 15 deg astray, and more."""
 
-SLIGHT, LASTING_S = 0.1, 1.0
+SLIGHT, LASTING_S, LASTING_M = 0.1, 1.0, 0.15
 """A row by less than the first is none; nor is one that has not lasted so many seconds: other lamps are hidden for a
-moment, and come to be in use again."""
+moment, and come to be in use again; nor one under which so much way has not been driven."""
 
 BENT_M = 0.7
 """A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
