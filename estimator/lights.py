@@ -108,18 +108,11 @@ def in_a_row(lights: Lights, t_mono: float) -> bool:
     """Whether the lamps in use have been one row for long enough to count as such.
 
     What a row tells of the distance from it, and of the heading, is the same mistake in every epoch: who also knows the
-    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing; nor does a row lead astray who
-    stands under it, or turns on the spot, and knows the place by others.
+    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing. Who turns on the spot knows the
+    place by the lamps before, and needs to be told of the turn.
     """
-    if lights.course.way - lights.way_row < row.LASTING_M:
-        return False
-    return t_mono - lights.t_row >= row.LASTING_S and t_mono - lights.t_used < HELD_S
-
-
-def begin_row(lights: Lights, t_mono: float) -> None:
-    """Note since when, and from which place of the way on, the lamps in use are a row; inf: they are none."""
-    if math.isinf(t_mono) or math.isinf(lights.t_row):
-        lights.t_row, lights.way_row = t_mono, lights.course.way
+    under = lights.under
+    return under.lasts(t_mono) and under.far >= row.LASTING_M and t_mono - lights.t_used < HELD_S
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:
@@ -154,13 +147,13 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
     keep_gains(lights)
     zeros = np.zeros((ekf.SIZE, ekf.SIZE))
     lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old, zeros)]
-    lights.t_lost, lights.t_odd, lights.t_row, lights.lost = math.inf, math.inf, math.inf, False
+    lights.t_lost, lights.t_odd, lights.under, lights.lost = math.inf, math.inf, row.Under(), False
 
 
 def reset(lights: Lights) -> None:
     """Forget the place and everything learned about lamps; those that described themselves stay known."""
     lights.tracks, lights.gains, lights.absent, lights.before = [], {}, {}, None
-    lights.t_lost, lights.t_odd, lights.t_row, lights.lost, lights.result = math.inf, math.inf, math.inf, False, None
+    lights.t_lost, lights.t_odd, lights.under, lights.lost, lights.result = math.inf, math.inf, row.Under(), False, None
 
 
 def update(lights: Lights, epoch: LightEpoch) -> LightsResult:
@@ -246,9 +239,9 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         age(lights, track, way, dt)
         if len(lights.tracks) == 1 and lights.result is not None:
             narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
-            begin_row(lights, middle if narrow > row.SLIGHT else math.inf)
-            if lights.course.wheels and in_a_row(lights, middle):
-                row.loosen(narrow, angle, track.P)
+            lights.under.take(middle if narrow > row.SLIGHT else math.inf, lights.course.T[:2], track.P[:3, :3])
+            if lights.course.wheels and lights.under.lasts(middle) and middle - lights.t_used < HELD_S:
+                row.loosen(narrow, angle, track.P, lights.under.least(angle))
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
         likelihood = absorb(lights, track, seen, view_of(lights, back), news)
         track.weight += likelihood * news

@@ -14,6 +14,7 @@ from estimator.lights_links import ACCEPTED, DIFFUSE, Sight, remembered, sights
 from estimator.lights_state import Lights, Track
 from estimator.optics import pack_lamps, pack_receiver
 from estimator.records import Array
+from estimator.row import Under
 
 LEAST = 3
 """Links without which there is no start: two leave two places, and their gains are not known."""
@@ -148,7 +149,7 @@ def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> 
             track = new_track(lights, T, covariance, old, block[len(lights.tracks)])
             track.weight = -0.5 * place.cost
             lights.tracks.append(track)
-    lights.way_start = lights.course.way
+    lights.way_start, lights.under = lights.course.way, Under()
 
 
 def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track | None, zeros: Array) -> Track:

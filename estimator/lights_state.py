@@ -17,6 +17,7 @@ from estimator.lights_catalogue import Catalogue
 from estimator.optics import LAMP_COLUMNS
 from estimator.records import Array
 from estimator.result import LightsResult
+from estimator.row import Under
 
 
 class Pause(Enum):
@@ -209,7 +210,7 @@ class Lights:
         t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: where the start began.
         t_lost: since when most links contradict, inf if they do not. t_odd: since when several links are stronger than
             they can be, which nothing in the way explains; way_odd: when it last was so.
-        t_row: since when the lamps in use have been a row, inf while they are none; way_row: from where on the way.
+        under: the row that the lamps in use have become.
         absent: by lamp ID, (instant, way) since which it should be received but is not.
         corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
         lost: the last start was made necessary by a contradiction.
@@ -229,8 +230,7 @@ class Lights:
     t_lost: float = math.inf
     t_odd: float = math.inf
     way_odd: float = -math.inf
-    t_row: float = math.inf
-    way_row: float = 0.0
+    under: Under = field(default_factory=Under)
     absent: dict[int, tuple[float, float]] = field(default_factory=dict)
     corrections: Corrections | None = None
     lean: tuple[float, float] = (0.0, 0.0)

@@ -23,7 +23,7 @@ SIDE_M, SIDE_RAD = 0.5, 0.2
 
 SLIGHT, LASTING_S, LASTING_M = 0.1, 1.0, 0.15
 """A row by less than the first is none; nor is one that has not lasted so many seconds: other lamps are hidden for a
-moment, and come to be in use again; nor one under which so much way has not been driven."""
+moment, and come to be in use again. Who has not gone so far under it knows the place by the lamps before."""
 
 BENT_M = 0.7
 """A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
@@ -86,6 +86,43 @@ class Lately:
         self.left = more if more.trace() >= self.usual.trace() else self.usual
 
 
+@dataclass(slots=True, eq=False)
+class Under:
+    """The row that lamps in use have become; start with ``Under()``.
+
+    Attributes:
+        t: since when, inf: they are none. at: (2,) where the robot was then, of its dead-reckoned way, m. far: how far
+            it has been from there since, m. P: (3, 3; m, m, rad; survey axes) what was known of the pose then.
+    """
+
+    t: float = math.inf
+    at: Array = field(default_factory=lambda: np.zeros(2))
+    far: float = 0.0
+    P: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def take(self, t: float, at: Array, P: Array) -> None:
+        """At ``t`` lamps in use are a row, inf: they are none; place and covariance of the pose are these."""
+        if math.isinf(t) or math.isinf(self.t):
+            self.t, self.at, self.far, self.P = t, at.copy(), 0.0, P.copy()
+        self.far = max(self.far, float(np.hypot(*(at - self.at))))
+
+    def lasts(self, t: float) -> bool:
+        """Whether they are more than a row for a moment."""
+        return t - self.t >= LASTING_S
+
+    def least(self, angle: float) -> tuple[float, float]:
+        """Variances across a direction (m^2) and of the heading (rad^2) that looks at the row make no smaller."""
+        if self.far >= LASTING_M:
+            return SIDE_M**2, SIDE_RAD**2
+        return min(SIDE_M**2, across(angle, self.P)), min(SIDE_RAD**2, float(self.P[2, 2]))
+
+
+def across(angle: float, P: Array) -> float:
+    """Variance of a place across a direction, rad."""
+    nx, ny = -math.sin(angle), math.cos(angle)
+    return float(nx * nx * P[0, 0] + 2.0 * nx * ny * P[0, 1] + ny * ny * P[1, 1])
+
+
 def shape(catalogue: Catalogue, lamps: frozenset[int]) -> tuple[float, float]:
     """How much lamps are a row (1: on one line; 0: not at all, or fewer than two are known), and its direction, rad."""
     at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, sorted(lamps)) if lamp is not None]
@@ -95,7 +132,7 @@ def shape(catalogue: Catalogue, lamps: frozenset[int]) -> tuple[float, float]:
     return math.exp(-2.0 * across / ROW_M**2), angle
 
 
-def loosen(narrow: float, angle: float, P: Array) -> None:
+def loosen(narrow: float, angle: float, P: Array, least: tuple[float, float] = (SIDE_M**2, SIDE_RAD**2)) -> None:
     """Keep a pose that a row of lamps has told from becoming surer across it than one look at them makes it.
 
     How far the lamps seem from the row is the same mistake in every epoch (walls beside, a common gain), and with it
@@ -105,15 +142,16 @@ def loosen(narrow: float, angle: float, P: Array) -> None:
         narrow: how much the lamps in use are a row.
         angle: its direction, rad; see `shape`.
         P: covariance, its first three rows and columns those of the pose in the survey's axes; changed in place.
+        least: variances across it (m^2) and of the heading (rad^2), see `Under.least`.
     """
     nx, ny = -math.sin(angle), math.cos(angle)
-    lacks = narrow * SIDE_M**2 - (nx * nx * P[0, 0] + 2.0 * nx * ny * P[0, 1] + ny * ny * P[1, 1])
+    lacks = narrow * least[0] - across(angle, P)
     if lacks > 0.0:
         P[0, 0] += lacks * nx * nx
         P[0, 1] += lacks * nx * ny
         P[1, 0] = P[0, 1]
         P[1, 1] += lacks * ny * ny
-    P[2, 2] += max(0.0, narrow * SIDE_RAD**2 - P[2, 2])
+    P[2, 2] += max(0.0, narrow * least[1] - P[2, 2])
 
 
 def straighten(P: Array, X: Array) -> tuple[Array, Array]:

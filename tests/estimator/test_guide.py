@@ -169,38 +169,31 @@ def test_a_robot_that_the_laser_saw_reverse_is_not_turned_round_for_it() -> None
 
 def test_under_a_row_of_lamps_nothing_is_taken() -> None:
     filter_ = placed(np.array((5.0, 5.0, 0.5)))
-    filter_.t_row = filter_.t_used = 0.0
+    filter_.t_used = 0.0
     for k in range(1, 31):
+        filter_.under.take(0.0, filter_.course.T[:2], np.eye(3))
         filter_.t_used = min(0.1 * k, 2.0)  # then they go out
         lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.1, 0.0, 0.0))), np.array((1.0, 0.0, 0.0)))
         assert filter_.course.wheels is (k < 10.0 * LASTING_S or k >= 20 + 10.0 * HELD_S)
 
 
-def test_who_turns_on_the_spot_under_a_row_of_lamps_goes_on_being_told() -> None:
+@pytest.mark.parametrize("speed", [0.05, 0.5])
+def test_who_turns_on_the_spot_under_a_row_of_lamps_goes_on_being_told(speed: float) -> None:
     """It knows the place by the lamps before; a lamp that is hidden would be taken for one across the row."""
     filter_ = placed(np.array((5.0, 5.0, 0.5)))
-    filter_.t_row = 0.0
-    for k in range(1, 31):
+
+    def goes(k: int, step: tuple[float, float, float]) -> None:
+        filter_.under.take(0.0, filter_.course.T[:2], np.eye(3))
         filter_.t_used = 0.1 * k
-        lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.002, 0.0, 0.09))), np.array((0.02, 0.0, 0.9)))
+        lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array(step)), 10.0 * np.array(step))
+
+    for k in range(1, 31):
+        goes(k, (0.002 * (-1) ** k, 0.0, 0.09))
         assert filter_.course.wheels
     assert filter_.tracks[0].x[2] == pytest.approx(0.5 + 30 * 0.09 - math.tau, abs=0.05)
-    for k in range(31, 36):  # and drives on
-        filter_.t_used = 0.1 * k
-        lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.05, 0.0, 0.0))), np.array((0.5, 0.0, 0.0)))
+    for k in range(31, 31 + round(2.0 / speed)):  # and drives on, however slowly
+        goes(k, (0.1 * speed, 0.0, 0.0))
     assert not filter_.course.wheels
-
-
-def test_the_way_under_a_row_counts_from_where_the_lamps_became_one() -> None:
-    filter_ = placed(np.array((5.0, 5.0, 0.5)))
-    filter_.course.way = 3.0
-    lights.begin_row(filter_, 7.0)
-    filter_.course.way = 3.5
-    lights.begin_row(filter_, 8.0)
-    assert (filter_.t_row, filter_.way_row) == (7.0, 3.0)
-    lights.begin_row(filter_, math.inf)
-    lights.begin_row(filter_, 9.0)
-    assert (filter_.t_row, filter_.way_row) == (9.0, 3.5)
 
 
 class Told:
@@ -328,9 +321,9 @@ def test_wheels_that_come_later_are_not_believed_as_matches_were() -> None:
 def test_reset_and_a_given_place_forget_that_lamps_were_a_row() -> None:
     filter_ = lights.new_lights(SURVEY)
     for forget in (lights.reset, lambda one: lights.place(one, np.zeros(3), np.eye(3))):
-        filter_.t_row = 0.0
+        filter_.under.take(0.0, np.zeros(2), np.eye(3))
         forget(filter_)
-        assert filter_.t_row == math.inf
+        assert filter_.under.t == math.inf
 
 
 @pytest.mark.parametrize("guided", [True, False])
