@@ -25,8 +25,9 @@ from daemon.publish.snapshot import NO_CONDITION
 from tools.bench.modbus import example
 from tools.bench.otherclock import OtherClock
 from tools.bench.vm import __main__ as command
-from tools.bench.vm import bench, image, places, reference, world
+from tools.bench.vm import bench, image, places, reference, trying_system, world
 from tools.bench.vm.__main__ import chosen
+from tools.bench.vm.common import ALONE
 from tools.bench.vm.guest import agent
 from tools.bench.vm.machine import Machine, Order, Ports, _waited_s
 from tools.bench.vm.scenarios import PARTS, SCENARIOS, SHARES, WRITTEN
@@ -41,6 +42,7 @@ ROOT = Path(__file__).parents[2]
 def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
     assert len(SCENARIOS) == len(set(SCENARIOS)) == len(WRITTEN)
     assert len(SCENARIOS) >= 25
+    assert {trying_system.drives} == ALONE
     assert all(one.__doc__ and len(one.__doc__.splitlines()) == 1 for one in SCENARIOS)
     names = [[part.__name__.rpartition("_")[2] for part in parts] for parts in PARTS]
     third = ["process", "computer", "surroundings", "removal"]
@@ -49,8 +51,9 @@ def test_every_scenario_is_in_the_list_once_and_has_a_title() -> None:
 
 def test_scenarios_up_to_the_named_ones_and_only_the_computers_that_they_take() -> None:
     assert chosen([]) == SHARES
-    assert [[one.__name__ for one in share] for share in chosen(["boots"])] == [["boots"]]
-    assert [share[-1].__name__ for share in chosen(["hangs", "boots", "starts"])] == ["starts", "hangs"]
+    assert [[one.__name__ for one in share] for share in chosen(["boots"])] == [["boots"], [], []]
+    assert [share[-1].__name__ for share in chosen(["hangs", "boots", "starts"]) if share] == ["starts", "hangs"]
+    assert [len(share) > 0 for share in chosen(["drives", "is_killed"])] == [True, False, True], "a number stays"
     with pytest.raises(places.CannotBench, match="no such scenario: flies; there are boots"):
         chosen(["flies"])
 

@@ -254,7 +254,41 @@ def test_a_drive_that_is_compared_has_a_slow_machine_to_itself(
     assert run_all(both, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
     assert all(one.passed for guest in both for one in guest.results)
     assert any(len(names) == 2 for names in seen if "drives" in names) is beside
-    assert any("drives" in names for names in seen)
+    begun = next(k for k, names in enumerate(seen) if "drives" in names)
+    before = {name for names in seen[:begun] for name in names}
+    assert len(before) <= 3, "the others wait with their next ones once it wants to drive"
+
+
+def test_who_wants_to_be_alone_does_not_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guests, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(guests, "LOOK_S", 0.01)
+    turns, nobody, broken_off = Turns(), threading.Event(), threading.Event()
+    broken_off.set()
+    with turns.taken(False, nobody), turns.taken(True, nobody):
+        third = turns.taken(False, broken_off)
+        with pytest.raises(places.BrokenOff):  # who comes then waits all the same
+            third.__enter__()
+    with turns.taken(False, nobody):
+        pass
+
+
+def test_the_computer_with_most_to_do_is_the_first_and_who_stands_back_goes_by_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[tuple[str, int]] = []
+
+    def made(booted: Booted, folder: Path, broken_off: threading.Event, nice: int) -> Playing:
+        begun.append((folder.name, nice))
+        return Playing(broken_off)
+
+    monkeypatch.setattr(guests, "bench", made)
+    monkeypatch.setattr(guests, "SIDE_BY_SIDE", 1)
+    monkeypatch.setattr(guests, "SLOW", 0.0)  # one after the other
+    monkeypatch.setattr(guests, "LOOK_S", 0.01)
+    (tmp_path / "work").mkdir()
+    three = [Guest(k, [like(passes)]) for k in (1, 2, 3)]
+    assert run_all(three, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
+    assert begun == [("3", 5), ("1", 0), ("2", 10)]
 
 
 def test_who_waits_for_a_turn_can_be_broken_off_and_holds_up_nobody_then() -> None:

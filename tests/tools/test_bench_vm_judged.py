@@ -69,11 +69,13 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
     short.memory["drive"][-1] = replace(short.memory["drive"][-1], missed=3, overruns=2, fault=301)
     with pytest.raises(Order, match=r"way compared: 0\.\d+ m.*; meanwhile 3 scans missed, 2 cycles .* \[301\]"):
         trying_system.agrees_with_outside(short)
-    for name, late in (("LATE_S", np.full(51, 0.012)), ("SPREAD_S", np.linspace(0.0, 0.012, 51))):
+    for name, least, late in (
+        ("LATE_S", 0.011, np.full(51, 0.012)), ("SPREAD_MS", 11, np.linspace(0.0, 0.012, 51)),
+    ):  # fmt: skip
         monkeypatch.setattr(agreement, "lateness", lambda *_, late=late: late)
         trying_system.agrees_with_outside(driven(5.0))
         with monkeypatch.context() as less:
-            less.setattr(trying_system, name, 0.011)
+            less.setattr(trying_system, name, least)
             with pytest.raises(Order, match="late by: 12"):
                 trying_system.agrees_with_outside(driven(5.0))
 
@@ -125,8 +127,11 @@ def test_a_drive_whose_end_was_left_undone_agrees_until_then(monkeypatch: pytest
     assert round(seen.figures[1].value, 1) == 5.9
     assert str(seen.figures[-1]) == "inside and outside: apart, largest of the whole drive: 50 mm", "what came after"
     for since, undone in ((60, 10_000), (60, 70), (20, 20)):  # nothing was; too late to be why; too little is left
-        with pytest.raises(Order, match=r"apart, largest: 50|way compared: 1\."):
+        with pytest.raises(common.Unmet, match=r"apart, largest: 50|way compared: 1\.") as unmet:
             trying_system.agrees_with_outside(astray(9.0, since, undone))
+        titles = [plot.title for plot in unmet.value.seen.plots]
+        assert titles == ["inside and outside: apart", "inside and outside: apart, whole drive"][: 1 + (undone < 100)]
+        assert ("until work was left undone" in str(unmet.value)) is (undone < 100)
     whole = trying_system.agrees_with_outside(astray(9.0, since=10_000, undone=3))
     assert isinstance(whole, Seen)
     assert round(whole.figures[1].value) == 9  # what changed nothing cuts nothing short
@@ -191,3 +196,23 @@ def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(
     assert (code, said[-1]) == (1, "FAILED: 1 worse than before"), said
     assert said[0].startswith("1 of 1 passed")
     assert bench("--out", str(tmp_path / "3"))[0] == 0
+
+
+@pytest.mark.parametrize(("degraded", "off", "right"), [(4, 0.0, True), (8, 0.0, False), (0, 0.2, False)])
+def test_a_drive_is_tracking_and_right_and_is_shown_where_it_is_not(
+    degraded: int, off: float, right: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = driven(5.0)
+    heard = [replace(one, pose=(0.1 * k, off, 0.0), state=3 if k >= degraded else 4) for k, one in enumerate(poses(51))]
+    bench.start = (0.0, 0.0, 0.0)
+    for name, made in (
+        ("drive", lambda: None), ("until", lambda *_: 0.0), ("collect", lambda seconds: heard),
+        ("placed", lambda *_: 0.0),
+    ):  # fmt: skip
+        monkeypatch.setattr(bench, name, made)
+    if right:
+        assert isinstance(trying_system.drives(bench), Seen)
+        return
+    with pytest.raises(common.Unmet, match=r"TRACKING for 84 % of 51 poses|0\.200 m from the truth") as unmet:
+        trying_system.drives(bench)
+    assert [plot.title for plot in unmet.value.seen.plots] == ["trajectory", "age of a pose that comes"]

@@ -34,7 +34,7 @@ def say(text: str) -> None:
 
 
 def chosen(names: list[str]) -> list[list[Scenario]]:
-    """All shares; or of each what goes up to the last that is named: each scenario builds on the ones before."""
+    """All shares; or of each what goes up to the last that is named, if any: a scenario builds on those before it."""
     known = [one.__name__ for one in SCENARIOS]
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -42,13 +42,13 @@ def chosen(names: list[str]) -> list[list[Scenario]]:
     if not names:
         return SHARES
     ends = [max((k + 1 for k, one in enumerate(share) if one.__name__ in names), default=0) for share in SHARES]
-    return [share[:end] for share, end in zip(SHARES, ends, strict=True) if end]
+    return [share[:end] for share, end in zip(SHARES, ends, strict=True)]
 
 
 def run(made: Booted, shares: list[list[Scenario]], out: Path) -> tuple[bool, list[Result]]:
     """Try them; whether that went to its end, and the results."""
     out.mkdir(parents=True, exist_ok=True)
-    guests = [Guest(number, share) for number, share in enumerate(shares, 1)]
+    guests = [Guest(number, share) for number, share in enumerate(shares, 1) if share]
     with workspace("lumiloop-vm", ROOM) as folder:
         whole = run_all(guests, made, folder, out, say)
     return whole, [one for guest in guests for one in guest.results]

@@ -19,12 +19,13 @@ AFTER: Final[dict[Scenario, Daemon]] = {}
 """What the daemon is after each: the same process as before; one that a person or the computer's start has started,
 and which has lived since; one that the service manager has restarted once; none."""
 ALONE: Final[set[Scenario]] = set()
-"""Those during which no other computer is to take its processor, where the emulation is slow."""
+"""Those during which the others wait between two scenarios of theirs, where the emulation is slow."""
 TRACKING_S: Final = 60.0
 WORST_M: Final = 0.10
 RESTING_M: Final = 0.05
 RIGHT_S: Final = 2.0
-"""Ten poses, driven over 0.8 m."""
+"""Ten poses; a robot that drives goes 0.8 m meanwhile."""
+READY_S: Final = 60.0
 PACE: Final = "i=0; while [ $i -lt 20000 ]; do i=$((i+1)); done"
 USUAL_S: Final = 0.4
 """What `pace` tells of a usual machine. Measured: 0.67 s on one that boots in 24 s; usual ones boot in 15, so this is
@@ -146,3 +147,22 @@ def back(bench: Bench, pid: int, states: tuple[str, ...] = ("TRACKING",)) -> str
     same_process(bench, pid)
     found = right(bench, bench.collect(RIGHT_S))
     return f"{' or '.join(states)} after {seconds:.1f} s, {1e3 * max(found):.0f} mm from the truth"
+
+
+def signal(bench: Bench, name: str, pid: int) -> None:
+    """Send one to a process inside."""
+    bench.machine.run("sh", "-c", f"kill -{name} {pid}")  # the shell's own: a small Debian has no /bin/kill
+
+
+def restarted(bench: Bench, before: int, seconds: float) -> str:
+    """``before`` has been replaced within so long, without a person; the new process is right, in the same map."""
+    begun = time.monotonic()
+    bench.until("another process", seconds, lambda: bench.main_pid() not in (0, before), every=1.0)
+    bench.until("started", READY_S, lambda: bench.read().get("state") not in (None, "STARTING"))  # costs it little
+    bench.until("READY", READY_S, lambda: bench.machine.show(UNIT, "ActiveState")["ActiveState"] == "active")
+    ready = time.monotonic() - begun
+    tracking = bench.placed(TRACKING_S)
+    need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
+    found = right(bench, bench.collect(RIGHT_S))
+    told = f"READY {ready:.1f} s later, TRACKING in the same map {tracking:.1f} s after that"
+    return f"{told}, {1e3 * max(found):.0f} mm from the truth"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -31,6 +32,7 @@ SIDE_BY_SIDE: Final = 2
 SLOW: Final = 1.4
 """From so many times the usual seconds for the same work."""
 LOOK_S: Final = 0.1
+PATIENCE_S: Final = 300.0
 Say = Callable[[str], None]
 
 
@@ -79,11 +81,21 @@ def _lost(scenario: Scenario, bench: Bench) -> str:
         return f"what has become of the daemon is not known: {error}"
 
 
-class Turns:
-    """Who tries a scenario: several at once, or one that wants to be alone.
+def _with_work(scenario: Scenario, whole: Bench) -> Result:
+    """One scenario's result, with what the emulation has worked for it."""
+    before = whole.machine.worked_s()
+    one = tried(scenario, whole)
+    after = whole.machine.worked_s()
+    if before is None or after is None:
+        return one
+    return replace(one, figures=(*one.figures, Figure("work of the emulation", after - before, "CPU s")))
 
-    Who wants that waits until the others have ended theirs, and they wait with their next ones from then on: they are
-    between two scenarios, where nothing is asked of their daemons.
+
+class Turns:
+    """Who tries a scenario: several at once, or one that wants the others to wait.
+
+    They wait between two scenarios, where nothing is asked of their daemons; these and their worlds go on running. Who
+    wants it waits until they have ended theirs, but not for ever: one that comes to no end costs it `PATIENCE_S`.
     """
 
     def __init__(self) -> None:
@@ -98,9 +110,10 @@ class Turns:
             self._wait(lambda: not self._alone, broken_off)
             self._alone = alone
             try:
-                self._wait(lambda: not (alone and self._running), broken_off)
+                self._wait(lambda: not (alone and self._running), broken_off, PATIENCE_S)
             except BrokenOff:
                 self._alone = False
+                self._lock.notify_all()
                 raise
             self._running += 1
         try:
@@ -111,8 +124,9 @@ class Turns:
                 self._alone = self._alone and not alone
                 self._lock.notify_all()
 
-    def _wait(self, free: Callable[[], bool], broken_off: threading.Event) -> None:
-        while not self._lock.wait_for(free, LOOK_S):
+    def _wait(self, free: Callable[[], bool], broken_off: threading.Event, patience_s: float = math.inf) -> None:
+        begun = time.monotonic()
+        while not self._lock.wait_for(free, LOOK_S) and time.monotonic() - begun < patience_s:
             if broken_off.is_set():
                 raise BrokenOff
 
@@ -135,20 +149,17 @@ class Guest:
         why = "the bench has met an error of its own, which it has written"
         try:
             folder.mkdir()
-            with bench(booted, folder, self.broken_off, BEHIND.get(self.number, 0)) as whole:
+            with ExitStack() as stack:
+                with turns.taken(False, self.broken_off):
+                    nice = BEHIND.get(self.number, 0)
+                    whole = stack.enter_context(bench(booted, folder, self.broken_off, nice))
                 for scenario in self.share:
                     alone = scenario in ALONE and self.slower is not None and self.slower > SLOW
                     with turns.taken(alone, self.broken_off):
-                        before = whole.machine.worked_s()
-                        one = tried(scenario, whole)
-                    after = whole.machine.worked_s()
-                    if before is not None and after is not None:
-                        worked = Figure("work of the emulation", after - before, "CPU s")
-                        one = replace(one, figures=(*one.figures, worked))
-                    self.results.append(one)
+                        self.results.append(_with_work(scenario, whole))
                     self._tell(self.results[-1], say)
                     self.slower = whole.slower
-                with contextlib.suppress(Order, OSError):
+                with turns.taken(False, self.broken_off), contextlib.suppress(Order, OSError):
                     (out / f"journal-{self.number}.log").write_text(whole.machine.run(*JOURNAL, seconds=120))
         except BrokenOff:
             why = "the run was broken off"

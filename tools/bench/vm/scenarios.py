@@ -1,8 +1,7 @@
 """What is tried: a function that raises where something is not so.
 
 Three emulated computers run side by side: what one waits for leaves a processor to another. A scenario builds on those
-before it in the same computer; the first of each brings that computer up. They are shared out so that all take about as
-long.
+before it in the same computer; the first of each brings that computer up.
 
 A scenario's first line is its title in the report; what it returns is what was seen. Times are the emulated computer's:
 some twenty times slower than the machine around it, so they are reported and bounded only as far as they must be.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import time
 from typing import Final
 
 from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench
-from tools.bench.vm.common import RIGHT_S, map_id, need, right, scenario
+from tools.bench.vm.common import RIGHT_S, map_id, need, restarted, right, scenario, signal
 
+CHANGED: Final = "near = 0.06"
 LOADING_S: Final = 12.0
 """By then the daemon has been started, and has not come to look for its place."""
 
@@ -41,10 +43,23 @@ def is_rebooted(bench: Bench) -> str:
     return _up_again(bench, ("TRACKING",), sets_off=True)
 
 
+@scenario("restarted")
+def is_killed(bench: Bench) -> str:
+    """Kill -9 while it drives: started again, in the same map; what was configured meanwhile holds."""
+    before = bench.main_pid()
+    bench.configure(f"[lidar.mask]\n{CHANGED}")
+    signal(bench, "KILL", before)
+    said = restarted(bench, before, 20.0)
+    told = bench.machine.run("journalctl", "--no-pager", "-o", "cat", f"_PID={bench.main_pid()}", "-b", "-n", "100")
+    need(CHANGED in told, told)
+    return said
+
+
 @scenario()
 def explains_itself(bench: Bench) -> str:
     """The journal of the boots before is there, with explanations."""
-    boots = bench.machine.run("journalctl", "--list-boots", "--no-pager").strip().splitlines()
+    listed = bench.machine.run("journalctl", "--list-boots", "--no-pager").splitlines()
+    boots = [line for line in listed if re.match(r" *-?\d+ ", line)]  # newer ones have a headline
     first = ("-b", "-2", "-n", "100")  # all of it takes minutes here
     text = bench.machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT, *first, seconds=120)
     need(len(boots) >= 3 and "What can be done" in text, f"{boots}\n{text[-500:]}")

@@ -100,7 +100,7 @@ def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, 
     """By how many seconds each of ``count`` stamps has to be set back for two traces to say most nearly the same.
 
     A line on which every scan is under way for a while, the emulated computer's, makes all instants later by as much:
-    at 0.6 m/s 10 ms are 6 mm along the way, which are the line's and not what was made of the scans. How much it is
+    at 0.4 m/s 10 ms are 4 mm along the way, which are the line's and not what was made of the scans. How much it is
     changes with what else the computer around has to do, in seconds and not from scan to scan: stamps are set back in
     groups. One in which less than half a metre was driven tells nothing, and has what the one before had. An error
     along the way that changes from group to group looks like it: who judges bounds by how much groups may differ.
