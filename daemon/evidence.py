@@ -196,13 +196,12 @@ class Observer:
 
         Without odometry, along an axis that no match shows, the pose is only carried on by its last velocity. A
         keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
-        is the place in the surroundings, not in the map. A loop closure ends that, an order, light that agrees, and
-        an estimate that is hardly less certain than before: the speeds before and after a short stretch tell of it.
+        is the place in the surroundings, not in the map. A loop closure ends that, an order, and light that agrees.
         The same is true, along every axis, of a map that was begun anew because nothing fitted the old one: the robot
         may have been carried off, so that a loop found near where it is taken to be tells nothing. That ends with a
         place that was looked for everywhere, or that light confirms.
         """
-        told = ordered or _lit(result) or self._hardly_less_certain(match, result)
+        told = ordered or _lit(result)
         if told or (result.loop is not None and (not self._begun or result.loop.reason in TELLING)):
             self._guessed, self._begun = [False] * 3, False
             self._t_shown = [t_mono] * 3
@@ -218,13 +217,6 @@ class Observer:
             return match
         x, y, yaw = (known and not guess for known, guess in zip(match.known, self._guessed, strict=True))
         return replace(match, known=(x, y, yaw))
-
-    def _hardly_less_certain(self, match: Match, result: StepResult) -> bool:
-        """Whether all that a stretch of guessed way has left in doubt is no more than a place may be to be used."""
-        if self._begun or result.placed or self._P_complete is None or not (match.good and all(match.known)):
-            return False
-        sigma_m, sigma_rad = _growth(result.covariance, self._P_complete)
-        return sigma_m <= VAGUE_M and sigma_rad <= VAGUE_RAD
 
     def _sigma(
         self, match: Match | None, result: StepResult | None, ordered: bool, odometry: bool | None

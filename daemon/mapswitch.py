@@ -68,6 +68,7 @@ def take_over(state: State, donor: State) -> None:
     state.light, state.absolute = donor.light, donor.absolute
     state.next_key, state.noise_m = donor.next_key, donor.noise_m
     state.frozen.forget()
+    state.guessed_s = 0.0
     state.T_map_odom = se2.compose(donor.T_map_odom, se2.inverse(state.fused.T_odom_base))
     state.T_map_start = se2.compose(state.T_map_odom, state.fused.T_odom_base)
     state.jumps += 1

@@ -409,7 +409,6 @@ def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> 
     P = se2.carry(frame.T_map_keyframe, T_keyframe_newest, P_map)
     atlas.marginal = R @ P @ R.T
     state.P_anchor = atlas.spread(state.T_odom_anchor)
-    state.guess.stays()
     tie = state.absolute
     if tie is None:
         return

@@ -351,7 +351,6 @@ def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Arr
         R = se2.rotation(-state.T_map_odom[2])
         atlas.marginal = R @ solution.covariance @ R.T
         state.P_anchor = surer(state, atlas.spread(state.T_odom_anchor), before_map)
-        state.guess.stays()
         if state.absolute is not None and atlas.held:
             absolute.hang_on_anchor(state)
     else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from estimator import adrift, se2
-from estimator.guess import Guess
 from estimator.hypotheses import Suspicion
 from estimator.mapframe import move_map, shift_map
 from estimator.mapping import NOTHING
@@ -67,7 +66,7 @@ def forget(state: State) -> None:
         state.live.clear()
     state.lag.forget()
     state.suspicion = Suspicion()  # of a map that there is no more
-    state.P_anchor, state.fused.P, state.guess = NOTHING.copy(), NOTHING.copy(), Guess()
+    state.P_anchor, state.fused.P = NOTHING.copy(), NOTHING.copy()
     state.anchor, state.T_odom_anchor, state.failures = 0, state.fused.T_odom_base, 0
     state.T_map_start = se2.compose(state.T_map_odom, state.fused.T_odom_base)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from estimator import absolute, guess, motion, se2
+from estimator import absolute, motion, se2
 from estimator.alike import agreement, beams_each
-from estimator.guess import loose_direction
 from estimator.moving import hang, informed, turn
 from estimator.records import Array, Scan
 from estimator.result import MatchResult, Reason
@@ -14,8 +15,8 @@ from estimator.state import State
 
 LEAST_NOISE_M = 0.004
 LEARNING = 0.02
-HELD_YAW = 830.0
-"""Information with which a match holds the heading: 2 deg (`MatchResult.known_axes`)."""
+HELD, HELD_YAW = 100.0, 830.0
+"""Information with which a match holds a direction, or the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
 BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE, Reason.PASSED_OVER)
 """Outcomes of a scan that has shown nothing: they do not speak against the map."""
 CAUCHY = 0.807
@@ -40,10 +41,9 @@ def fuse(state: State, match: MatchResult) -> None:
             made = se2.between(state.T_odom_scan, moving.T_odom_base)
             moving.gyro.learn(float(made[2]), moving.t_mono - state.t_scan)
             motion.feel(moving, made, (state.t_scan, moving.t_mono), 2.0 * moving.P.diagonal(), state.settings.noise)
-            guess.on_match(state, match.information, moving.t_mono - state.t_scan)
+            guess(state, match.information, moving.t_mono - state.t_scan)
     elif match.reason is not Reason.NO_MAP:
         state.failures += match.reason not in BLIND  # who sees nothing contradicts nothing
-        state.guess.stays()
         if not moving.odometry:
             motion.slow_down(moving)
     state.t_scan, state.T_odom_scan = moving.t_mono, moving.T_odom_base
@@ -54,7 +54,7 @@ def updated(P: Array, H: Array, odometry: bool) -> Array:
 
     A direction that the match does not hold gets no surer by it. In a corridor what it does hold is not the same to a
     hair from scan to scan; a tenth of a degree between two of them, forty times a second, would add up to centimetres
-    along an axis of which none has seen anything. Without ``odometry`` there is nothing else either: see `guess`.
+    along an axis of which none has seen anything. Without ``odometry`` there is nothing else either: see :func:`guess`.
     """
     after = np.empty((3, 3))
     informed(P, H, after)
@@ -65,6 +65,35 @@ def updated(P: Array, H: Array, odometry: bool) -> Array:
     if odometry and H[2, 2] < HELD_YAW:
         after[2, 2] = max(float(P[2, 2]), float(after[2, 2]))
     return after
+
+
+def loose_direction(H: Array) -> Array | None:
+    """Unit vector (x, y) along which information ``H`` (3, 3) does not hold the place, None where it holds all."""
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = H.tolist()
+    tt = max(tt, 1e-9)
+    xx, xy, yy = xx - xt * xt / tt, xy - xt * yt / tt, yy - yt * yt / tt
+    half = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    x, y = -math.sin(half), math.cos(half)
+    return np.array((x, y)) if x * x * xx + 2.0 * x * y * xy + y * y * yy < HELD else None
+
+
+def guess(state: State, H: Array, dt: float) -> None:
+    """Without wheels, along a direction that the match does not hold the pose is a guess, and the stated place says so.
+
+    The velocity carries the pose on, and no match contradicts it. What it may be wrong by adds up with the way: the map
+    that is laid meanwhile is out of place for good, so it is the covariance of the place in the map that grows: at
+    walking pace, from half a second on. A silence of the laser has grown the prediction's own covariance already.
+    """
+    loose = loose_direction(H)
+    if state.fused.odometry or loose is None:
+        state.guessed_s = 0.0
+        return
+    before, state.guessed_s = state.guessed_s, state.guessed_s + min(max(dt, 0.0), motion.LONGEST_CARRY_S)
+    t0, t1 = max(0.0, before - motion.LONGEST_CARRY_S), max(0.0, state.guessed_s - motion.LONGEST_CARRY_S)
+    more = np.zeros((3, 3))
+    more[:2, :2] = float(motion.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
+    state.P_anchor += more
+    state.atlas.loosen(more, state.T_odom_anchor)  # the way too, or no loop could bring submaps together again
 
 
 def noise_of(state: State, scan: Scan) -> float:

@@ -12,8 +12,7 @@ from __future__ import annotations
 from typing import Final
 
 from estimator import se2
-from estimator.fusion import BLIND
-from estimator.guess import loose_direction
+from estimator.fusion import BLIND, loose_direction
 from estimator.lights_motion import CARRY_S
 from estimator.records import Odometry
 from estimator.result import MatchResult

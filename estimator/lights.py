@@ -147,7 +147,7 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
     keep_gains(lights)
     zeros = np.zeros((ekf.SIZE, ekf.SIZE))
     lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old, zeros)]
-    lights.t_lost, lights.t_odd, lights.under, lights.lost = math.inf, math.inf, row.Under(), False
+    lights.t_lost, lights.t_odd, lights.under, lights.lost = math.inf, math.inf, row.Under(told=True), False
 
 
 def reset(lights: Lights) -> None:
@@ -239,7 +239,8 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         age(lights, track, way, dt)
         if len(lights.tracks) == 1 and lights.result is not None:
             narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
-            lights.under.take(middle if narrow > row.SLIGHT else math.inf, lights.course.T[:2], track.P[:3, :3])
+            if row.several(lights.catalogue, lights.result.accepted):
+                lights.under.take(middle, narrow, lights.course.T[:2], track.P[:3, :3])
             if lights.course.wheels and lights.under.lasts(middle) and middle - lights.t_used < HELD_S:
                 row.loosen(narrow, angle, track.P, lights.under.least(angle))
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))

@@ -92,18 +92,27 @@ class Under:
 
     Attributes:
         t: since when, inf: they are none. at: (2,) where the robot was then, of its dead-reckoned way, m. far: how far
-            it has been from there since, m. P: (3, 3; m, m, rad; survey axes) what was known of the pose then.
+            it has been from there since, m; inf: nothing but a row has told the pose. P: (3, 3; m, m, rad; survey axes)
+            what was known of the pose then.
+        told: lamps that are no row, or a person, have told the pose before.
     """
 
     t: float = math.inf
     at: Array = field(default_factory=lambda: np.zeros(2))
-    far: float = 0.0
+    far: float = math.inf
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    told: bool = False
 
-    def take(self, t: float, at: Array, P: Array) -> None:
-        """At ``t`` lamps in use are a row, inf: they are none; place and covariance of the pose are these."""
-        if math.isinf(t) or math.isinf(self.t):
-            self.t, self.at, self.far, self.P = t, at.copy(), 0.0, P.copy()
+    def take(self, t: float, narrow: float, at: Array, P: Array) -> None:
+        """At ``t`` two lamps or more are in use, and ``narrow`` a row; place and covariance of the pose are these.
+
+        Fewer tell nothing of a row, nor that it is over: it would begin anew, with what it has told itself.
+        """
+        if narrow <= SLIGHT:
+            self.t, self.told = math.inf, True
+            return
+        if math.isinf(self.t):
+            self.t, self.at, self.P, self.far = t, at.copy(), P.copy(), 0.0 if self.told else math.inf
         self.far = max(self.far, float(np.hypot(*(at - self.at))))
 
     def lasts(self, t: float) -> bool:
@@ -130,6 +139,11 @@ def shape(catalogue: Catalogue, lamps: frozenset[int]) -> tuple[float, float]:
         return 0.0, 0.0
     _, across, angle = spread(at)
     return math.exp(-2.0 * across / ROW_M**2), angle
+
+
+def several(catalogue: Catalogue, lamps: frozenset[int]) -> bool:
+    """Whether two or more of these are known."""
+    return sum(lamp in catalogue.by_id for lamp in lamps) > 1
 
 
 def loosen(narrow: float, angle: float, P: Array, least: tuple[float, float] = (SIDE_M**2, SIDE_RAD**2)) -> None:

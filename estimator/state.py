@@ -12,7 +12,6 @@ import numpy as np
 from estimator import se2
 from estimator.atlas import Atlas
 from estimator.frozen import Frozen
-from estimator.guess import Guess
 from estimator.hypotheses import Suspicion
 from estimator.keyframe import Keyframe, Submap
 from estimator.livemap import LiveMap
@@ -89,7 +88,7 @@ class State:
         next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
         kinship: sums over neighbouring residuals, product and squares, that fade (`estimator.alike`).
-        guess: the stretch along which the pose is carried on by a guess, in a direction that nothing holds.
+        guessed_s: how long the pose has been carried on by a guess, along a direction that nothing held.
         frozen: ties of a while ago, that light is held against.
         way: metres driven, and turned as keyframes count turns, by the prediction; paces: of them, in keyframes.
         t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
@@ -124,7 +123,7 @@ class State:
     jumps: int = 0
     noise_m: float = 0.0
     kinship: Array = field(default_factory=lambda: np.zeros(2))
-    guess: Guess = field(default_factory=Guess)
+    guessed_s: float = 0.0
     way: float = 0.0
     frozen: Frozen = field(default_factory=Frozen)
     paces: int = 0

@@ -171,7 +171,7 @@ def test_under_a_row_of_lamps_nothing_is_taken() -> None:
     filter_ = placed(np.array((5.0, 5.0, 0.5)))
     filter_.t_used = 0.0
     for k in range(1, 31):
-        filter_.under.take(0.0, filter_.course.T[:2], np.eye(3))
+        filter_.under.take(0.0, 1.0, filter_.course.T[:2], np.eye(3))
         filter_.t_used = min(0.1 * k, 2.0)  # then they go out
         lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array((0.1, 0.0, 0.0))), np.array((1.0, 0.0, 0.0)))
         assert filter_.course.wheels is (k < 10.0 * LASTING_S or k >= 20 + 10.0 * HELD_S)
@@ -183,7 +183,7 @@ def test_who_turns_on_the_spot_under_a_row_of_lamps_goes_on_being_told(speed: fl
     filter_ = placed(np.array((5.0, 5.0, 0.5)))
 
     def goes(k: int, step: tuple[float, float, float]) -> None:
-        filter_.under.take(0.0, filter_.course.T[:2], np.eye(3))
+        filter_.under.take(0.0, 1.0, filter_.course.T[:2], np.eye(3))
         filter_.t_used = 0.1 * k
         lights.move(filter_, Odometry(0.1 * k - 0.1, 0.1 * k, np.array(step)), 10.0 * np.array(step))
 
@@ -321,7 +321,7 @@ def test_wheels_that_come_later_are_not_believed_as_matches_were() -> None:
 def test_reset_and_a_given_place_forget_that_lamps_were_a_row() -> None:
     filter_ = lights.new_lights(SURVEY)
     for forget in (lights.reset, lambda one: lights.place(one, np.zeros(3), np.eye(3))):
-        filter_.under.take(0.0, np.zeros(2), np.eye(3))
+        filter_.under.take(0.0, 1.0, np.zeros(2), np.eye(3))
         forget(filter_)
         assert filter_.under.t == math.inf
 

@@ -9,8 +9,7 @@ import pytest
 
 from estimator import localmap, se2
 from estimator.alike import agreement, beams_each
-from estimator.fusion import updated
-from estimator.guess import loose_direction
+from estimator.fusion import loose_direction, updated
 from estimator.keyframe import keep
 from estimator.lines import lines_of
 from estimator.localmap import MapSettings

@@ -48,22 +48,46 @@ def test_who_stays_where_lamps_have_become_a_row_becomes_neither_surer_nor_less_
     known, angle = catalogue([(3.0 * k, 0.0) for k in range(4)]), 0.0
     narrow = row.shape(known, frozenset({1, 2, 3, 4}))[0]
     under, begun = row.Under(), np.diag((0.03**2, 0.06**2, 0.03**2))
-    under.take(5.0, np.array((1.0, 2.0)), begun)
+    under.take(4.9, 0.0, np.array((1.0, 2.0)), begun)
+    under.take(5.0, narrow, np.array((1.0, 2.0)), begun)
     for k in range(1, 60):  # turning about a point beside it
         at = np.array((1.0 + 0.05 * math.sin(0.3 * k), 2.05 - 0.05 * math.cos(0.3 * k)))
-        under.take(5.0 + 0.1 * k, at, np.diag((0.03**2, 0.01**2, 0.002**2)))
+        under.take(5.0 + 0.1 * k, narrow, at, np.diag((0.03**2, 0.01**2, 0.002**2)))
     assert under.lasts(7.0)
     P = np.diag((0.03**2, 0.01**2, 0.002**2))
     row.loosen(narrow, angle, P, under.least(angle))
     assert np.sqrt(np.diag(P)) == pytest.approx((0.03, 0.06, 0.03), rel=1e-6)
-    under.take(12.0, np.array((1.16, 2.0)), P)
-    under.take(12.1, np.array((1.0, 2.0)), P)  # and back: what it has been told on the way stays
+    under.take(12.0, narrow, np.array((1.16, 2.0)), P)
+    under.take(12.1, narrow, np.array((1.0, 2.0)), P)  # and back: what it has been told on the way stays
     assert under.least(angle) == (row.SIDE_M**2, row.SIDE_RAD**2)
-    under.take(math.inf, np.array((1.0, 2.0)), P)
+    under.take(12.2, 0.0, np.array((1.0, 2.0)), P)
     assert not under.lasts(100.0)
-    under.take(13.0, np.array((4.0, 2.0)), 100.0 * np.eye(3))
+    under.take(13.0, narrow, np.array((4.0, 2.0)), 100.0 * np.eye(3))
     assert (under.t, under.far) == (13.0, 0.0)
     assert under.least(angle) == (row.SIDE_M**2, row.SIDE_RAD**2), "a pose that is hardly known is made no surer"
+
+
+def test_what_a_row_alone_has_told_is_no_knowledge_from_before_it() -> None:
+    """A start under a row: the pose is sure of what the row has told it, and what it was is not known by others."""
+    narrow, sure = 1.0, np.diag((0.03**2, 0.02**2, 0.01**2))
+    under = row.Under()
+    under.take(1.0, narrow, np.zeros(2), sure)
+    assert under.least(0.0) == (row.SIDE_M**2, row.SIDE_RAD**2)
+    for told in (row.Under(told=True), row.Under()):
+        if not told.told:
+            told.take(0.5, 0.0, np.zeros(2), sure)
+        told.take(1.0, narrow, np.zeros(2), sure)
+        assert told.least(0.0) == pytest.approx((0.02**2, 0.01**2))
+
+
+def test_one_lamp_or_none_in_use_says_nothing_of_a_row() -> None:
+    known = catalogue([(0.0, 0.0), (3.0, 0.0)])
+    assert [row.several(known, frozenset(lamps)) for lamps in ({1, 2}, {1}, {1, 17}, set())] == [
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
 def test_two_rows_one_lamp_or_none_change_nothing() -> None:
