@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -200,9 +201,10 @@ def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(
 
 @pytest.mark.parametrize(("degraded", "off", "right"), [(4, 0.0, True), (8, 0.0, False), (0, 0.2, False)])
 def test_a_drive_is_tracking_and_right_and_is_shown_where_it_is_not(
-    degraded: int, off: float, right: bool, monkeypatch: pytest.MonkeyPatch
+    degraded: int, off: float, right: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     bench = driven(5.0)
+    bench.folder = tmp_path
     heard = [replace(one, pose=(0.1 * k, off, 0.0), state=3 if k >= degraded else 4) for k, one in enumerate(poses(51))]
     bench.start = (0.0, 0.0, 0.0)
     for name, made in (
@@ -212,6 +214,9 @@ def test_a_drive_is_tracking_and_right_and_is_shown_where_it_is_not(
         monkeypatch.setattr(bench, name, made)
     if right:
         assert isinstance(trying_system.drives(bench), Seen)
+        kept = json.loads((tmp_path / "drive").read_text())
+        assert kept["poses"][3][1:3] == [pytest.approx(0.6), [pytest.approx(0.3), 0.0, 0.0]]
+        assert kept["truth"][12] == [pytest.approx(0.6), [pytest.approx(0.3), 0.0, 0.0]]
         return
     with pytest.raises(common.Unmet, match=r"TRACKING for 84 % of 51 poses|0\.200 m from the truth") as unmet:
         trying_system.drives(bench)

@@ -145,7 +145,7 @@ class Guest:
     broken_off: threading.Event = field(default_factory=threading.Event)
 
     def run(self, booted: Booted, folder: Path, out: Path, say: Say, turns: Turns) -> None:
-        """Try them, until it ends or is broken off; its console and its journal stay in ``out``."""
+        """Try them, until it ends or is broken off; its console, its journal and its drive stay in ``out``."""
         why = "the bench has met an error of its own, which it has written"
         try:
             folder.mkdir()
@@ -171,7 +171,7 @@ class Guest:
             why = "the emulated computer had ended"
         finally:
             self._leave(why, say)
-            for name in ("console", "qemu", "world"):
+            for name in ("console", "qemu", "world", "drive"):
                 if (folder / name).exists():
                     (out / f"{name}-{self.number}.log").write_bytes((folder / name).read_bytes())
 

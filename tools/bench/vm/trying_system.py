@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import statistics
 import time
@@ -166,6 +167,7 @@ def drives(bench: Bench) -> Seen:
     bench.memory["drive"] = heard
     found = errors(bench, heard)
     need(found, "no pose has come")
+    _keep(bench, heard)
     tracked = sum(one.state == 3 for one in heard) / len(heard)
     middle = statistics.median(found)
     ages = [1e3 * (one.t_came - one.t_pose) for one in heard]
@@ -184,6 +186,16 @@ def drives(bench: Bench) -> Seen:
     except Order as error:
         raise Unmet(f"{error}", seen) from error
     return seen
+
+
+def _keep(bench: Bench, heard: list[Heard]) -> None:
+    """For who wants to look into one pose: all of the drive, and the truth meanwhile; goes with the results."""
+    poses = [(one.t_came, one.t_pose, one.pose, one.missed, one.overruns, one.fault) for one in heard]
+    truth = [(t, pose) for t, pose in list(bench.ears.truth) if t >= heard[0].t_pose - 1.0]
+    head = (
+        "poses: came, true at, (x, y, yaw), missed scans, cycles over budget, fault; truth: at, (x, y, yaw); s, m, rad"
+    )
+    (bench.folder / "drive").write_text(json.dumps({"what": head, "poses": poses, "truth": truth}))
 
 
 @scenario()
