@@ -1,4 +1,4 @@
-"""Scenarios: what happens to the computer."""
+"""Scenarios: what happens to the computer, and to the process while its robot drives."""
 
 from __future__ import annotations
 

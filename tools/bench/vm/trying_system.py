@@ -40,7 +40,8 @@ AGREE_M: Final = 0.01
 AGREE_WAY_M: Final = 4.0
 """Driven at least: two runs that share no way agree about nothing."""
 MOST: Final = 0.9
-"""Of the scans: at the ends of the time that is listened, one more or less may fall into it."""
+"""Of the scans: at the ends of the time that is listened, one more or less may fall into it. So much of a drive is
+TRACKING, too."""
 LATE_S: Final = 0.02
 SPREAD_MS: Final = 20
 """By so much lateness may change in a drive: 4 mm to either side at 0.4 m/s, which is what it may hide."""
