@@ -22,6 +22,7 @@ from hal.errors import DataInvalid
 from hal.imu import RawImu
 from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, decode
 from hal.odometry import RawOdometry
+from hal.senderclock import SenderClock
 from hal.share import Reader, Share
 
 log = logging.getLogger(__name__)
@@ -163,6 +164,7 @@ class InputPort:
         self._on_odometry: OnOdometry | None = None
         self._on_imu: OnImu | None = None
         self._kinds = {ODOMETRY_MAGIC: Sequence(), IMU_MAGIC: Sequence()}
+        self._clocks = {ODOMETRY_MAGIC: SenderClock(), IMU_MAGIC: SenderClock()}
         self.invalid = 0
         self._damage, self._rivals = _Trouble(), {ODOMETRY_MAGIC: _Trouble(), IMU_MAGIC: _Trouble()}
         self.odometry = UdpOdometry(self)
@@ -241,7 +243,7 @@ class InputPort:
                 said = "port %d: readings of %s are ignored while another sender is heard there (end one of them)"
                 log.warning(said, self.port, peer)
             return
-        t_mono = _reading_time(datagram, t_rx)
+        t_mono = self._reading_time(datagram, t_rx, kind.restarted)
         if datagram.magic == IMU_MAGIC:
             if self._on_imu is not None:
                 self._on_imu(RawImu(t_rx=t_rx, t_mono=t_mono, yaw_rate=datagram.values[0]))
@@ -252,6 +254,15 @@ class InputPort:
         if self._on_odometry is not None:
             missed = kind.counts.lost - lost
             self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_mono, x=x, y=y, yaw=yaw, missed=missed))
+
+    def _reading_time(self, datagram: InputDatagram, t_rx: float, restarted: bool) -> float:
+        """When the reading was true: by the sender's clock, ours if it says so and is plausible, or by the arrival."""
+        if not datagram.flags & SHARED_CLOCK:
+            clock = self._clocks[datagram.magic]
+            if restarted:
+                clock.restart()
+            return clock.when(datagram.time, t_rx)
+        return min(datagram.time, t_rx) if -MAX_LEAD_S <= t_rx - datagram.time <= MAX_AGE_S else t_rx
 
     def send_odometry_to(self, receiver: OnOdometry | None) -> None:
         """Who gets odometry readings."""
@@ -294,11 +305,3 @@ class UdpImu:
         finally:
             self._port.send_imu_to(None)
             self._port.close()
-
-
-def _reading_time(datagram: InputDatagram, t_rx: float) -> float:
-    """When the reading was true: the sender's time if it shares our clock and is plausible, else the arrival."""
-    age = t_rx - datagram.time
-    if datagram.flags & SHARED_CLOCK and -MAX_LEAD_S <= age <= MAX_AGE_S:
-        return min(datagram.time, t_rx)
-    return t_rx

@@ -13,7 +13,7 @@ class RawOdometry:
 
     Attributes:
         t_rx: ``t_mono`` of arrival (kernel receive stamp where there is one).
-        t_mono: ``t_mono`` at which the pose held; equals ``t_rx`` when the sender has no shared clock.
+        t_mono: ``t_mono`` at which the pose held; a sender without a shared clock: ``t_rx``, less what it was held up.
         x, y: metres. yaw: rad, counter-clockwise, not necessarily wrapped.
         missed: readings lost on their way since the one before; not recorded.
     """

@@ -85,7 +85,7 @@ class Port(Protocol):
 
 
 class ForeignSender(UdpSender):
-    """Odometry of another computer: its clock means nothing to the daemon, so the bit that says so is cleared."""
+    """Odometry of another computer: its clock is not the daemon's, so the bit that says it is gets cleared."""
 
     def send(self, data: bytes) -> None:
         """See :class:`UdpSender`."""
