@@ -18,7 +18,7 @@ from hal.odometry import RawOdometry
 LATE_PERIODS: Final = 2.5
 """Scan periods from a scan's first beam to its arrival: a revolution takes one, the line less than another."""
 LATE_S: Final = 0.15
-"""Age of an odometry reading at its arrival, where sender and daemon share a clock."""
+"""Age of an odometry reading at its arrival, as the clock of its sender tells."""
 MISFIT_S: Final = 2.0
 """A laser that is at odds with the map for this long is told, once the place had been known."""
 NOWHERE_S: Final = 5.0

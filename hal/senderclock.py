@@ -1,29 +1,30 @@
-"""When a reading of another computer was true: its own clock tells how late the network has brought it."""
+"""When a reading of another computer was true: its own clock tells which readings the network has held up."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Final
 
 from hal.arrival import MAX_AGE_S
 
-WINDOW_S: Final = 3.0
-"""What the way has been like for so long: clocks drift by less than a millisecond meanwhile, and one that has been set
-back is believed by then."""
-FIRST_S: Final = 0.01
-LEAST_S: Final = 50e-6
-STEP: Final = 1.05
-"""The usual lateness, to begin with and at least; with every reading it changes by this factor, so that it follows the
-median, whatever a single reading does."""
+LEARN: Final = 0.05
+"""Share of a reading in what is usual; of 20 of them it is learned."""
+FEWEST: Final = 20
+"""Readings before which none is dated back."""
+GAP: Final = 1.5
+"""So many times the usual time between two arrivals is a gap."""
+REGULAR: Final = 0.5
+"""What the sender's clock has to have gone on by meanwhile, of that time, to be believed: it may have stood."""
+LASTS_S: Final = 0.3
+"""What still lags so long after a gap is the way of the data, or the clock."""
 
 
 class SenderClock:
-    """Follows (arrival - the sender's time) of one sender; what it has never been less than is the way of the data.
+    """Follows one sender: arrivals, and the time that its clock gives with each reading.
 
-    A reading that is later than twice the usual is taken to have been under way for longer, and dated back by that; all
-    others are as old as their arrival says. So a clock that ticks as coarsely as readings come does no harm, nor one
-    that stands, runs wild or is set: then nothing is late, or everything, and the arrival is as good as it was.
+    Where nothing comes for longer than usual though the clock has gone on as usual, the reading that comes at last has
+    been held up by the difference, and those that come with it by less each. That much they are dated back; all others
+    are as old as their arrival says. No clock has to be right for that, or fine: only what it does during a gap counts.
     """
 
     def __init__(self) -> None:
@@ -31,27 +32,34 @@ class SenderClock:
 
     def restart(self) -> None:
         """Another sender, or another clock."""
-        self._least: deque[tuple[float, float]] = deque()  # (arrival, delay): falling arrivals have rising delays
+        self._t = self._t_gap = -math.inf
         self._time = -math.inf
-        self._usual = FIRST_S
+        self._held = self._usual = 0.0
+        self._count = 0
 
     def when(self, time: float, t_rx: float) -> float:
-        """The instant of a reading on this computer's clock, ``t_rx`` at the latest.
+        """The instant of a reading on this computer's clock, ``t_rx`` at the latest, never before the one before.
 
         Args:
             time: of the reading by the sender's clock, s.
-            t_rx: of its arrival, on this computer's, s.
+            t_rx: of its arrival, on this computer's, s; one before the latest is taken for that.
         """
         if time <= self._time:
             self.restart()
-        self._time = time
-        delay = t_rx - time
-        while self._least and self._least[-1][1] >= delay:
-            self._least.pop()
-        self._least.append((t_rx, delay))
-        while self._least[0][0] < t_rx - WINDOW_S:
-            self._least.popleft()
-        late = delay - self._least[0][1]
-        allowed = 2.0 * self._usual
-        self._usual = max(LEAST_S, self._usual * (STEP if late > self._usual else 1.0 / STEP))
-        return t_rx - late + allowed if allowed < late <= MAX_AGE_S else t_rx
+        arrived = max(t_rx, self._t)
+        if self._count:
+            self._follow(arrived - self._t, time - self._time, arrived)
+        self._t, self._time, self._count = arrived, time, self._count + 1
+        return min(t_rx, arrived - min(self._held, MAX_AGE_S))
+
+    def _follow(self, waited: float, went_on: float, arrived: float) -> None:
+        later = waited - went_on
+        regular = self._count >= FEWEST and went_on >= REGULAR * self._usual
+        if later > 0.0 and regular and waited > GAP * self._usual:
+            self._held, self._t_gap = self._held + later, arrived
+        else:
+            self._held = max(0.0, self._held + min(later, 0.0))
+        if arrived - self._t_gap > LASTS_S:
+            self._held = 0.0
+        most = waited if self._count < FEWEST else min(waited, 4.0 * self._usual)  # a silence is not what is usual
+        self._usual += (most - self._usual) * max(LEARN, 1.0 / self._count)

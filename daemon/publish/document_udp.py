@@ -55,9 +55,10 @@ CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
 * A sender that restarts draws a new `session` (or is silent for {inputs.SESSION_TIMEOUT_S:g} s) and may begin again
   at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored;
   where that lasts for more than a second the log says whose.
-* The time of a reading is the kernel's time of arrival; one that has been under way for more than twice as long as is
-  usual, as the sender's own `time` tells, is dated back by that, up to {MAX_AGE_S:g} s. Any clock does for that, also
-  one that is set now and then; where `time` stands still, the arrival counts.
+* The time of a reading is the kernel's time of arrival. Where none has come for longer than usual although the sender's
+  own `time` has gone on as usual, those that come at last were held up: they are dated back by that, up to
+  {MAX_AGE_S:g} s. So are readings that are sent several at a time, each with the `time` it was taken at. Any clock does
+  for that; where it stands, is set or runs fast or slow, the arrival counts.
 * A sender on the same computer does better: it sets bit 0 of `flags` and puts CLOCK_MONOTONIC into `time`; a time in
   the future or more than {MAX_AGE_S:g} s old is not believed.
 * Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped; the
