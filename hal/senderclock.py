@@ -7,10 +7,10 @@ from typing import Final
 
 from hal.arrival import MAX_AGE_S
 
-LEARN: Final = 0.05
-"""Share of a reading in what is usual; of 20 of them it is learned."""
 FEWEST: Final = 20
-"""Readings before which none is dated back."""
+"""Readings of which it is learned how long is usual between two; before, none is dated back."""
+LEARN: Final = 1.0 / FEWEST
+"""Share of every later one in that."""
 GAP: Final = 1.5
 """So many times the usual time between two arrivals is a gap."""
 REGULAR: Final = 0.5
@@ -38,11 +38,13 @@ class SenderClock:
         self._count = 0
 
     def when(self, time: float, t_rx: float) -> float:
-        """The instant of a reading on this computer's clock, ``t_rx`` at the latest, never before the one before.
+        """The instant of a reading on this computer's clock, s: ``t_rx`` at the latest, `MAX_AGE_S` before at most.
+
+        Unless arrivals go back it is never before that of the reading before.
 
         Args:
-            time: of the reading by the sender's clock, s.
-            t_rx: of its arrival, on this computer's, s; one before the latest is taken for that.
+            time: of the reading by the sender's clock, s, finite.
+            t_rx: of its arrival, on this computer's, s; how long was waited since counts from the latest so far.
         """
         if time <= self._time:
             self.restart()

@@ -6,6 +6,7 @@ from typing import Final
 
 from daemon.publish import integrity, lights, registers, subscribe
 from daemon.publish.tables import NOT_KNOWN, NOTICE, layout_rows, table
+from daemon.watch import LATE_S
 from hal import input_codec, inputs
 from hal.arrival import MAX_AGE_S
 
@@ -58,7 +59,8 @@ CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
 * The time of a reading is the kernel's time of arrival. Where none has come for longer than usual although the sender's
   own `time` has gone on as usual, those that come at last were held up: they are dated back by that, up to
   {MAX_AGE_S:g} s. So are readings that are sent several at a time, each with the `time` it was taken at. Any clock does
-  for that; where it stands, is set or runs fast or slow, the arrival counts.
+  for that; where it stands, is set or runs fast or slow, the arrival counts. Readings that keep coming more than
+  {LATE_S:g} s late are told (ODOMETRY_GAPS).
 * A sender on the same computer does better: it sets bit 0 of `flags` and puts CLOCK_MONOTONIC into `time`; a time in
   the future or more than {MAX_AGE_S:g} s old is not believed.
 * Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped; the
