@@ -11,9 +11,9 @@ from daemon.reasons import Reason
 SILENT_PERIODS: Final = 3.0
 """Scan periods without a valid scan after which the lidar is said to be gone."""
 VAGUE_M: Final = 0.15
-VAGUE_RAD: Final = 0.045
-"""One-sigma uncertainty beyond which TRACKING is not said. The heading's is half of the 5 deg that TRACKING must not be
-off by (docs/integrity.md): of those that were less sure, some were."""
+VAGUE_RAD: Final = 0.05
+"""One-sigma uncertainty beyond which TRACKING is not said. The heading's is 2.9 deg, of the 5 that TRACKING must not be
+off by: of those that were less sure, some were (docs/integrity.md)."""
 
 
 @dataclass(frozen=True, slots=True)

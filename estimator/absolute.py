@@ -21,7 +21,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.keyframe import Virtual
-from estimator.lights_trust import TRUST, across_the_row, doubted, doubted_covariance, without_heading
+from estimator.lights_trust import BESIDE_M, TRUST, across_the_row, doubted, doubted_covariance, without_heading
 from estimator.linear3 import det3, invert3, largest_of, positive_part, symmetric
 from estimator.mapframe import move_map, rehang, shift_map
 from estimator.moving import grow_tie, hang, mend_tie
@@ -180,7 +180,8 @@ def on_lights(state: State, lights: LightsResult) -> None:
     if lights.fix not in (Fix.GOOD, Fix.STARTING):
         return
     tie.row.take(doubt(state.light.filter.catalogue, lights.accepted), tie.way)
-    lights = across_the_row(tie.row.left, doubted(lights, tie.way - tie.way_young, state.light.told))
+    in_row = tie.row.narrow(BESIDE_M)
+    lights = across_the_row(tie.row.left, doubted(lights, tie.way - tie.way_young, state.light.told, in_row))
     held = holds_heading(state)
     if held:
         lights = without_heading(lights)
@@ -319,7 +320,7 @@ def virtual(state: State) -> Virtual | None:
         return None
     wheels = state.light.told
     lights = across_the_row(tie.row.left, state.light.result)
-    _, factor = doubted_covariance(lights, tie.way - tie.way_young, wheels)
+    _, factor = doubted_covariance(lights, tie.way - tie.way_young, wheels, tie.row.narrow(BESIDE_M))
     T_odom_base = pose_at(state, max(lights.t_mono, lights.t_pose))
     T_map_base = lights.T_map_base.copy()
     if not wheels:  # the pose's heading is the better guess, by which the submap's origin is found from here

@@ -14,12 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from estimator import ekf, ekf_iterate, ekf_links, lights_motion, row, se2
+from estimator.bent import Bent
 from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
 from estimator.lights_links import Learned, Sight, distrust, forget, judge, relearn, sights, table, view_of
-from estimator.lights_memory import fresh_gains
+from estimator.lights_memory import bend, fresh_gains
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places, rule_out
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3, positive_part
@@ -148,11 +149,13 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
     zeros = np.zeros((ekf.SIZE, ekf.SIZE))
     lights.tracks = [new_track(lights, np.asarray(T_map_base), np.asarray(covariance), old, zeros)]
     lights.t_lost, lights.t_odd, lights.under, lights.lost = math.inf, math.inf, row.Under(told=True), False
+    lights.bent = Bent()
 
 
 def reset(lights: Lights) -> None:
     """Forget the place and everything learned about lamps; those that described themselves stay known."""
     lights.tracks, lights.gains, lights.absent, lights.before = [], {}, {}, None
+    lights.recalled, lights.bent = {}, Bent()
     lights.t_lost, lights.t_odd, lights.under, lights.lost, lights.result = math.inf, math.inf, row.Under(), False, None
 
 
@@ -184,6 +187,7 @@ def update(lights: Lights, epoch: LightEpoch) -> LightsResult:
     forget(lights)
     best = lights.tracks[0] if lights.tracks else None
     learned = Learned(best)
+    bend(lights, [sight for sight in seen if sight.state is LinkState.ACCEPTED])
     lights.result = describe(lights, [sight.link(learned) for sight in seen], epoch, (gained, gained_by))
     return lights.result
 
@@ -233,6 +237,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
     lights.way_epoch = lights.course.way
     news = min(way / ANEW_M, 1.0) if lights.course.wheels else float(way > 0.0)
     views: list[tuple[Track, list[Sight]]] = []
+    likeliest = lights.tracks[:1]
     for track in lights.tracks:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
@@ -251,6 +256,8 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         rule_out(lights, epoch)
     if len(lights.tracks) > 1:
         decide(lights)
+    if lights.tracks[:1] != likeliest:
+        lights.bent.elsewhere()
     return next((seen for track, seen in views if lights.tracks and track is lights.tracks[0]), [])
 
 
@@ -348,6 +355,7 @@ def describe(
         block=epoch.block if epoch is not None else BlockFlag.NONE,
         clock_ppm=epoch.clock_ppm if epoch is not None else None,
         t_pose=lights.course.t_mono,
+        bent=lights.bent.anew,
     )
 
 
@@ -362,6 +370,7 @@ def fix_of(lights: Lights, P: Array) -> Fix:
         return Fix.AMBIGUOUS if spread > 0.8 else Fix.STARTING
     if lights.course.t_mono - lights.t_odd > ODD_S:
         lights.lost, lights.way_odd = True, lights.course.way
+        lights.bent.elsewhere()
         return Fix.LOST
     if lights.lost and lights.course.way - max(lights.way_start, lights.way_odd) < PROOF_M:
         return Fix.STARTING

@@ -398,5 +398,7 @@ def forget(lights: Lights) -> None:
             break
         lights.catalogue.drop(lamp_id)
         lights.gains.pop(lamp_id, None)
+        lights.recalled.pop(lamp_id, None)
+        lights.bent.lamps.pop(lamp_id, None)
         for track in lights.tracks:
             track.watches.pop(lamp_id, None)

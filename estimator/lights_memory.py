@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator import ekf
 from estimator.lamps import Lamp
-from estimator.lights_links import settled
+from estimator.lights_links import Sight, settled
 from estimator.lights_motion import wheel_scales
 from estimator.lights_state import Lights, Track
 from estimator.records import Array
@@ -49,6 +49,37 @@ def gains_known(lights: Lights) -> Learned:
     return {**lights.gains, **fresh_gains(lights)}
 
 
+def expected_of(lights: Lights, lamp_id: int) -> tuple[Array, Array]:
+    """Means and variances, (3,) each, of a lamp's own (ln gain, lean x, lean y): of an earlier run, else as surveyed.
+
+    Not what this run has found so far: a place that is wrong has found lamps that fit it.
+    """
+    return lights.recalled.get(lamp_id) or (np.zeros(3), new_variance(lights, lamp_id))
+
+
+def bend(lights: Lights, used: list[Sight]) -> None:
+    """Note how far the likeliest hypothesis takes lamps for others than was expected (`bent.Bent`).
+
+    Of a lamp it is the sum of the squares of what is taken for its own gain, its lean and the error of its link: in
+    deviations, of the link in usual ones, though at first more is allowed for.
+
+    ``used``: the links accepted in the latest epoch; none tell nothing, nor do those that an older hypothesis has used.
+    """
+    if not lights.tracks:
+        return
+    track, squares = lights.tracks[0], dict[int, float]()
+    for sight in used:
+        if sight.lamp is None or track.slots.get(sight.lamp.lamp_id) != sight.slot:
+            continue
+        mean, variance = expected_of(lights, sight.lamp.lamp_id)
+        first = ekf.FIRST + ekf.OWN * sight.slot
+        off = track.x[first : first + 3] - mean
+        error = float(track.x[first + ekf.ERROR])
+        squares[sight.lamp.lamp_id] = float(np.sum(off**2 / np.maximum(variance, DOUBT))) + error**2
+    if squares:
+        lights.bent.take(squares, lights.course.t_mono, lights.course.way)
+
+
 def sensors_known(lights: Lights) -> tuple[Array, Array] | None:
     """Means and variances of :data:`SENSORS`, None while nothing worth keeping is known."""
     known = lights.tracks[0] if len(lights.tracks) == 1 and settled(lights.tracks[0]) else lights.before
@@ -72,6 +103,7 @@ def recall(lights: Lights, gains: Learned, sensors: tuple[Array, Array] | None, 
     for lamp_id, (mean, variance) in gains.items():
         if lamp_id in catalogue.by_id:
             lights.gains[lamp_id] = mean.copy(), np.minimum(variance + AGED, new_variance(lights, lamp_id))
+            lights.recalled[lamp_id] = lights.gains[lamp_id]
     if sensors is not None:
         mean, variance = sensors
         lights.before = Track()

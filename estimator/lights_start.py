@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator import ekf, ekf_start, se2
+from estimator.bent import Bent
 from estimator.cdma_epoch import LightEpoch
 from estimator.lamps import Lamp
 from estimator.lights_links import ACCEPTED, DIFFUSE, Sight, remembered, sights
@@ -150,6 +151,7 @@ def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> 
             track.weight = -0.5 * place.cost
             lights.tracks.append(track)
     lights.way_start, lights.under = lights.course.way, Under()
+    lights.bent = Bent()
 
 
 def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track | None, zeros: Array) -> Track:

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from estimator import se2
+from estimator.bent import Bent
 from estimator.ekf import FIRST, OWN, SIZE, SLOTS
 from estimator.lamps import Survey
 from estimator.lights_catalogue import Catalogue
@@ -214,7 +215,8 @@ class Lights:
         absent: by lamp ID, (instant, way) since which it should be received but is not.
         corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
         lost: the last start was made necessary by a contradiction.
-        before: what an earlier run knew of the sensors, for the first hypothesis.
+        before: what an earlier run knew of the sensors, for the first hypothesis. recalled: and of lamps, as ``gains``.
+        bent: how far lamps are taken for others than was expected (`lights_memory.bend`).
     """
 
     survey: Survey
@@ -236,4 +238,6 @@ class Lights:
     lean: tuple[float, float] = (0.0, 0.0)
     lost: bool = False
     before: Track | None = None
+    recalled: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    bent: Bent = field(default_factory=Bent)
     result: LightsResult | None = None

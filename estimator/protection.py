@@ -25,7 +25,7 @@ import numpy as np
 
 from estimator import se2
 from estimator.absolute import pose_at
-from estimator.lights_trust import doubted_covariance
+from estimator.lights_trust import BESIDE_M, doubted_covariance
 from estimator.records import Array
 from estimator.result import Fix, Protection
 from estimator.state import State
@@ -103,7 +103,8 @@ def _without_laser(state: State) -> tuple[float, float]:
     assert tie is not None
     assert light is not None
     wheels = on_wheels(state)
-    said, (covered, _) = light.result, doubted_covariance(light.result, tie.way - tie.way_young, wheels)
+    in_row = tie.row.narrow(BESIDE_M)
+    said, (covered, _) = light.result, doubted_covariance(light.result, tie.way - tie.way_young, wheels, in_row)
     here = se2.compose(state.T_map_odom, pose_at(state, max(said.t_mono, said.t_pose)))
     off = said.T_map_base - here
     far, turned = spread(covered, K_FAULT)

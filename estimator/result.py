@@ -201,6 +201,8 @@ class LightsResult:
         gained: 3x3 information that this step's links added to the pose beyond the prediction, and ``gained_by``: the
             pose's correction they made; `fused` takes exactly this, so that odometry is never counted twice.
         floor: the diffuse part as estimated. block: flags of the latest sample block. clock_ppm: of the sample clock.
+        bent: how much farther than usual, and than they have long been, lamps are taken for others than was expected;
+            deviations squared, of a lamp (`bent.Bent`).
     """
 
     t_mono: float
@@ -215,6 +217,7 @@ class LightsResult:
     block: BlockFlag = BlockFlag.NONE
     clock_ppm: float | None = None
     t_pose: float = -math.inf
+    bent: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,6 +85,10 @@ class Lately:
         self.usual, self.way = more if self.usual is None else keep * self.usual + (1.0 - keep) * more, way
         self.left = more if more.trace() >= self.usual.trace() else self.usual
 
+    def narrow(self, off_m: float) -> float:
+        """How much of a row the lamps are, or were of late, 0 to 1: where they are less than so far off a line."""
+        return math.pow(max(float(self.left[2, 2]), 0.0) / ACROSS_RAD**2, (ROW_M / off_m) ** 2)
+
 
 @dataclass(slots=True, eq=False)
 class Under:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from daemon.state_evidence import VAGUE_RAD
 from estimator import absolute, se2
-from estimator.lights_trust import across_the_row
+from estimator.lights_trust import BENT, IN_ROW, TRUST, YOUNG, across_the_row, doubted
 from estimator.pipeline import State, keyframe_poses, step
 from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
-from estimator.result import SURPRISE, Fix
-from estimator.row import doubt
+from estimator.result import SURPRISE, Fix, LightsResult
+from estimator.row import Lately, doubt
 from tests.estimator.lit import Log, Truth, lights_at, lit_state, play, scans, together
 from tools.sim.buildings import building
 from tools.sim.ceiling import ceiling_of
@@ -76,10 +79,14 @@ def test_light_places_the_map_in_the_survey_and_the_laser_steadies_it(in_room: L
 
 
 @pytest.mark.slow
-def test_four_drives_are_as_good_and_as_honest_as_the_estimator_page_says() -> None:
-    runs = [replace(room_run(seed=seed), seconds=110.0) for seed in (5, 6, 7, 8)]
+def test_eight_drives_are_as_good_and_as_honest_as_the_estimator_page_says() -> None:
+    """With 12, of twenty the start that is led astray farthest: half a metre and more, with lamps bent by 13."""
+    runs = [replace(room_run(seed=seed), seconds=110.0) for seed in (5, 6, 7, 8, 9, 10, 11, 12)]
     logs = [play(lit_state(run), everything(run), run.truth) for run in runs]
-    spans = ((10.0, 30.0, 0.12, 1.5), (30.0, 60.0, 0.06, 0.6), (60.0, 120.0, 0.05, 0.4))
+    for log in logs:
+        heading, sigma = np.abs(np.array(log.error)[:, 2]), np.array([math.sqrt(P[2, 2]) for P in log.P])
+        assert np.degrees(heading[sigma < VAGUE_RAD].max()) < 5.0, "TRACKING could have been said"
+    spans = ((10.0, 30.0, 0.14, 1.75), (30.0, 60.0, 0.06, 0.6), (60.0, 120.0, 0.05, 0.4))
     for begin, end, metres, degrees in spans:
         rmse = np.sqrt(np.mean(np.square([log.rmse(begin, end) for log in logs]), axis=0))
         assert rmse[0] < metres
@@ -316,6 +323,71 @@ def test_what_light_says_of_a_keyframe_is_as_doubtful_across_a_row(driven: tuple
     assert told is not None
     assert np.sqrt(np.diag(told.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
     assert told.accepted == {1, 2, 3, 4}
+
+
+def test_what_light_says_of_a_keyframe_is_as_doubtful_as_its_lamps_are_bent(driven: tuple[State, Log]) -> None:
+    state = copy.deepcopy(driven[0])
+    assert state.light is not None
+    assert state.absolute is not None
+    state.absolute.way_young, state.absolute.row = state.absolute.way - 100.0, Lately()
+    lit = lights_at(driven[1].results[-1].T_map_odom, frozenset((1, 4, 13, 16)), state)
+    state.light.result = lit
+    fitting = absolute.virtual(state)
+    state.light.result = replace(lit, bent=1.0)
+    bent = absolute.virtual(state)
+    assert fitting is not None
+    assert bent is not None
+    assert bent.covariance - fitting.covariance == pytest.approx(BENT / TRUST * lit.covariance, rel=1e-3, abs=1e-6)
+
+
+def test_what_light_says_of_a_keyframe_is_doubted_more_at_a_start_in_a_row(driven: tuple[State, Log]) -> None:
+    state = copy.deepcopy(driven[0])
+    assert state.light is not None
+    assert state.absolute is not None
+    state.light.result = lights_at(driven[1].results[-1].T_map_odom, frozenset((1, 2, 3, 4)), state)
+    state.absolute.way_young = state.absolute.way
+    state.absolute.row.take(doubt(state.light.filter.catalogue, state.light.result.accepted), state.absolute.way)
+    told = absolute.virtual(state)
+    assert told is not None
+    assert told.covariance[0, 0] == pytest.approx(0.05**2 * (TRUST + YOUNG + IN_ROW) / TRUST, rel=0.1)
+
+
+def test_a_start_in_a_row_is_doubted_more_before_it_enters_the_pose(
+    driven: tuple[State, Log], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, raised = copy.deepcopy(driven[0]), list[float]()
+    tie = state.absolute
+    assert tie is not None
+
+    def noted(lights: LightsResult, *known: Any) -> LightsResult:
+        less = doubted(lights, *known)
+        raised.append(less.covariance[0, 0] / lights.covariance[0, 0])
+        return less
+
+    monkeypatch.setattr(absolute, "doubted", noted)
+    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    for lamps in ((1, 2, 3, 4), (1, 4, 13, 16)):
+        tie.way_young, tie.row = tie.way, Lately()
+        absolute.on_lights(state, lights_at(T, frozenset(lamps), state))
+    assert raised == pytest.approx([TRUST + YOUNG + IN_ROW, TRUST + YOUNG], rel=0.05)
+
+
+def test_light_of_bent_lamps_that_brings_nothing_is_not_taken_for_surer_than_the_pose(
+    driven: tuple[State, Log],
+) -> None:
+    """A place taken as it is, for being much surer, would stay."""
+    state = copy.deepcopy(driven[0])
+    assert state.light is not None
+    tie = state.absolute
+    assert tie is not None
+    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    lit = replace(lights_at(T + np.array((0.1, 0.0, 0.0)), frozenset((1, 4, 13, 16)), state), bent=3.0)
+    tie.way_young = tie.way
+    tie.P = doubted(lit, 0.0).covariance * 0.9
+    before, at = tie.P.copy(), state.T_map_odom.copy()
+    absolute.on_lights(state, replace(lit, accepted=frozenset()))
+    assert pytest.approx(before) == tie.P
+    assert state.T_map_odom == pytest.approx(at)
 
 
 def test_with_nobody_to_tell_the_way_light_says_nothing_of_a_keyframes_heading(driven: tuple[State, Log]) -> None:

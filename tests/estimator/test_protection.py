@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -68,6 +69,23 @@ def test_a_hundred_thousand_gaussian_errors_are_within_it() -> None:
     held = held_by(lit())
     assert held is not None
     assert np.hypot(*errors.T).max() < held.horizontal_m
+
+
+def test_light_whose_lamps_are_bent_or_in_a_row_bounds_it_less_at_a_start() -> None:
+    def level(bent: float, in_row: bool) -> float:
+        state = lit()
+        tie = cast(Absolute, state.absolute)
+        tie.way_young = tie.way
+        tie.row.left = np.diag((1.0, 1.0, 0.2**2)) * float(in_row)
+        assert state.light is not None
+        state.light.result = replace(state.light.result, bent=bent)
+        held = held_by(state)
+        assert held is not None
+        return held.horizontal_m
+
+    usual = level(0.0, in_row=False)
+    assert level(3.0, in_row=False) > 1.3 * usual
+    assert level(0.0, in_row=True) > 1.2 * usual
 
 
 def test_two_witnesses_that_agree_bound_it_by_the_covariance() -> None:

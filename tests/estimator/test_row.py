@@ -125,6 +125,16 @@ def test_what_a_row_has_led_astray_stays_in_doubt_for_a_while_with_other_lamps()
     assert lately.left.trace() < 0.01 * a_row.trace()
 
 
+@pytest.mark.parametrize(("beside_m", "least", "most"), [(0.1, 0.95, 1.0), (2.0, 0.3, 0.7), (6.0, 0.0, 0.01)])
+def test_how_much_of_a_row_lamps_are(beside_m: float, least: float, most: float) -> None:
+    """Four in a line, and two beside it: by what the six are off a line together."""
+    known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, beside_m), (4.5, beside_m)])
+    lately = row.Lately()
+    assert lately.narrow(1.0) == 0.0
+    lately.take(row.doubt(known, frozenset(range(1, 7))), 0.0)
+    assert least <= lately.narrow(1.0) <= most
+
+
 def test_what_a_row_has_led_astray_is_not_forgotten_in_the_dark() -> None:
     """The first lamp beside it after a metre without any is the first all the same; so is a start below a row."""
     known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
