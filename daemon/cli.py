@@ -222,7 +222,13 @@ def _map(parser: argparse.ArgumentParser) -> None:
 def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     align = verbs.add_parser("align", help="move a map so that points of it lie where they should")
     align.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
-    align.add_argument("--point", action="append", default=[], metavar="X,Y=X',Y'", help="from, to, in m; two or more")
+    align.add_argument(
+        "--point",
+        action="append",
+        default=[],
+        metavar="X,Y=X',Y'",
+        help="from, to, in m; two or more; --point=-1,0=0,0 where the first is negative",
+    )
     name = verbs.add_parser("name", help="say which floor or building a map is of")
     name.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     name.add_argument("text", metavar="NAME", help="at most 64 characters")

@@ -139,7 +139,7 @@ class Patience:
         if waited > TELL_S and not self._told:
             self._told = True
             print(
-                "not ready yet: a first start compiles the numerical kernels, up to a minute; later ones take seconds",
+                "not ready yet: a first start compiles the numerical kernels, a minute or two; later ones take seconds",
                 flush=True,
             )
         time.sleep(0.05)
