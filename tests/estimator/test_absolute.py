@@ -6,18 +6,16 @@ import copy
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from daemon.state_evidence import VAGUE_RAD
 from estimator import absolute, se2
-from estimator.lights_trust import BENT, IN_ROW, TRUST, YOUNG, across_the_row, doubted
 from estimator.pipeline import State, keyframe_poses, step
 from estimator.records import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
-from estimator.result import SURPRISE, Fix, LightsResult
-from estimator.row import Lately, doubt
+from estimator.result import SURPRISE, Fix
+from estimator.row import doubt
 from tests.estimator.lit import Log, Truth, lights_at, lit_state, play, scans, together
 from tools.sim.buildings import building
 from tools.sim.ceiling import ceiling_of
@@ -292,103 +290,6 @@ def test_reset_forgets_where_the_map_lies() -> None:
     result = step(state, [Command(3.0, Order.RESET)], UNLIMITED)
     assert not result.placed
     assert result.gap is None
-
-
-def test_lamps_in_one_row_tell_little_across_it(driven: tuple[State, Log]) -> None:
-    """Lamps 1 to 4 hang along x: y and heading are doubted, x is not; with lamp 16 as well nothing is."""
-    state, T = driven[0], driven[1].results[-1].T_map_odom
-    catalogue = state.light.filter.catalogue  # type: ignore[union-attr]  # lit
-    lamps = catalogue.by_id
-    assert len({round(lamps[k].y, 2) for k in (1, 2, 3, 4)}) == 1
-    in_a_row = doubt(catalogue, frozenset((1, 2, 3, 4)))
-    row = across_the_row(in_a_row, lights_at(T, frozenset((1, 2, 3, 4)), state))
-    assert np.sqrt(np.diag(row.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
-    told = lights_at(T, frozenset((1, 2, 3, 4)), state)
-    told = replace(told, gained=0.5 * np.linalg.inv(told.covariance), gained_by=np.array((0.02, 0.1, 0.0)))
-    row = across_the_row(in_a_row, told)
-    x, y, _ = (np.linalg.inv(row.covariance) @ row.gained_by / np.diag(row.gained)).tolist()
-    assert (x, y) == pytest.approx((0.04, 0.2), rel=0.05), "a correction goes with what it weighs, along and across"
-    grid = across_the_row(doubt(catalogue, frozenset((1, 4, 13, 16))), lights_at(T, frozenset((1, 4, 13, 16)), state))
-    assert np.sqrt(np.diag(grid.covariance)) == pytest.approx((0.05, 0.05, 0.02), abs=0.005)
-
-
-def test_what_light_says_of_a_keyframe_is_as_doubtful_across_a_row(driven: tuple[State, Log]) -> None:
-    """It anchors the map, which would be turned to and fro between two laps by what a row of lamps cannot know."""
-    state = copy.deepcopy(driven[0])
-    assert state.light is not None
-    T = driven[1].results[-1].T_map_odom
-    assert state.absolute is not None
-    state.light.result = lights_at(T, frozenset((1, 2, 3, 4)), state)
-    state.absolute.row.take(doubt(state.light.filter.catalogue, state.light.result.accepted), state.absolute.way)
-    told = absolute.virtual(state)
-    assert told is not None
-    assert np.sqrt(np.diag(told.covariance)) == pytest.approx((0.05, 1.0, 0.2), abs=0.02)
-    assert told.accepted == {1, 2, 3, 4}
-
-
-def test_what_light_says_of_a_keyframe_is_as_doubtful_as_its_lamps_are_bent(driven: tuple[State, Log]) -> None:
-    state = copy.deepcopy(driven[0])
-    assert state.light is not None
-    assert state.absolute is not None
-    state.absolute.way_young, state.absolute.row = state.absolute.way - 100.0, Lately()
-    lit = lights_at(driven[1].results[-1].T_map_odom, frozenset((1, 4, 13, 16)), state)
-    state.light.result = lit
-    fitting = absolute.virtual(state)
-    state.light.result = replace(lit, bent=1.0)
-    bent = absolute.virtual(state)
-    assert fitting is not None
-    assert bent is not None
-    assert bent.covariance - fitting.covariance == pytest.approx(BENT / TRUST * lit.covariance, rel=1e-3, abs=1e-6)
-
-
-def test_what_light_says_of_a_keyframe_is_doubted_more_at_a_start_in_a_row(driven: tuple[State, Log]) -> None:
-    state = copy.deepcopy(driven[0])
-    assert state.light is not None
-    assert state.absolute is not None
-    state.light.result = lights_at(driven[1].results[-1].T_map_odom, frozenset((1, 2, 3, 4)), state)
-    state.absolute.way_young = state.absolute.way
-    state.absolute.row.take(doubt(state.light.filter.catalogue, state.light.result.accepted), state.absolute.way)
-    told = absolute.virtual(state)
-    assert told is not None
-    assert told.covariance[0, 0] == pytest.approx(0.05**2 * (TRUST + YOUNG + IN_ROW) / TRUST, rel=0.1)
-
-
-def test_a_start_in_a_row_is_doubted_more_before_it_enters_the_pose(
-    driven: tuple[State, Log], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    state, raised = copy.deepcopy(driven[0]), list[float]()
-    tie = state.absolute
-    assert tie is not None
-
-    def noted(lights: LightsResult, *known: Any) -> LightsResult:
-        less = doubted(lights, *known)
-        raised.append(less.covariance[0, 0] / lights.covariance[0, 0])
-        return less
-
-    monkeypatch.setattr(absolute, "doubted", noted)
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    for lamps in ((1, 2, 3, 4), (1, 4, 13, 16)):
-        tie.way_young, tie.row = tie.way, Lately()
-        absolute.on_lights(state, lights_at(T, frozenset(lamps), state))
-    assert raised == pytest.approx([TRUST + YOUNG + IN_ROW, TRUST + YOUNG], rel=0.05)
-
-
-def test_light_of_bent_lamps_that_brings_nothing_is_not_taken_for_surer_than_the_pose(
-    driven: tuple[State, Log],
-) -> None:
-    """A place taken as it is, for being much surer, would stay."""
-    state = copy.deepcopy(driven[0])
-    assert state.light is not None
-    tie = state.absolute
-    assert tie is not None
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    lit = replace(lights_at(T + np.array((0.1, 0.0, 0.0)), frozenset((1, 4, 13, 16)), state), bent=3.0)
-    tie.way_young = tie.way
-    tie.P = doubted(lit, 0.0).covariance * 0.9
-    before, at = tie.P.copy(), state.T_map_odom.copy()
-    absolute.on_lights(state, replace(lit, accepted=frozenset()))
-    assert pytest.approx(before) == tie.P
-    assert state.T_map_odom == pytest.approx(at)
 
 
 def test_with_nobody_to_tell_the_way_light_says_nothing_of_a_keyframes_heading(driven: tuple[State, Log]) -> None:
