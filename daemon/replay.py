@@ -27,7 +27,7 @@ from daemon.ledger import Ledger
 from daemon.lights import Lights, SurveyError, from_header, load_lights, lost_residuals
 from daemon.record import MAP
 from daemon.rerun import Rerun
-from daemon.results import Folder, OutputRefused, map_files, tum
+from daemon.results import Folder, OutputRefused, guessed, map_files, tum
 from daemon.sources import Source, open_log, sha256_of
 from daemon.store import START, NoMap, Start, recorded_start, started
 from daemon.store_file import BadMap
@@ -176,7 +176,12 @@ def start_for(source: Source, used: Config, lights: Lights | None, given: Given)
     try:
         named = given.file and used.map.folder and not source.recorded
         if named or any(key.startswith("map.") for key in given.keys):
-            return started(used.map, lights, mend=False)[1]
+            store, start = started(used.map, lights, mend=False)
+            if store is not None and start is None:
+                if "map.folder" in given.keys:
+                    raise DataInvalid(str(store.folder), "it holds no map that can be used", "or --set map.folder=none")
+                source.report.notes.append(f"{store.folder} holds no map that can be used: replayed without one")
+            return start
         if not source.recorded or MAP not in source.header:
             return None
         path, sha256 = source.files[0].parent / START, source.header[MAP]["sha256"]
@@ -259,6 +264,8 @@ def _verdict(outcome: Outcome) -> int:
     log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
     speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
     sys.stderr.write(f"replay: {len(rerun.ledger)} poses, {speed}\n")
+    if said := guessed(rerun.ledger.online()):
+        sys.stderr.write(f"replay: {said}\n")
     return cli.OK
 
 

@@ -6,6 +6,7 @@ Each file appears whole or not at all: it is written beside its place and moved 
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,6 +147,17 @@ def tum(trajectory: Trajectory) -> bytes:
         for guess, t, x, y, s, c in zip(*columns, strict=True)
     ]
     return (_TUM_HEAD + "".join(lines)).encode()
+
+
+def guessed(told: Trajectory) -> str:
+    """How many of the poses say where the robot may be, not where it is, as a sentence; empty: none does."""
+    guesses = told.guesses()
+    states = Counter(filter(None, guesses))
+    if not states:
+        return ""
+    named = ", ".join(f"{state} {count}" for state, count in states.most_common())
+    last = f"; the last one too ({guesses[-1]})" if guesses[-1] else ""
+    return f"{states.total()} of {len(guesses)} poses are guesses, their place was not known ({named}){last}"
 
 
 def kitti(trajectory: Trajectory) -> bytes:

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from daemon import cli
-from daemon.config import MapConfig
+from daemon.config import Config, MapConfig
 from daemon.publish.snapshot import State
+from daemon.replay import Given, start_for
+from daemon.sources import open_log
 from daemon.store import START, Start, Store, started
 from daemon.store_image import meta_of, packed
 from estimator import se2
@@ -81,6 +83,24 @@ def test_a_replay_may_begin_with_a_map_that_a_person_names(
         assert cli.main(words) == cli.OK
     assert "map 00000abc of" in caplog.text
     assert len(list((run[0] / "maps").glob("*.lumimap"))) == 1, "a replay writes no map there"
+
+
+def test_a_named_folder_without_a_map_is_refused_one_of_a_configuration_is_noted(
+    run: tuple[Path, Bench, Start], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    words = ["replay", str(run[0] / "first"), "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--set", f"map.folder={empty}"]) == cli.FAILED
+    said = capsys.readouterr().err
+    assert f"{empty}: it holds no map that can be used" in said
+    assert "--set map.folder=none" in said
+    assert cli.main([*words, "--set", "map.folder=none"]) == cli.OK
+    assert "holds no map" not in capsys.readouterr().err
+
+    source = open_log(run[0] / "first")
+    assert start_for(source, Config(map=MapConfig(folder=str(empty))), None, Given(keys=("map.localise",))) is None
+    assert source.report.notes == [f"{empty} holds no map that can be used: replayed without one"]
 
 
 def test_the_map_that_a_replay_writes_is_one_to_begin_with(

@@ -15,12 +15,30 @@ from PIL import Image
 from daemon.mapimage import WALL, draw, lettered
 from daemon.mapserver import FREE, OCCUPIED
 from daemon.png import encode_png
-from daemon.results import Folder, OutputRefused, Trajectory, greys, map_files, map_yaml, pgm, tum
+from daemon.publish.snapshot import State
+from daemon.results import Folder, OutputRefused, Trajectory, greys, guessed, map_files, map_yaml, pgm, tum
 from estimator.grid import Grid
 
 LOGITS = np.array([[4.0, 0.0, -4.0], [-1.4, -1.42, 0.61], [0.63, 10.0, -10.0]], dtype=np.float32)
 """Row 0 has the smallest y: wall, unknown, free; then just over FREE, just under, just under OCCUPIED; then walls."""
 GRID = Grid(np.array([-3.0, 7.5]), 0.05, LOGITS)
+
+
+@pytest.mark.parametrize(
+    ("states", "said"),
+    [
+        ([State.TRACKING, State.MAPPING], ""),
+        ([State.LOST, State.TRACKING], "1 of 2 poses are guesses, their place was not known (LOST 1)"),
+        (
+            [State.LOST, State.AMBIGUOUS, State.TRACKING, State.AMBIGUOUS],
+            "3 of 4 poses are guesses, their place was not known (AMBIGUOUS 2, LOST 1); the last one too (AMBIGUOUS)",
+        ),
+        ([], ""),
+    ],
+)
+def test_guesses_are_counted_in_a_sentence(states: list[State], said: str) -> None:
+    count = len(states)
+    assert guessed(Trajectory(np.arange(float(count)), np.zeros((count, 3)), np.array(states, np.int64))) == said
 
 
 def test_grid_pixels_run_from_the_top() -> None:
