@@ -19,7 +19,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from daemon.cycle import Cycle, CycleRecord
-from daemon.disk import SEGMENT_BYTES, SegmentWriter
+from daemon.disk import CLOCK, SEGMENT_BYTES, SegmentWriter, both
 from daemon.faults import FAULTS, Fault
 from daemon.flight import ASKED, Begun, Flight, Told
 from daemon.moment import CYCLE_PARTS
@@ -170,7 +170,7 @@ class BlackBox:
             self._watch_faults(now)
         if self._pending is not None and now >= self._pending[0]:
             (_, fault), self._pending = self._pending, None
-            self._dump(f"fault-{int(fault)}", FAULTS[fault][0], _said)
+            self._dump(*_of_fault(fault), _said)
         elif now >= self._due or self._disk.taken - self._bytes > SEGMENT_BYTES:
             if self._disk.taken - self._bytes >= self.flight.state_bytes:  # large maps: at most half is states
                 self._begin(_nothing)
@@ -206,7 +206,14 @@ class BlackBox:
             end(repr(error))
 
     def close(self, ended: bool) -> None:
-        """Finish what is under way; after the disk."""
+        """Finish what is under way; after the disk.
+
+        A dump that was to wait for what becomes of its fault waits no longer: what was recorded goes with the next
+        start. It needs no state of its own, for nothing comes after it.
+        """
+        if self._pending is not None:
+            (_, fault), self._pending = self._pending, None
+            self.flight.dump(self._about(*_of_fault(fault)), _said)
         self.flight.close(ended)
 
     def _follow_jobs(self, record: CycleRecord) -> None:
@@ -236,27 +243,27 @@ class BlackBox:
 
     def _begin(self, then: Callable[[int | None], None]) -> None:
         """Begin a segment with the state of this moment."""
-        now = self._clock.now()
+        now, utc = both(self._clock)
         taken = self._take()
         self._due = now + (RETRY_S if taken is None else self._every_s)
         self._bytes = self._disk.taken
         cycle = 0 if self._cycle is None else self._cycle.cycles
         line = self.line.said()
-        self._disk.begin(partial(self._begun, now, taken, line, cycle, then))
+        self._disk.begin(partial(self._begun, (now, utc), taken, line, cycle, then))
 
     def _begun(
         self,
-        now: float,
+        now: tuple[float, float],
         taken: Taken | None,
         line: bytes,
         cycle: int,
         then: Callable[[int | None], None],
         segment: int | None,
     ) -> None:
-        """In the writing thread: the segment has its number."""
+        """In the writing thread: the segment has its number. ``now``: by both clocks, s, when its state was taken."""
         if segment is not None:
-            header = {**self._header, "segment": segment, "t_state": now, "cycle": cycle}
-            self.flight.begun(Begun(segment, now, taken, line, header))
+            header = {**self._header, "segment": segment, "t_state": now[0], CLOCK: now, "cycle": cycle}
+            self.flight.begun(Begun(segment, now[0], taken, line, header))
         then(segment)
 
     def _take(self) -> Taken | None:
@@ -285,16 +292,20 @@ class BlackBox:
         self.error = ""
         return taken
 
-    def _dump(self, reason: str, why: str, told: Told) -> None:
-        utc = datetime.fromtimestamp(self._clock.utc(), UTC)
-        about = {
+    def _about(self, reason: str, why: str) -> dict[str, Any]:
+        """What a dump says of itself."""
+        t_mono, t_utc = both(self._clock)
+        return {
             "reason": re.sub(r"[^a-z0-9-]", "-", reason),
             "why": why,
-            "at": f"{utc:%Y-%m-%dT%H-%M-%SZ}",
-            "t_mono": self._clock.now(),
-            "t_utc": self._clock.utc(),
+            "at": f"{datetime.fromtimestamp(t_utc, UTC):%Y-%m-%dT%H-%M-%SZ}",
+            "t_mono": t_mono,
+            "t_utc": t_utc,
             "faults": [int(fault) for fault in sorted(self._present)],
         }
+
+    def _dump(self, reason: str, why: str, told: Told) -> None:
+        about = self._about(reason, why)
 
         def then(segment: int | None) -> None:
             if segment is None:
@@ -303,6 +314,11 @@ class BlackBox:
                 self.flight.dump(about, told)
 
         self._begin(then)
+
+
+def _of_fault(fault: Fault) -> tuple[str, str]:
+    """Reason of a dump because of a fault, and what the fault means."""
+    return f"fault-{int(fault)}", FAULTS[fault][0]
 
 
 def _none() -> None:

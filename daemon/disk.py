@@ -7,6 +7,7 @@ written: it is counted, said once, noted in the recording as soon as there is ro
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 import time
@@ -17,6 +18,7 @@ from secrets import token_hex
 from typing import Any, Final
 
 from daemon.wholefile import defect_in, reason_of, sync_folder, write_whole
+from hal.clock import Clock
 from hal.replay.recording import LONGEST, Kind, pack_frame, pack_head, segment_name
 
 log = logging.getLogger(__name__)
@@ -27,6 +29,25 @@ RETRY_S: Final = 5.0
 SEGMENT_BYTES: Final = 64 << 20
 BACKLOG_BYTES: Final = 32 << 20
 """Bytes that may wait for a slow disk; beyond, records are dropped and counted."""
+CLOCK: Final = "clock"
+"""Key of a head: the monotonic clock and UTC, s, both of the moment that it was written at."""
+STEP_S: Final = 0.05
+"""UTC that is further from what a head says has been set: another segment says what is true from then on."""
+STEP_AGAIN_S: Final = 10.0
+"""But no more often than this: a clock may be set all the time."""
+READINGS, TIGHT_S = 5, 1e-3
+"""Two clocks are read again, at most so often, if it took longer, s: the thread may have had to wait in between."""
+
+
+def both(clock: Clock) -> tuple[float, float]:
+    """The monotonic clock and UTC of one moment, s: they are told apart by steps of UTC alone."""
+    best = math.inf, 0.0, 0.0
+    for _ in range(READINGS):
+        begun, utc, ended = clock.now(), clock.utc(), clock.now()
+        best = min(best, (ended - begun, begun, utc))
+        if best[0] < TIGHT_S:
+            break
+    return best[1:]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,10 +79,12 @@ class SegmentWriter:
         header: dict[str, Any],
         segment_bytes: int = SEGMENT_BYTES,
         beside: Mapping[str, bytes] | None = None,
+        clock: Clock | None = None,
     ) -> None:
         """Make the folder and open the first segment; where that is not possible it is tried again, as later on.
 
         ``beside``: files of the folder, by name, that every segment needs; they are written before the first.
+        ``clock``: whose times every head is to say; read by the writing thread.
         """
         self.records = self.bytes = self.lost = self.taken = 0
         self.error = ""
@@ -70,6 +93,8 @@ class SegmentWriter:
         self._header = header
         self._segment_bytes = segment_bytes
         self._beside = dict(beside or {})
+        self._clock = clock
+        self._ahead = self._stepped_at = -math.inf
         self._segment = -1
         self._file = -1
         self._good = 0  # bytes of the open segment that end with a whole record
@@ -152,8 +177,8 @@ class SegmentWriter:
             self.busy_since = None
 
     def _write(self, frames: list[bytes]) -> None:
-        """Append whole records; rotates first where the segment is full."""
-        if frames and self._good > self._segment_bytes:
+        """Append whole records; rotates first where the segment is full, or the clock was set."""
+        if frames and (self._good > self._segment_bytes or self._clock_was_set()):
             self._close()
             self._open()
         data = self._gap() + b"".join(frames)
@@ -169,6 +194,16 @@ class SegmentWriter:
         if self.error:
             log.warning("recording goes on in %s; %d records were lost", self.folder, self.lost)
             self.error = ""
+
+    def _clock_was_set(self) -> bool:
+        """Whether UTC is no longer what this segment's head says it is."""
+        if self._clock is None or time.monotonic() - self._stepped_at < STEP_AGAIN_S:
+            return False
+        t_mono, utc = both(self._clock)
+        if abs(utc - t_mono - self._ahead) <= STEP_S:
+            return False
+        self._stepped_at = time.monotonic()
+        return True
 
     def _gap(self) -> bytes:
         """A note in the recording where records are missing."""
@@ -203,11 +238,20 @@ class SegmentWriter:
             del self._beside[name]
         path = self.folder / segment_name(self._segment)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        head = pack_head({**self._header, "segment": self._segment})
+        head = pack_head({**self._header, **self._now(), "segment": self._segment})
         self._good = 0
         _write_all(self._file, head)
+        os.fdatasync(self._file)  # before its name: a power cut must not leave a segment without a head
         self._good = len(head)
         sync_folder(self.folder)
+
+    def _now(self) -> dict[str, tuple[float, float]]:
+        """What a head says of the moment."""
+        if self._clock is None:
+            return {}
+        t_mono, utc = both(self._clock)
+        self._ahead = utc - t_mono
+        return {CLOCK: (t_mono, utc)}
 
     def _close(self) -> None:
         """Cut off a record that was written in part, sync, close; a segment without a whole head is removed."""

@@ -2,7 +2,8 @@
 
 A recording can be replayed from its beginning, and from every segment with a state beside it. What is taken away is
 therefore everything before such a segment, and never the last of them. A dump is a folder of links to the segments that
-are there: it costs next to nothing until the ring goes on without them.
+are there: it costs next to nothing until the ring goes on without them. Then it holds their room: where the disk has
+too little, dumps go first, and after them segments, whose room a dump may hold.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from daemon.lights import RESIDUALS
 from daemon.store import START
 from daemon.wholefile import sync_folder, write_whole
-from hal.replay.recording import segment_name, state_name
+from hal.replay.recording import STATE_SUFFIX, SUFFIX, segment_name, state_name
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from daemon.checkpoint import Taken
@@ -68,7 +69,11 @@ Told = Callable[[str], None]
 
 
 class Begun(NamedTuple):
-    """A segment that was begun with a state: the state, the lines it needs, and what is said of it."""
+    """A segment that was begun with a state: the state, the lines it needs, and what is said of it.
+
+    Attributes:
+        t_mono: when the state was taken, s of the monotonic clock. taken: None where there is none to be had.
+    """
 
     number: int
     t_mono: float
@@ -102,7 +107,8 @@ class Flight:
         self._keep_s = keep_s
         self._most = math.inf if math.isinf(keep_s) else max(LEAST_BYTES, (MB_A_MINUTE << 20) * keep_s / 60.0)
         self._segments: dict[int, _Segment] = {0: _Segment(t_mono=-math.inf, state=True)}
-        self._said_full = False
+        self._said_full = self._owed = False
+        self._made: Path | None = None  # the newest dump, as far as is known
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._ring = -1
         self._mark_ring()
@@ -113,7 +119,7 @@ class Flight:
         """Mark the folder as a ring, where it is to be one: at the start, or once there is a folder."""
         if self._ring < 0 and not math.isinf(self._keep_s):
             with contextlib.suppress(OSError):  # the recording itself says what is wrong with the disk
-                self._ring = _begin_ring(self._folder)
+                self._ring, self._made = _begin_ring(self._folder)
 
     def prepare(self) -> None:
         """The estimator has been loaded; what is still missing is loaded here, and not within a cycle."""
@@ -128,15 +134,21 @@ class Flight:
         self._tasks.put(partial(self._keep, begun))
 
     def dump(self, about: dict[str, Any], told: Told) -> None:
-        """Link what is complete; ``told``: empty, or why that came to nothing. Called in this thread of its own."""
+        """Link what there is; ``told``: empty, or why that came to nothing. Called in this thread of its own."""
         self._tasks.put(partial(self._dump, about, told))
 
     def close(self, ended: bool) -> None:
-        """Finish what was asked for, for so long. ``ended``: as it should; else the next start keeps it as a dump."""
+        """Finish what was asked for, for so long. ``ended``: as it should; else the next start keeps it as a dump.
+
+        So it does where a dump was asked for, and is not there: the ring is all there is of it.
+        """
         self._tasks.put(None)
         self._thread.join(CLOSE_S)
+        if self._thread.is_alive():  # it still writes: the ring stays locked for as long as it may
+            log.warning("%s: not everything is written yet; the next start keeps it as a dump", self._folder)
+            return
         if self._ring >= 0:
-            if ended:
+            if ended and not self._owed:
                 with contextlib.suppress(OSError):
                     os.write(self._ring, b"ended\n")
             os.close(self._ring)
@@ -190,7 +202,7 @@ class Flight:
             self._segments.setdefault(number, _Segment()).bytes += path.stat().st_size
 
     def _prune(self, now: float) -> None:
-        """Take away what is older than asked for, and then what there is no room for.
+        """Take away what is older than asked for, and then what there is no room for, dumps before segments.
 
         Where states cannot be had, a ring that holds twice what it may goes on without a beginning: it must not fill
         the disk that the maps go to.
@@ -199,8 +211,9 @@ class Flight:
         old = [number for number in starts if self._segments[number].t_mono <= now - self._keep_s]
         if old:
             self._remove_before(old[-1])
+        lacks = self._lacks_room()
         for start in starts:
-            if start > min(self._segments) and self._too_much():
+            if start > min(self._segments) and (self._bytes() > self._most or (lacks and self._lacking() > 0)):
                 self._remove_before(start)
         while len(self._segments) > 1 and self._bytes() > 2.0 * self._most:
             self._remove_before(sorted(self._segments)[1])
@@ -208,21 +221,30 @@ class Flight:
     def _bytes(self) -> int:
         return sum(segment.bytes for segment in self._segments.values())
 
-    def _too_much(self) -> bool:
-        if self._bytes() > self._most:
-            return True
+    def _lacking(self) -> int:
+        """Bytes of room that are missing on the disk; not more than 0: none."""
         try:
             room = shutil.disk_usage(self._folder).free
         except OSError:
-            return False
+            return 0
         if room < RESERVE_BYTES and not self._said_full:
-            log.warning(
-                "%s has %d MB of room left: the oldest part of the recording is taken away from now on",
-                self._folder,
-                room >> 20,
-            )
+            what = "the oldest dumps go from now on, and then the oldest part of the recording"
+            log.warning("%s has %d MB of room left: %s", self._folder, room >> 20, what)
             self._said_full = True
-        return room < RESERVE_BYTES
+        return RESERVE_BYTES - room
+
+    def _lacks_room(self) -> bool:
+        """Whether room is missing though dumps were taken away; what was theirs may be free only later."""
+        lacking = self._lacking()
+        with contextlib.suppress(OSError):  # a dump that cannot be taken away: then it is the recording's turn
+            for dump in _spare_dumps(self._folder.parent, self._made) if lacking > 0 else ():
+                held = _held_alone(dump)
+                shutil.rmtree(dump)
+                lacking -= held
+                log.warning("%s was taken away, for there is too little room on the disk", dump)
+                if lacking <= 0:
+                    break
+        return lacking > 0
 
     def _remove_before(self, first: int) -> None:
         ended = -math.inf
@@ -243,6 +265,7 @@ class Flight:
         try:
             reason = self._dumped(about)
         finally:  # whoever has asked hears of it, whatever has happened
+            self._owed = bool(reason)
             told(reason)
 
     def _dumped(self, about: dict[str, Any]) -> str:
@@ -251,6 +274,7 @@ class Flight:
         try:
             names = self._names(self._dump_from(float(about["t_mono"])))
             made = _linked(self._folder, names, self._folder.parent / name, about)
+            self._made = made
             _prune_dumps(self._folder.parent, made)
         except OSError as error:
             self._fail("a dump", error)
@@ -267,14 +291,17 @@ class Flight:
         return old[-1] if old else min(starts, default=0)
 
     def _names(self, begin: int) -> list[str]:
-        """Files of a dump; the segment that is being written has its turn with the next one."""
-        there = {path.name for path in self._folder.iterdir()}
-        names = [
-            segment_name(number) for number, one in sorted(self._segments.items()) if number >= begin and one.bytes
-        ]
-        names += [state_name(number) for number in sorted(self._segments) if number >= begin]
-        maps = {name for name in there if name.endswith(MAP_SUFFIX)} - ({START} if begin > 0 else set())
-        return [name for name in (*names, RESIDUALS, *sorted(maps)) if name in there]
+        """Files of a dump; the segment that is being written is one of them, whatever is known of it here."""
+        there = sorted(path.name for path in self._folder.iterdir())
+        names = [name for suffix in (SUFFIX, STATE_SUFFIX) for name in there if _numbered(name, suffix) >= begin]
+        maps = [name for name in there if name.endswith(MAP_SUFFIX) and not (name == START and begin > 0)]
+        return [*names, *(name for name in there if name == RESIDUALS), *maps]
+
+
+def _numbered(name: str, suffix: str) -> int:
+    """Number of a segment's or a state's file, -1 where it is none."""
+    stem = name.removesuffix(suffix)
+    return int(stem) if stem != name and stem.isdecimal() else -1
 
 
 def _load() -> None:
@@ -302,8 +329,7 @@ def _linked(source: Path, names: list[str], target: Path, about: dict[str, Any])
 
 
 def _free(path: Path) -> Path:
-    number = 1
-    free = path
+    number, free = 1, path
     while free.exists():
         number += 1
         free = path.with_name(f"{path.name}-{number}")
@@ -321,35 +347,54 @@ def _prune_dumps(parent: Path, made: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
+def _spare_dumps(parent: Path, made: Path | None) -> list[Path]:
+    """Dumps that may go where there is no room, by when they were made; those that were asked for are the last.
+
+    The newest is none of them: that is the one ``made`` by this run, or else the last to the clock, which may have been
+    set meanwhile.
+    """
+    dumps = sorted((path.stat().st_mtime, path.name, path) for path in parent.glob(f"{DUMP}*") if path.is_dir())
+    newest = made if made is not None and made.exists() else dumps[-1][2] if dumps else None
+    return sorted((path for _, _, path in dumps if path != newest), key=_was_asked)
+
+
+def _held_alone(dump: Path) -> int:
+    """Bytes on the disk that nothing but this dump holds."""
+    return sum(512 * one.st_blocks for one in map(Path.stat, dump.iterdir()) if one.st_nlink == 1)
+
+
 def _was_asked(dump: Path) -> bool:
     return re.search(rf"-{ASKED}(-\d+)?$", dump.name) is not None
 
 
-def _begin_ring(folder: Path) -> int:
-    """Mark a folder as a ring that is being written, and see to those that earlier runs have left."""
+def _begin_ring(folder: Path) -> tuple[int, Path | None]:
+    """Mark a folder as a ring that is being written, and see to those that earlier runs have left; a dump of them."""
+    made = None
     for other in sorted(folder.parent.glob(f"*/{RING}")):
         if other.parent != folder:
-            _see_to(other)
+            made = _see_to(other) or made
     handle = os.open(folder / RING, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return handle
+    return handle, made
 
 
-def _see_to(mark: Path) -> None:
+def _see_to(mark: Path) -> Path | None:
     """A ring of an earlier run: nobody needs it if that run has ended as it should; else it is a dump from now on."""
+    kept: Path | None = None
     try:
         with mark.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if file.read():
                 shutil.rmtree(mark.parent, ignore_errors=True)
-                return
+                return None
         kept = mark.parent
         if not kept.name.startswith(DUMP):  # else it was moved, and the power went before its mark did
             kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
             mark.parent.rename(kept)
         (kept / RING).unlink()
         sync_folder(kept.parent)
-        log.warning("the run before this one did not end as it should: what it recorded last is in %s", kept)
+        log.warning("a run did not end as it should, or one of its dumps is missing: what it recorded is in %s", kept)
         _prune_dumps(kept.parent, kept)
     except OSError as error:
         log.warning("%s: the ring of an earlier run stays as it is: %s", mark.parent, error.strerror)
+    return kept

@@ -22,7 +22,7 @@ import numpy as np
 from daemon.blackbox import BlackBox
 from daemon.config import Config
 from daemon.cycle import CycleRecord
-from daemon.disk import SegmentWriter
+from daemon.disk import SegmentWriter, both
 from daemon.lights import RESIDUALS, Lights
 from daemon.publish.snapshot import Snapshot
 from daemon.store import START, Start
@@ -182,20 +182,21 @@ class Recorder:
         tell it again. ``keep_s``: how far back it reaches, see `daemon.flight`. Where nothing can be written, now or
         later, :attr:`error` says so and it is tried again: a robot is to know its place on a full disk, too.
         """
-        started = datetime.fromtimestamp(clock.utc(), UTC)
+        t_mono, t_utc = both(clock)
+        started = datetime.fromtimestamp(t_utc, UTC)
         header: dict[str, Any] = {
             "recording": f"{started:%Y-%m-%dT%H-%M-%S.%f}",
-            "t_mono": clock.now(),
-            "t_utc": clock.utc(),
+            "t_mono": t_mono,
+            "t_utc": t_utc,
             "versions": versions(),
             "config": msgspec.to_builtins(config),
             **({} if lights is None else lights.header()),
             **({} if start is None else {MAP: {"sha256": hashlib.sha256(start.content).hexdigest()}}),
         }
-        self._clock, self.t_begun = clock, float(header["t_mono"])
+        self._clock, self.t_begun = clock, t_mono
         beside = {RESIDUALS: lights.residuals} if lights is not None and lights.residuals else {}
         beside |= {} if start is None else {START: start.content}  # too large for every head
-        self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header, beside=beside)
+        self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header, beside=beside, clock=clock)
         self.box: Final = BlackBox(self.disk, clock, header, keep_s)
 
     @property

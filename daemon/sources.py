@@ -210,6 +210,14 @@ class _Marks:
     missing: int = 0
 
 
+def _size(file: Path) -> int:
+    """Bytes of a file, which the keeper of a ring that is being written may just have taken away; raises `HalError`."""
+    try:
+        return file.stat().st_size
+    except OSError as error:
+        raise unreadable(file, error) from error
+
+
 def _number(header: dict[str, Any], key: str) -> float:
     """An entry of a header, 0 where it holds none that is a number."""
     value = header.get(key, 0.0)
@@ -227,7 +235,7 @@ class RecordingSource(Source):
         whole = open_recording(path)
         self._recording: Recording = beginning(whole, until)
         self._codec = PassiveHokuyo(device=str(path), untimed=self._recording.first > 0)
-        size = sum(file.stat().st_size for file in self._recording.segments)
+        size = sum(map(_size, self._recording.segments))
         super().__init__(path, LogReport(), self._codec.status, size)
         self.files = self._recording.segments
         self.header = self._recording.header

@@ -11,14 +11,14 @@ import math
 import re
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from daemon import cli, warmup, whymoment, whyplot, whysaid
+from daemon import cli, warmup, whyclock, whymoment, whyplot, whysaid
 from daemon.config import Config
 from daemon.cycle import CycleRecord
 from daemon.extras import how_to_install
@@ -30,7 +30,7 @@ from daemon.sources import RecordingSource, Turn
 from daemon.versions import made_elsewhere
 from daemon.whymoment import Moment, chosen
 from hal.errors import DataInvalid, DeviceMissing, HalError
-from hal.replay.recording import SUFFIX, open_recording
+from hal.replay.recording import SUFFIX, Recording, open_recording
 from hal.replay.report import LogReport
 from hal.replay.text import unreadable
 
@@ -38,8 +38,6 @@ FLIGHT: Final = "flight"
 """Folder below the state directory, ours or else the service's, where recordings are looked for if none is named."""
 BEFORE_S, AFTER_S = 20.0, 5.0
 """How much around the moment is looked at."""
-EVER_S: Final = 1e11
-"""Beyond the year 5000."""
 UNIX_S: Final = 1e8
 """A number of seconds beyond is since the Unix epoch, else since the recording began."""
 DIGITS: Final = 6
@@ -52,10 +50,12 @@ class NoMoment(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A recording, and the time (UTC) that it covers.
+    """A recording, or the part of one in which the clock was not set, and the time (UTC, s) that it covers.
 
     Attributes:
-        utc_at_zero: of its monotonic clock. made: with what, where that is not what runs now; empty otherwise.
+        utc_at_zero: of its monotonic clock, s. made: with what, where that is not what runs now; empty otherwise.
+        before_s: how much of the recording is before it, s.
+        came, gone: how far the clock was set where it begins and ends, s; 0: it was not.
     """
 
     path: Path
@@ -63,6 +63,15 @@ class Span:
     end: float
     utc_at_zero: float
     made: str = ""
+    before_s: float = 0.0
+    came: float = 0.0
+    gone: float = 0.0
+
+    @property
+    def remarks(self) -> str:
+        """Lines to say before anything is told of it; may be empty."""
+        clock = whyclock.said(self.begin, self.came, self.end, self.gone)
+        return "\n".join([*([self.made] if self.made else []), *clock])
 
 
 def main(args: argparse.Namespace) -> int:
@@ -77,7 +86,7 @@ def main(args: argparse.Namespace) -> int:
             _try(args.out)
         told, rerun = moments(span, utc)
         second = whole_second(args.time)
-        sys.stdout.write(whysaid.report(told, utc, span.path.name, wide, second, span.made))
+        sys.stdout.write(whysaid.report(told, utc, span.path.name, wide, second, span.remarks))
         if rerun.comparison.differ:
             cli.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
@@ -101,7 +110,7 @@ def _draw(out: Path, told: list[Moment], utc: float, rerun: Rerun) -> None:
 
 
 def spans(folder: Path) -> list[Span]:
-    """The recordings and dumps in a folder, or the one that it is.
+    """The recordings and dumps in a folder, or the one that it is; in parts where the clock was set, in their order.
 
     Raises:
         HalError: it cannot be read, or there is none.
@@ -116,8 +125,8 @@ def spans(folder: Path) -> list[Span]:
     found = []
     for path in runs:
         try:
-            found.append(_span(path))
-        except DataInvalid as error:
+            found += _spans(path)
+        except (DataInvalid, DeviceMissing) as error:  # a ring that is being written loses segments meanwhile
             if len(runs) == 1:
                 raise
             cli.say(f"{error}: passed over")
@@ -132,26 +141,48 @@ def _is_folder(path: Path) -> bool:
         raise unreadable(path, error) from error
 
 
-def _span(path: Path) -> Span:
+def _spans(path: Path) -> list[Span]:
     recording = open_recording(path)
     source = RecordingSource(path)
-    begun, utc = _begun(path, recording.header)
-    begin = begun if source.begin is None else source.begin.t_mono
-    last = open_recording(recording.segments[-1])
-    end = max((frame.t_mono for frame in last.frames(LogReport())), default=begin)
-    return Span(path, round(utc + begin, 6), round(utc + end, 6), utc, made_elsewhere(recording.header))
+    begun = _begun(path, recording.header)
+    begin = begun[0] if source.begin is None else source.begin.t_mono
+    end = max(begin, _end(recording, begin))
+    parts = [part for part in whyclock.parts(path, source.files, begun, begin) if part.t_mono <= end]
+    ends = [*(part.t_mono for part in parts[1:]), end]
+    steps = [*(part.step for part in parts[1:]), 0.0]
+    made = made_elsewhere(recording.header)
+    return [
+        Span(
+            path,
+            begin=round(part.utc_at_zero + part.t_mono, 6),
+            end=round(part.utc_at_zero + until, 6),
+            utc_at_zero=part.utc_at_zero,
+            made=made,
+            before_s=part.t_mono - begin,
+            came=part.step,
+            gone=gone,
+        )
+        for part, until, gone in zip(parts, ends, steps, strict=True)
+    ]
 
 
-def _begun(path: Path, header: dict[str, Any]) -> tuple[float, float]:
-    """When a run began, on its monotonic clock, and the UTC at which that clock was zero."""
-    try:
-        t_mono, t_utc = float(header["t_mono"]), float(header["t_utc"])
-    except (KeyError, TypeError, ValueError) as error:
+def _end(recording: Recording, begin: float) -> float:
+    """When the last record was made, s; a kill or a power cut may leave a segment without any, or without a head."""
+    for segment in reversed(recording.segments):
+        last = replace(recording, segments=(segment,)).frames(LogReport())
+        if (end := max((frame.t_mono for frame in last), default=None)) is not None:
+            return end
+    return begin
+
+
+def _begun(path: Path, header: dict[str, Any]) -> whyclock.Pair:
+    """When a run began, s, by its monotonic clock and in UTC."""
+    if not {"t_mono", "t_utc"} <= header.keys():
         problem = "its head does not say when it began, so no moment can be found in it"
-        raise DataInvalid(str(path), problem, "replay it as a whole: lumiloop replay") from error
-    if not (abs(t_mono) < EVER_S and abs(t_utc) < EVER_S):  # not a number is neither
+        raise DataInvalid(str(path), problem, "replay it as a whole: lumiloop replay")
+    if (pair := whyclock.pair_of(header["t_mono"], header["t_utc"])) is None:
         raise DataInvalid(str(path), "its head says no time that can be", "replay it as a whole: lumiloop replay")
-    return t_mono, t_utc - t_mono
+    return pair
 
 
 def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, float]:
@@ -159,7 +190,8 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
 
     Returns:
         The recording with most of the time before it; the moment (UTC), to the microsecond; and how long it lasts, s,
-        more than 0. Of a whole second a part may be recorded: then it is that part.
+        more than 0. Of a whole second a part may be recorded: then it is that part. Where a clock was set back, a time
+        came twice in a recording: the later is taken.
 
     Raises:
         NoMoment: none does, or that is no time.
@@ -167,17 +199,29 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
     wide = width(words)
     asked = [(span, round(utc, 6), round(utc + wide, 6)) for span in recorded for utc in meant(words, span)]
     here = [
-        (min(begin - span.begin, BEFORE_S), span.begin, span, begin, round(end - begin, 6))
+        (span, begin, round(end - begin, 6), begin == utc)
         for span, utc, end in asked
         if utc <= span.end and (begin := max(utc, span.begin)) < end
     ]
     if here:
-        return max(here, key=lambda one: one[:2])[2:]
-    there = "\n".join(
-        f"  {whymoment.clock(s.begin)} to {whymoment.clock(s.end)}, {s.end - s.begin:.0f} s  {s.path.name}"
-        for s in recorded
-    )
-    raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n{there}")
+        # Of the parts of one recording that which holds the time's begin, and of several the latest.
+        part = {one[0].path: one[0] for one in sorted(here, key=lambda one: one[3])}
+        there = [one for one in here if one[0] is part[one[0].path]]
+        return max(there, key=_has_before)[:3]
+    raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n" + "\n".join(map(_listed, recorded)))
+
+
+def _has_before(found: tuple[Span, float, float, bool]) -> tuple[float, float]:
+    """By what a recording is chosen: how much it holds before a moment, and then the latest."""
+    span, begin, *_ = found
+    return min(begin - span.begin + span.before_s, BEFORE_S), span.begin - span.before_s
+
+
+def _listed(span: Span) -> str:
+    """A line that says what is recorded."""
+    came = f", after the clock was set by {span.came:+.3f} s" if span.came else ""
+    begin, end = whymoment.clock(span.begin), whymoment.clock(span.end)
+    return f"  {begin} to {end}, {span.end - span.begin:.0f} s  {span.path.name}{came}"
 
 
 def whole_second(words: str) -> bool:
@@ -197,8 +241,9 @@ def width(words: str) -> float:
 def meant(words: str, span: Span) -> list[float]:
     """The instants (UTC) that somebody may mean.
 
-    A time of the day, on the days that the recording covers; a date with a time; local time unless it ends with Z or an
-    offset. Or a number: of seconds since the recording began, or since the Unix epoch.
+    A time of the day, on the days that the recording covers; a date with a time; local time, of which the night has one
+    hour twice when the clocks are put back, unless it ends with Z or an offset. Or a number: of seconds since the
+    recording began, or since the Unix epoch.
 
     Raises:
         NoMoment: it is no time.
@@ -206,21 +251,29 @@ def meant(words: str, span: Span) -> list[float]:
     text = words.strip().replace(",", ".")  # as half of the world writes a fraction, and ISO 8601 too
     if re.fullmatch(r"[0-9]+(\.[0-9]+)?", text):
         number = float(text)
-        return [number if number > UNIX_S else span.begin + number]
+        return [number if number > UNIX_S else span.begin - span.before_s + number]
     try:
         if told := re.fullmatch(r"(\d{1,2}:\d\d(?::\d\d(?:\.\d+)?)?)(Z|[+-]\d\d:?\d\d)?", text):
             of_day, offset = told.groups()
             zone = None if offset is None else datetime.strptime(offset, "%z").tzinfo
-            first = datetime.fromtimestamp(span.begin, zone).astimezone(zone)
-            days = int((span.end - span.begin) / 86400.0) + 2
-            at = _time_of(of_day)
-            midnight = first.replace(hour=0, minute=0, second=0, microsecond=0)
-            return [(midnight + timedelta(days=day) + at).timestamp() for day in range(days)]
-        return [datetime.fromisoformat(text).astimezone().timestamp()]  # without a zone: local time
+            first, last = (datetime.fromtimestamp(utc, zone) for utc in (span.begin, span.end))
+            midnight = first.replace(hour=0, minute=0, second=0, microsecond=0, fold=0)
+            days = [midnight + timedelta(days=day) for day in range((last.date() - first.date()).days + 1)]
+            return [utc for day in days for utc in _instants(day + _time_of(of_day))]
+        return _instants(datetime.fromisoformat(text))
     except (ValueError, OverflowError) as error:
         raise NoMoment(
             f"{words}: not a time; write 21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning"
         ) from error
+
+
+def _instants(at: datetime) -> list[float]:
+    """The instants (UTC, s) of a date and time: without a zone that of the place, which may have it twice, or never."""
+    if at.tzinfo is not None:
+        return [at.timestamp()]
+    found = (at.replace(fold=fold).astimezone() for fold in (0, 1))
+    utc = dict.fromkeys(local.timestamp() for local in found if local.replace(tzinfo=None, fold=0) == at)
+    return list(utc)
 
 
 def _time_of(text: str) -> timedelta:

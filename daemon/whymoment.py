@@ -83,13 +83,15 @@ class Chosen(NamedTuple):
     changed: int | None
 
 
-def clock(utc: float) -> str:
-    """Local time of day with its date and zone."""
-    return f"{datetime.fromtimestamp(utc, UTC).astimezone():%Y-%m-%d %H:%M:%S.%f}"[:-3]
+def clock(utc: float, whole: bool = False) -> str:
+    """Date, local time of day to the millisecond (``whole``: second), and the zone's offset then; ``utc``: s."""
+    local = datetime.fromtimestamp(utc, UTC).astimezone()
+    fraction = "" if whole else f".{local.microsecond // 1000:03d}"
+    return f"{local:%Y-%m-%d %H:%M:%S}{fraction}{local:%z}"
 
 
 def of_day(utc: float) -> str:
-    """Local time of day."""
+    """Local time of day to the millisecond; ``utc``: s."""
     return f"{datetime.fromtimestamp(utc, UTC).astimezone():%H:%M:%S.%f}"[:-3]
 
 

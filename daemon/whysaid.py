@@ -34,8 +34,8 @@ FITS: Final = 0.2
 def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: bool = False, made: str = "") -> str:
     """The text of a time, which lasts from ``utc`` on for ``wide``, s (:func:`daemon.whymoment.chosen`).
 
-    ``second``: it is a whole one, of which the first change is told. ``made``: a line on what the recording was made
-    with, where there is something to say of it.
+    ``second``: it is a whole one, of which the first change is told. ``made``: lines on what the recording was made
+    with, and on its clock, where there is something to say of it.
     """
     k, last, changed = chosen(told, utc, second, wide)
     one, begun, apart = told[k], clock(utc), told[k].utc - utc
@@ -61,7 +61,7 @@ def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: 
 def _named(utc: float, wide: float) -> tuple[str, str]:
     """How a second is written that begins then and lasts ``wide``, s, and what it is."""
     if utc.is_integer():
-        return clock(utc).partition(".")[0], "the whole second"
+        return clock(utc, whole=True), "the whole second"
     return clock(utc), "the second from then" if wide >= SECOND_S else "the rest of that second"
 
 

@@ -12,11 +12,12 @@ import pytest
 
 from daemon import blackbox, checkpoint, cli, disk
 from daemon.config import Config
-from daemon.disk import SegmentWriter
+from daemon.disk import CLOCK, SegmentWriter
 from daemon.faults import Fault
 from daemon.flight import ABOUT, DUMP, Flight
 from daemon.moment import CYCLE_PARTS
 from daemon.replay import replay
+from daemon.statefile import read_header
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
 from hal.replay.recording import Kind, frames_in, open_recording
@@ -72,13 +73,15 @@ def test_every_state_is_a_beginning(tmp_path: Path) -> None:
     whole = replayed(run, tmp_path / "whole")["recorded_run"]
     assert whole["differ"] == 0
     for number, state in enumerate(found):
+        said = read_header(state)
+        assert said[CLOCK] == pytest.approx([said["t_state"], 1.7e9 + said["t_state"]], abs=1e-6)
         for old in sorted(run.glob("*.lumirec")):
             if old.stem < state.stem:
                 old.unlink()
                 old.with_suffix(".lumistate").unlink(missing_ok=True)
-        said = replayed(run, tmp_path / f"out{number}")
-        assert said["recorded_run"]["differ"] == 0, said["recorded_run"]
-        assert 0 < said["recorded_run"]["cycles"] < whole["cycles"]
+        compared = replayed(run, tmp_path / f"out{number}")["recorded_run"]
+        assert compared["differ"] == 0, compared
+        assert 0 < compared["cycles"] < whole["cycles"]
 
 
 def broken(*_: object) -> None:
@@ -142,6 +145,29 @@ def test_a_fault_makes_a_dump_that_shows_what_became_of_it(tmp_path: Path) -> No
     compared = replayed(dumps[0], tmp_path / "out")["recorded_run"]
     assert compared["differ"] == 0, compared
     assert compared["cycles"] > 70, "eight seconds, five of them since the fault"
+
+
+async def unplugged_at_the_end(bench: Bench) -> None:
+    """The lidar goes, and somebody starts the service anew before the dump is due."""
+    await bench.drive(4.0)
+    let_write(0.05)
+    bench.opener.unplug(USB)
+    await bench.drive(blackbox.AFTER_S - 1.0)
+    assert bench.recorder.box._pending is not None
+
+
+def test_a_dump_that_is_due_after_the_stop_is_made_at_the_stop(tmp_path: Path) -> None:
+    record(tmp_path / "rec", unplugged_at_the_end, keep_s=60.0)
+    (ring,) = (path for path in (tmp_path / "rec").iterdir() if not path.name.startswith(DUMP))
+    again = tmp_path / "rec" / "again"
+    again.mkdir()
+    Flight(again, 60.0).close(ended=True)
+    assert not ring.exists(), "the next start has taken it away"
+    (dump,) = (tmp_path / "rec").glob(f"{DUMP}*-fault-101")
+    assert json.loads((dump / ABOUT).read_text())["faults"][0] == 101
+    compared = replayed(dump, tmp_path / "out")["recorded_run"]
+    assert compared["differ"] == 0, compared
+    assert compared["published_with"]["101"] > 5
 
 
 async def lit(bench: Recorded) -> None:

@@ -23,6 +23,7 @@ from tests.daemon.replay.test_dump import let_write, unplugged
 from tests.daemon.replay.test_recorded_run import Bench, aged, pulled, record
 
 AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
+ZONE = f"{datetime.fromtimestamp(AT, UTC).astimezone():%z}"
 
 
 def test_what_the_service_records_is_looked_for_where_we_have_recorded_nothing(
@@ -150,10 +151,10 @@ def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pyt
     said = asked(second, dump, capsys)
     assert "laser   silent for 0." in said, "as published, however short it is"
     head, state = said.splitlines()[:2]
-    assert f"{second}, the whole second: state, reason or faults first change in it, cycle of {at}" in head
+    assert f"{second}{ZONE}, the whole second: state, reason or faults first change in it, cycle of {at}" in head
     assert state == silent
     head, state = asked(f"{second}.0", dump, capsys).splitlines()[:2]
-    assert f"{second}.000, cycle of" in head
+    assert f"{second}.000{ZONE}, cycle of" in head
     assert state.startswith("TRACKING since")
     assert "the whole second: nothing changes, cycle of" in asked("9", dump, capsys).splitlines()[0]
 
@@ -164,7 +165,7 @@ def test_a_time_that_it_has_printed_means_the_same_cycle(recorded: Path, capsys:
     printed = {line.split()[0] for line in said.partition("what changed")[2].splitlines()[1:]}
     assert len(printed) > 2
     for at in printed:
-        assert f"{at}, cycle of {at}, " in asked(at, dump, capsys).splitlines()[0]
+        assert f"{at}{ZONE}, cycle of {at}, " in asked(at, dump, capsys).splitlines()[0]
 
 
 def test_a_run_where_all_is_well_from_a_folder_of_several(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -130,3 +131,45 @@ def test_the_last_instant_of_a_recording_is_in_it_however_the_sum_is_rounded() -
 def test_how_wide_that_is(words: str, wide: float) -> None:
     assert width(words) == pytest.approx(wide, abs=1e-12)
     assert find([SPAN], words, Path())[2] == pytest.approx(wide, abs=1e-9)
+
+
+@pytest.fixture
+def berlin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Summer time ends on 2026-10-25 at 03:00."""
+    with monkeypatch.context() as there:
+        there.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+def instant(text: str) -> float:
+    return datetime.fromisoformat(text).timestamp()
+
+
+@pytest.mark.usefixtures("berlin")
+@pytest.mark.parametrize(
+    ("words", "begin", "meant_at"),
+    [
+        ("08:00:00", "2026-10-25T00:30+02:00", ["2026-10-25T08:00+01:00", "2026-10-26T08:00+01:00"]),
+        ("01:00:00", "2026-10-25T00:30+02:00", ["2026-10-25T01:00+02:00", "2026-10-26T01:00+01:00"]),
+        ("02:30:00", "2026-10-25T00:30+02:00", [
+            "2026-10-25T02:30+02:00", "2026-10-25T02:30+01:00", "2026-10-26T02:30+01:00",
+        ]),
+        ("2026-10-25T02:30", "2026-10-25T00:30+02:00", ["2026-10-25T02:30+02:00", "2026-10-25T02:30+01:00"]),
+        ("02:30:00+01:00", "2026-10-25T00:30+02:00", ["2026-10-25T02:30+01:00", "2026-10-26T02:30+01:00"]),
+    ],
+)  # fmt: skip
+def test_a_time_of_the_day_is_that_of_its_own_day(words: str, begin: str, meant_at: list[str]) -> None:
+    span = Span(Path("rec"), instant(begin), instant("2026-10-26T09:00+01:00"), 0.0)
+    found = [utc for utc in meant(words, span) if span.begin <= utc <= span.end]
+    assert found == list(map(instant, meant_at))
+    assert find([span], words, Path())[1] == found[0], "the first"
+
+
+@pytest.mark.usefixtures("berlin")
+def test_a_time_that_the_place_never_had_is_not_recorded() -> None:
+    span = Span(Path("rec"), instant("2026-03-29T00:30+01:00"), instant("2026-03-29T09:00+02:00"), 0.0)
+    assert meant("02:30:00", span) == []
+    with pytest.raises(NoMoment, match=r"there is\n  2026-03-29 00:30:00.000\+0100 to 2026-03-29 09:00:00.000\+0200"):
+        find([span], "02:30:00", Path())

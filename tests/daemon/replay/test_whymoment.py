@@ -13,7 +13,7 @@ import pytest
 
 from daemon.publish.snapshot import Snapshot, State
 from daemon.reasons import Reason
-from daemon.whymoment import Moment, chosen, first_change, moment_of, of_day
+from daemon.whymoment import Moment, chosen, clock, first_change, moment_of, of_day
 from daemon.whysaid import report
 
 AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
@@ -88,7 +88,7 @@ def test_what_is_judged_of_a_boundary_is_what_is_printed_of_it(begun: float) -> 
 
 def test_of_a_second_of_which_a_part_is_recorded_that_part_is_told() -> None:
     """Of 22:13:25, where the recording begins at 25.4: it ends at 26, not at 26.4."""
-    assert "22:13:25.400, the rest of that second: nothing changes, cycle" in head(
+    assert "22:13:25.400+0000, the rest of that second: nothing changes, cycle" in head(
         cycles(5.5, 6.1, fault=6.3), 5.4, 0.6
     )
     assert "nothing changes in it, but 0.05 s after it" in head(cycles(5.5, fault=6.05), 5.4, 0.6)
@@ -102,11 +102,25 @@ def test_a_second_that_does_not_begin_with_one_of_the_clock_is_named_with_its_be
     """That is a number of seconds since a recording began."""
     said = head(cycles(5.5, fault=6.3), 5.4)
     assert (
-        "22:13:25.400, the second from then: state, reason or faults first change in it, cycle of 22:13:26.300" in said
+        "22:13:25.400+0000, the second from then: state, reason or faults first change in it, cycle of 22:13:26.300"
+        in said
     )
-    assert "22:13:25, the whole second: " in head(cycles(5.5, fault=5.7), 5.0)
-    assert "22:13:25.400, no cycle ran then; the last before it, 5 s earlier" in head(cycles(0.1, fault=0.2), 5.4)
+    assert "22:13:25+0000, the whole second: " in head(cycles(5.5, fault=5.7), 5.0)
+    assert "22:13:25.400+0000, no cycle ran then; the last before it, 5 s earlier" in head(cycles(0.1, fault=0.2), 5.4)
 
 
 def test_before_its_first_cycle_no_time_is_less_than_none() -> None:
     assert "what changed in the 0 s before" in report([replace(WELL, utc=AT)], AT - 50.0, "here", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("utc", "said"), [(1792886400.25, "2026-10-25 02:00:00.250+0200"), (1792890000.25, "2026-10-25 02:00:00.250+0100")]
+)
+def test_a_time_is_told_with_the_offset_of_its_own_day_and_hour(
+    utc: float, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as there:
+        there.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+        time.tzset()
+        assert clock(utc) == said
+    time.tzset()
