@@ -19,7 +19,7 @@ from tests.hil.programs import Served, program, served_lidar
 from tests.hil.walking import Walked, walk_real, walk_simulated
 from tools.bench.against import Before, CannotCompare, read
 from tools.bench.plots import Plot
-from tools.bench.report import About, Figure, Result, facts, write
+from tools.bench.report import About, CannotReport, Figure, Result, demand_apart, facts, write
 
 NAME = "hil"
 DEVICES = ("lidar", "adc")
@@ -198,7 +198,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--against"):
         try:
             config.stash[BEFORE] = read(Path(config.getoption("--against")), NAME)
-        except CannotCompare as reason:
+            demand_apart(Path(folder), config.stash[BEFORE], "--hil-report")
+        except (CannotCompare, CannotReport) as reason:
             raise pytest.UsageError(f"--against: {reason}") from reason
 
 
@@ -256,7 +257,7 @@ def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
     if not folder or not results:
         return
     ends = {option: named(config, option) for option in DEVICES}
-    ends |= {name: str(config.getoption(f"--{name}") or "-") for name in ("have", "operator", "program")}
+    ends |= {name: str(config.getoption(f"--{name}") or "-") for name in ("have", "operator", "program", "walk-s")}
     about = About(NAME, "Devices", facts(**ends, when=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())))
     compared = write(Path(folder), results, about, config.stash[BEFORE])
     say = config.get_terminal_writer()

@@ -278,6 +278,9 @@ def test_what_nothing_can_be_compared_with_is_refused_before_anything_is_tried(t
         assert (code, says in said, results) == (4, True, {}), said
     code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / "none.json"))
     assert (code, "name the results.json" in said) == (4, True)
+    (tmp_path / "report" / "results.json").write_text(json.dumps(ours))
+    code, said, _ = suite(tmp_path, "-k", "light_levels", "--against", str(tmp_path / "report"))
+    assert (code, "would overwrite it; name another folder with --hil-report" in said) == (4, True), said
 
 
 def test_beside_a_real_device_no_fake_counts(tmp_path: Path) -> None:
@@ -294,6 +297,7 @@ def test_beside_a_real_device_no_fake_counts(tmp_path: Path) -> None:
     assert "1 of 1 passed (1 of them on fakes)" in (tmp_path / "report" / "report.html").read_text()
     told = json.loads((tmp_path / "report" / "results.json").read_text())
     assert (told["bench"], told["about"]["lidar"], told["about"]["adc"]) == ("hil", "fake", "fake")
+    assert (told["about"]["have"], told["about"]["walk-s"]) == ("-", "60.0"), "they are compared with another run's"
 
 
 def test_a_terminal_that_is_not_there_is_said_once(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 from daemon.versions import versions
 from tools.bench.against import CannotCompare, Compared, read, regressions
 from tools.bench.plots import Plot, Series, histogram, svg
-from tools.bench.report import About, CannotReport, Figure, Result, demand_room, facts, junit, page, write
+from tools.bench.report import About, CannotReport, Figure, Result, demand_apart, demand_room, facts, junit, page, write
 
 NOISE = Figure("noise", 10.0, "mm", "more")
 GOOD = Result("boots", "Debian boots", True, 20.0, "up after 20 s", figures=(NOISE,))
@@ -50,11 +50,12 @@ def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
     slow = replace(GOOD, seconds=60.0)
     fine = replace(BAD, passed=True)
     before = read(kept(tmp_path, GOOD, fine), "bench-vm").results
-    assert regressions([slow, BAD], before) == ["drives passed then"], "the machine may be to blame for seconds"
-    assert regressions([GOOD, fine], before) == []
-    assert regressions([replace(LEFT, name="boots")], before) == [
-        "boots passed then, and was not tried now: needs motion"
-    ]
+    worse = {"drives": ["drives passed then"]}
+    assert regressions([slow, BAD], before) == worse, "the machine may be to blame for seconds"
+    assert regressions([GOOD, fine], before) == {}
+    assert regressions([replace(LEFT, name="boots")], before) == {
+        "boots": ["boots passed then, and was not tried now: needs motion"]
+    }
     compared = write(tmp_path / "now", [slow, BAD], ABOUT, read(tmp_path, "bench-vm"))
     assert compared.worse == ["drives passed then"]
     assert compared.closing()[-1] == "FAILED: 1 worse than before"
@@ -63,13 +64,54 @@ def test_a_run_is_compared_with_another(tmp_path: Path) -> None:
     assert "60.0 (20.0 then)" in written
 
 
+def test_what_is_worse_is_a_failure_for_machines_too(tmp_path: Path) -> None:
+    """A figure of what has passed, and what passed then and was not tried now; what has failed is counted once."""
+    before = [replace(one, passed=True, skipped="") for one in (GOOD, BAD, LEFT)]
+    file = kept(tmp_path, *before)
+    slower = replace(GOOD, figures=(replace(NOISE, value=90.0),))
+    new = replace(GOOD, name="flies")
+    compared = write(tmp_path / "now", [slower, BAD, LEFT, new], ABOUT, read(file, "bench-vm"))
+    assert len(compared.worse) == 3
+    suite = ElementTree.parse(tmp_path / "now" / "junit.xml").getroot()
+    assert [suite.get(key) for key in ("tests", "failures", "skipped")] == ["4", "3", "0"]
+    told = {case.get("name"): case.find("failure") for case in suite}
+    assert told["flies"] is None
+    texts = {name: (one.get("message"), one.text) for name, one in told.items() if one is not None}
+    assert texts["boots"] == ("worse than before: boots: noise: 90 mm, 10 then", f"up after 20 s\n{texts['boots'][0]}")
+    assert texts["drives"] == ("0.300 m", f"{BAD.said}\nworse than before: drives passed then")
+    assert texts["walks"][0] == "worse than before: walks passed then, and was not tried now: needs motion"
+
+
+def test_a_report_does_not_overwrite_the_one_it_is_compared_with(tmp_path: Path) -> None:
+    before = read(kept(tmp_path, GOOD), "bench-vm")
+    with pytest.raises(
+        CannotReport, match=r"results\.json is to be compared with, .* another folder with --hil-report"
+    ):
+        demand_apart(tmp_path / "x" / "..", before, "--hil-report")
+    demand_apart(tmp_path / "x", before)
+    demand_apart(tmp_path, None)
+    (tmp_path / "results.json").rename(tmp_path / "old.json")
+    demand_apart(tmp_path, read(tmp_path / "old.json", "bench-vm"))
+
+
+def test_other_words_of_a_run_are_said_and_a_whole_file_by_its_digest(tmp_path: Path) -> None:
+    then = {"have": "-", "walk-s": "60.0", "configuration": "[lidar]\na = 1\n", "scenario lap": "1f", "load": "1"}
+    write(tmp_path, [GOOD], replace(ABOUT, facts=then))
+    now = {"have": "light", "walk-s": "90.0", "configuration": "[lidar]\na = 2\n", "scenario lap": "2e", "load": "9"}
+    told = write(tmp_path / "now", [GOOD], replace(ABOUT, facts=now), read(tmp_path, "bench-vm")).told
+    assert [line.partition(" differs")[0] for line in told[1:]] == ["have", "walk-s", "configuration", "scenario lap"]
+    assert all("\n" not in line for line in told)
+    assert told[-1] == "scenario lap differs, and so may figures: 2e; 1f then"
+
+
 def test_a_figure_that_is_not_measured_any_more_is_worse(tmp_path: Path) -> None:
     told = Figure("temperature", 31.0, "deg C")
     before = read(kept(tmp_path, replace(GOOD, figures=(NOISE, told))), "bench-vm").results
-    assert regressions([replace(GOOD, figures=())], before) == ["boots: noise is not measured any more, 10 then"]
-    assert regressions([replace(GOOD, figures=(NOISE,))], before) == []
+    gone = {"boots": ["boots: noise is not measured any more, 10 then"]}
+    assert regressions([replace(GOOD, figures=())], before) == gone
+    assert regressions([replace(GOOD, figures=(NOISE,))], before) == {}
     failed = replace(GOOD, figures=(), passed=False)
-    assert regressions([failed], before) == ["boots passed then"]
+    assert regressions([failed], before) == {"boots": ["boots passed then"]}
 
 
 @pytest.mark.parametrize(

@@ -95,12 +95,13 @@ def test_what_may_not_be_read_or_written_is_named(
 def test_a_folder_left_by_a_killed_process_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(places, "MEMORY", tmp_path)
     left, running = tmp_path / "some-999999999", tmp_path / f"some-{os.getppid()}"
-    for one in (left, running, tmp_path / f"some-{os.getpid()}"):  # numbers of processes come again
+    others = tmp_path / f"some-image-{os.getppid()}"  # of another name, which begins with this one
+    for one in (left, running, others, tmp_path / f"some-{os.getpid()}"):  # numbers of processes come again
         one.mkdir()
     with places.workspace("some", 1000) as folder:
         assert folder == tmp_path / f"some-{os.getpid()}"
         (folder / "file").touch()
-    assert list(tmp_path.iterdir()) == [running]
+    assert set(tmp_path.iterdir()) == {running, others}
 
 
 def test_what_the_bench_starts_ends_with_it_however_it_ends() -> None:
@@ -137,14 +138,15 @@ def test_an_image_that_is_not_whole_is_made_anew(tmp_path: Path, monkeypatch: py
     left[0].mkdir()
     left[1].touch()
     said: list[str] = []
-    with pytest.raises(places.CannotBench, match="it would be made anew"):
-        image.image(said.append)
+    with pytest.raises(places.CannotBench, match="it would be made anew"), image.image(said.append):
+        pass
     assert "no disk, no initrd" in said[-1]
     assert [path.name for path in image.cache().iterdir()] == []
     half.folder.mkdir()
     for path in (half.disk, half.kernel, half.initrd):
         path.write_bytes(b"x")
-    assert image.image(said.append) == half
+    with image.image(said.append) as made:
+        assert made == half
 
 
 def test_the_kernel_is_taken_out_of_its_boot_image() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -188,7 +189,7 @@ def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(
         code, said = bench("--against", str(tmp_path / name))
         assert (code, says in said[-1]) == (2, True), said
     made = SimpleNamespace(image=SimpleNamespace(folder=tmp_path))
-    monkeypatch.setattr(command, "image", lambda say: None)
+    monkeypatch.setattr(command, "image", lambda say: nullcontext())
     monkeypatch.setattr(command, "booted", lambda image, say: made)
     monkeypatch.setattr(command, "outside", lambda: None)
     monkeypatch.setattr(command, "run", lambda *_: (True, [boots]))
@@ -197,6 +198,15 @@ def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(
     assert (code, said[-1]) == (1, "FAILED: 1 worse than before"), said
     assert said[0].startswith("1 of 1 passed")
     assert bench("--out", str(tmp_path / "3"))[0] == 0
+    code, said = bench("--against", str(tmp_path / "3"), "--out", str(tmp_path / "4"))
+    assert (code, said[1:]) == (0, [f"compared with {tmp_path}/3/results.json: 1 of 1 outcomes, 1 of 1 figures"])
+    other = tmp_path / "lumiloop.toml"
+    other.write_text("[lidar]\n# another\n")
+    monkeypatch.setattr(command, "CONFIGURATION", other)
+    assert "configuration differs" in bench("--against", str(tmp_path / "3"), "--out", str(tmp_path / "4"))[1][-1]
+    monkeypatch.setattr(command, "image", lambda say: pytest.fail("nothing may be made"))
+    code, said = bench("--against", str(tmp_path / "3"), "--out", str(tmp_path / "3"))
+    assert (code, "would overwrite it; name another folder with --out" in said[-1]) == (2, True), said
 
 
 @pytest.mark.parametrize(("degraded", "off", "right"), [(4, 0.0, True), (8, 0.0, False), (0, 0.2, False)])

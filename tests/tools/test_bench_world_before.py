@@ -55,7 +55,7 @@ def test_what_is_worse_is_said_last_and_fails_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     error = Figure("error, median", 3.0, "mm", "more")
-    lap = Result("lap.1-error", "a lap", True, 17.0, "seen", figures=(error,))
+    lap = Result("lap.error", "a lap", True, 17.0, "seen", figures=(error,))
     monkeypatch.setattr(world, "tried", lambda *_: [lap])
     line = ["lap", "--modbus", "127.0.0.1:9", "--lidar", "pty:x", "--out"]
     assert main([*line, str(tmp_path / "w1")]) == 0
@@ -64,7 +64,7 @@ def test_what_is_worse_is_said_last_and_fails_the_run(
     *_, count, told, worse, last = capsys.readouterr().out.splitlines()
     assert count.startswith("1 of 1 as expected")
     assert "1 of 1 outcomes, 1 of 1 figures" in told
-    assert worse.startswith("worse than before: lap.1-error: error, median: 9 mm, 3 then")
+    assert worse.startswith("worse than before: lap.error: error, median: 9 mm, 3 then")
     assert last == "FAILED: 1 worse than before"
 
 

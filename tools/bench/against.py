@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -15,8 +16,10 @@ if TYPE_CHECKING:
 
 NAMED: Final = 6
 """So many names of what cannot be compared are told."""
-ENDS: Final = ("computer", "robot", "lidar", "adc", "light")
+ENDS: Final = ("computer", "robot", "lidar", "adc", "light", "odometry", "have", "walk-s", "configuration")
 """Facts that say what was measured: where they differ, a figure may differ for that reason."""
+SCENARIO: Final = "scenario "
+"""So begin, before a scenario's name, the facts that say by its digest what was played."""
 
 
 class CannotCompare(Exception):
@@ -75,10 +78,18 @@ class Before:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """What came of it: lines that say what could be compared, and what has become worse; both empty without another."""
+    """What came of it: lines that say what could be compared, and by the result's name what of it has become worse.
+
+    Both are empty without another.
+    """
 
     told: tuple[str, ...] = ()
-    worse: list[str] = field(default_factory=list)
+    of: dict[str, list[str]] = field(default_factory=dict)
+
+    @property
+    def worse(self) -> list[str]:
+        """All that has become worse."""
+        return [text for lines in self.of.values() for text in lines]
 
     def closing(self) -> list[str]:
         """The last lines of a bench: nothing that reads like success may follow what makes it fail."""
@@ -134,11 +145,21 @@ def _extent(results: Sequence[Result], before: Before) -> str:
 def _doubts(facts: dict[str, str], before: Before) -> list[str]:
     """Why a difference may come from elsewhere."""
     doubts = [] if before.bench else [f"{before.file} does not say of which bench it is; it is taken for one of this"]
-    for name in ENDS:
+    for name in (*ENDS, *(name for name in facts if name.startswith(SCENARIO))):
         now, then = facts.get(name), before.facts.get(name)
         if now is not None and then is not None and now != then:
-            doubts.append(f"{name} differs, and so may figures: {now}; {then} then")
+            doubts.append(f"{name} differs, and so may figures: {_short(now)}; {_short(then)} then")
     return doubts
+
+
+def digest(text: str) -> str:
+    """By which two texts can be told apart."""
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _short(text: str) -> str:
+    """In a line; of a whole file its digest."""
+    return digest(text) if "\n" in text else text
 
 
 def _some(names: Sequence[str]) -> str:
@@ -146,23 +167,25 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
-def regressions(results: Sequence[Result], before: dict[str, Old]) -> list[str]:
-    """What has become worse since another run."""
+def regressions(results: Sequence[Result], before: dict[str, Old]) -> dict[str, list[str]]:
+    """What has become worse since another run, by the result's name."""
+    found = {one.name: _lost(one, before[one.name]) for one in results if one.name in before}
+    return {name: lines for name, lines in found.items() if lines}
+
+
+def _lost(one: Result, old: Old) -> list[str]:
+    """How a result is worse than it was."""
     found = []
-    for one in results:
-        old = before.get(one.name)
-        if old is None:
-            continue
-        if old.outcome == "passed" and one.outcome == "FAILED":
-            found.append(f"{one.name} passed then")
-        elif old.outcome == "passed" and one.skipped:
-            found.append(f"{one.name} passed then, and was not tried now: {one.skipped}")
-        found += [
-            f"{one.name}: {figure}, {old.figures[figure.name]:.4g} then"
-            for figure in one.figures
-            if figure.name in old.figures and figure.lost(old.figures[figure.name])
-        ]
-        if one.passed and not one.skipped:  # otherwise it is said above why there are none
-            gone = sorted(old.judged - {figure.name for figure in one.figures})
-            found += [f"{one.name}: {name} is not measured any more, {old.figures[name]:.4g} then" for name in gone]
+    if old.outcome == "passed" and one.outcome == "FAILED":
+        found.append(f"{one.name} passed then")
+    elif old.outcome == "passed" and one.skipped:
+        found.append(f"{one.name} passed then, and was not tried now: {one.skipped}")
+    found += [
+        f"{one.name}: {figure}, {old.figures[figure.name]:.4g} then"
+        for figure in one.figures
+        if figure.name in old.figures and figure.lost(old.figures[figure.name])
+    ]
+    if one.passed and not one.skipped:  # otherwise it is said above why there are none
+        gone = sorted(old.judged - {figure.name for figure in one.figures})
+        found += [f"{one.name}: {name} is not measured any more, {old.figures[name]:.4g} then" for name in gone]
     return found

@@ -13,7 +13,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -123,12 +123,14 @@ def _described() -> str:
     return ""
 
 
-def junit(results: list[Result], name: str = "bench") -> str:
-    """The results as JUnit XML."""
+def junit(results: list[Result], name: str = "bench", worse: Mapping[str, list[str]] | None = None) -> str:
+    """The results as JUnit XML. ``worse``: than in another run, by the result's name; it is a failure, too."""
+    lost = worse or {}
+    failed = sum(one.outcome == "FAILED" or one.name in lost for one in results)
+    skipped = sum(bool(one.skipped) and one.name not in lost for one in results)
     suite = ElementTree.Element(
-        "testsuite", name=name, tests=str(len(results)),
-        failures=str(sum(one.outcome == "FAILED" for one in results)),
-        skipped=str(sum(bool(one.skipped) for one in results)), time=f"{sum(one.seconds for one in results):.1f}",
+        "testsuite", name=name, tests=str(len(results)), failures=str(failed), skipped=str(skipped),
+        time=f"{sum(one.seconds for one in results):.1f}",
     )  # fmt: skip
     for one in results:
         where = name.replace("-", ".")
@@ -139,14 +141,20 @@ def junit(results: list[Result], name: str = "bench") -> str:
                 ElementTree.SubElement(kept, "property", name="device", value="fake")
             for figure in one.figures:
                 ElementTree.SubElement(kept, "property", name=figure.name, value=f"{figure.value:.9g} {figure.unit}")
-        if one.skipped:
-            ElementTree.SubElement(case, "skipped", message=_plain(one.skipped))
-        elif one.passed:
-            ElementTree.SubElement(case, "system-out").text = _plain(one.said)
-        else:
-            first = (one.said.splitlines() or [""])[0][:200]
-            ElementTree.SubElement(case, "failure", message=_plain(first)).text = _plain(one.said)
+        _outcome(case, one, lost.get(one.name, []))
     return ElementTree.tostring(suite, encoding="unicode")
+
+
+def _outcome(case: ElementTree.Element, one: Result, lost: list[str]) -> None:
+    """Below a test case, what came of it."""
+    if one.outcome == "FAILED" or lost:
+        told = "\n".join([*filter(None, [one.said]), *(f"worse than before: {text}" for text in lost)])
+        first = (told.splitlines() or [""])[0] if one.outcome == "FAILED" else f"worse than before: {lost[0]}"
+        ElementTree.SubElement(case, "failure", message=_plain(first[:200])).text = _plain(told)
+    elif one.skipped:
+        ElementTree.SubElement(case, "skipped", message=_plain(one.skipped))
+    else:
+        ElementTree.SubElement(case, "system-out").text = _plain(one.said)
 
 
 def _plain(text: str) -> str:
@@ -209,12 +217,25 @@ def demand_room(out: Path, option: str = "--out") -> None:
         raise CannotReport(f"nothing can be written to {out}; name another folder with {option}")
 
 
+def demand_apart(out: Path, before: Before | None, option: str = "--out") -> None:
+    """Before anything is tried: raise `CannotReport` where the report would overwrite the one to compare with."""
+    if before is not None and before.file.resolve() in [(out / name).resolve() for name in FILES]:
+        raise CannotReport(
+            f"{before.file} is to be compared with, and this run's report would overwrite it; name another folder with "
+            f"{option}"
+        )
+
+
 def write(out: Path, results: list[Result], about: About, before: Before | None = None) -> Compared:
     """Write all three into ``out``; returns how it compares with the run ``before``."""
     out.mkdir(parents=True, exist_ok=True)
     compared = compare(results, about.facts, before)
     told = {"bench": about.name, "about": about.facts, "results": [_kept(one) for one in results]}
-    texts = junit(results, about.name), page(results, about, compared, before), json.dumps(told, indent=1) + "\n"
+    texts = (
+        junit(results, about.name, compared.of),
+        page(results, about, compared, before),
+        json.dumps(told, indent=1) + "\n",
+    )
     for name, text in zip(FILES, texts, strict=True):
         (out / name).write_text(text, encoding="utf-8")
     return compared

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from tools.bench.against import CannotCompare, read
-from tools.bench.report import About, CannotReport, Result, demand_room, facts, write
+from tools.bench.report import About, CannotReport, Result, demand_apart, demand_room, facts, write
 from tools.bench.vm.booted import Booted, booted
 from tools.bench.vm.common import Scenario
 from tools.bench.vm.guests import Guest, run_all
@@ -75,11 +75,13 @@ def main() -> int:
             before = read(options.against, NAME)
             before.demand([one.__name__ for share in shares for one in share])
         demand_room(options.out)
-        made = booted(image(say), say)
-        outside()
-        if options.image_only:
-            return 0
-        whole, results = run(made, shares, options.out)
+        demand_apart(options.out, before)
+        with image(say) as system:
+            made = booted(system, say)
+            outside()
+            if options.image_only:
+                return 0
+            whole, results = run(made, shares, options.out)
     except (CannotBench, CannotCompare, CannotReport) as reason:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT

@@ -36,6 +36,8 @@ FIRST_FAULT, FAULTS = 407, 12
 PLACED: Final = ("MAPPING", "TRACKING", "DEGRADED")
 KEPT: Final = 30_000
 WORLD_S: Final = 240.0
+WORLD_ANSWERS_S: Final = 5.0
+LOOK_S: Final = 0.2
 READS: Final = 4
 BUSY: Final = 5.0
 """No bound is stretched beyond so many times its seconds."""
@@ -81,7 +83,7 @@ class Ears:
                     self.poses.append(heard(data, time.monotonic(), clock))
 
     def true_pose(self, t: float) -> Pose | None:
-        """Where the robot really was."""
+        """Where the robot really was at ``t`` (this computer's clock, s): x, y, yaw in the room's frame, m and rad."""
         told = list(self.truth)
         at = bisect_left(told, (t,))
         if at == 0 or at == len(told):
@@ -107,7 +109,7 @@ def heard(data: bytes, now: float, clock: OtherClock) -> Heard:
 
 
 def inverse_then(frame: Pose, pose: Pose) -> Pose:
-    """``pose`` seen from ``frame``."""
+    """``pose`` seen from ``frame``: x, y, yaw, m and rad, as both are."""
     dx, dy = pose[0] - frame[0], pose[1] - frame[1]
     c, s = math.cos(frame[2]), math.sin(frame[2])
     return (c * dx + s * dy, -s * dx + c * dy, math.remainder(pose[2] - frame[2], math.tau))
@@ -128,25 +130,44 @@ class Bench:
         self.life = (0, 0)
 
     def orders(self, text: str) -> str:
-        """An order to the world's devices (`python -m hal.fake`'s control socket): ``order silence for=2``."""
-        with socket.socket(socket.AF_UNIX) as link:
-            link.settimeout(5.0)
-            link.connect(str(self.folder / "control"))
-            link.sendall(text.encode() + b"\n")
-            answer = b""
-            while not answer.endswith(b"ok\n") and b"refused" not in answer:
-                answer += link.recv(4096)
+        """An order to the world's devices (`python -m hal.fake`'s control socket): ``order silence for=2``.
+
+        Raises:
+            Order: it is refused, or the world hangs up or says nothing.
+        """
+        try:
+            with socket.socket(socket.AF_UNIX) as link:
+                link.settimeout(WORLD_ANSWERS_S)
+                link.connect(str(self.folder / "control"))
+                link.sendall(text.encode() + b"\n")
+                answer = self._answered(link)
+        except OSError as error:
+            raise Order(f"{text}: the simulated world does not take it: {error}") from error
         if b"refused" in answer:
             raise Order(f"{text}: {answer.decode()}")
         return answer.decode()
+
+    def _answered(self, link: socket.socket) -> bytes:
+        """The world's answer to an order, to its end; raises `OSError` where there is none."""
+        answer, end = b"", time.monotonic() + WORLD_ANSWERS_S
+        while not answer.endswith(b"ok\n") and b"refused" not in answer:
+            self.machine.check()
+            if time.monotonic() > end:
+                raise TimeoutError(f"no answer within {WORLD_ANSWERS_S:g} s")
+            if select.select([link], [], [], LOOK_S)[0]:
+                piece = link.recv(4096)
+                if not piece:
+                    raise ConnectionError("it has hung up")
+                answer += piece
+        return answer
 
     def drive(self) -> None:
         """The robot sets off."""
         self.world.send_signal(signal.SIGUSR1)
 
-    def read(self, tcp: bool = False) -> dict[str, Any]:
-        """The daemon's block over Modbus; empty where nobody answers, asked several times."""
-        for _ in range(READS):
+    def read(self, tcp: bool = False, tries: int = READS) -> dict[str, Any]:
+        """The daemon's block over Modbus; empty where nobody answers, asked so many times."""
+        for _ in range(tries):
             with suppress(OSError, ValueError):
                 reader = Reader("127.0.0.1", self.machine.ports.modbus, tcp)
                 try:

@@ -79,6 +79,7 @@ def booted(image: Image, say: Say) -> Booted:
     part = image.folder / f"part-{os.getpid()}"
     try:
         with workspace("lumiloop-vm-boot", ROOM) as folder:
+            shutil.rmtree(part, ignore_errors=True)  # of a process that was killed and had our number
             part.mkdir()
             seconds = _boot(folder, Booted(image, part))
         (part / "told.json").write_text(json.dumps({"seconds": seconds}))

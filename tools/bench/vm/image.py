@@ -16,12 +16,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tools.bench.vm.places import LEASH, CannotBench, cache, missing, workspace
+from tools.bench.vm.places import LEASH, CannotBench, cache, discard, held, missing, workspace
 
 ROOT = Path(__file__).parents[3]
 GUEST = Path(__file__).parent / "guest"
@@ -87,11 +87,17 @@ class Image:
 
 
 def discard_parts(say: Say) -> None:
-    """Remove what a making that was killed has left half done in the cache."""
-    for left in cache().glob("part-*"):
-        if not Path("/proc", left.name.removeprefix("part-").partition(".")[0]).exists():
+    """Remove what a making or a first boot that was killed has left half done in the cache.
+
+    Before this process makes anything, what bears its number is of one that had it before.
+    """
+    for left in (*cache().glob("part-*"), *cache().glob("image-*/part-*")):
+        number = left.name.removeprefix("part-").partition(".")[0]
+        if number == str(os.getpid()) or not Path("/proc", number).exists():
             say(f"removing {left}: left half done by a process that was ended")
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
+            shutil.rmtree(left, ignore_errors=True)
+            with contextlib.suppress(OSError):  # it is gone with that; or of another user, and who may read still runs
+                left.unlink()
 
 
 def digest(*paths: Path, extra: str = "") -> str:
@@ -116,14 +122,29 @@ def image_key() -> str:
     return digest(*(ROOT / part for part in parts), GUEST, Path(__file__), extra=base_key())
 
 
-def image(say: Say) -> Image:
-    """The image of these sources; made where it is not there yet.
+@contextlib.contextmanager
+def image(say: Say) -> Iterator[Image]:
+    """The image of these sources, made where it is not there yet; until the end nobody else removes it.
+
+    Another checkout may have made one of its own, and want to remove this one, before it is held: then once more.
 
     Raises:
         CannotBench: something is missing, or a step failed; says what.
     """
     made = Image(cache() / f"image-{image_key()}")
     discard_parts(say)
+    with contextlib.ExitStack() as stack:
+        _see_to(made, say)
+        try:
+            stack.enter_context(held(made.folder))
+        except FileNotFoundError:
+            _see_to(made, say)
+            stack.enter_context(held(made.folder))
+        yield made
+
+
+def _see_to(made: Image, say: Say) -> None:
+    """Make it where it is not there, or not whole; others that nobody uses go then."""
     if made.folder.exists() and (lacks := made.lacks()):
         say(f"{made.folder} is not whole ({lacks}): it is made anew")
         shutil.rmtree(made.folder, ignore_errors=True)
@@ -135,9 +156,8 @@ def image(say: Say) -> Image:
             _make_image(folder, made, say)
         say(f"image made in {time.monotonic() - begun:.0f} s")
         for old in cache().glob("image-*"):
-            if old != made.folder:
-                shutil.rmtree(old, ignore_errors=True)
-    return made
+            if old != made.folder and not discard(old):
+                say(f"{old} stays: another run uses it, or it is of another user")
 
 
 _running: set[subprocess.Popen[str]] = set()

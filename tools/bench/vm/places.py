@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -63,13 +66,48 @@ def workspace(name: str, room: int) -> Iterator[Path]:
     parent = MEMORY if in_memory else Path(tempfile.gettempdir())
     folder = parent / f"{name}-{os.getpid()}"
     for left in parent.glob(f"{name}-*"):
-        if left == folder or not Path("/proc", left.name.removeprefix(f"{name}-")).exists():
+        number = re.fullmatch(rf"{re.escape(name)}-([0-9]+)", left.name)  # another workspace's name may begin so, too
+        if number and (left == folder or not Path("/proc", number[1]).exists()):
             shutil.rmtree(left, ignore_errors=True)
     folder.mkdir(mode=0o755)
     try:
         yield folder
     finally:
         shutil.rmtree(folder)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Meanwhile :func:`discard` of any process leaves the folder alone; who may only read it can hold it, too.
+
+    Raises:
+        FileNotFoundError: it is not there, or was removed while somebody held it to do so.
+    """
+    kept = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(kept, fcntl.LOCK_SH)
+        if not (folder.exists() and os.path.samestat(os.fstat(kept), folder.stat())):
+            raise FileNotFoundError(errno.ENOENT, "removed by another process", str(folder))
+        yield
+    finally:
+        os.close(kept)
+
+
+def discard(folder: Path) -> bool:
+    """Remove a folder that nobody holds; whether it is gone."""
+    try:
+        kept = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:  # it is gone; or another user's, who lets nobody in
+        return not folder.exists()
+    try:
+        fcntl.flock(kept, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        return not folder.exists()
+    finally:
+        os.close(kept)
 
 
 def _memory_available() -> int:

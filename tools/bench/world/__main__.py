@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Final
 
 from hal.errors import HalError
-from tools.bench.against import Before, CannotCompare, read
-from tools.bench.report import About, CannotReport, Result, demand_room, facts, write
+from tools.bench.against import SCENARIO, Before, CannotCompare, digest, read
+from tools.bench.report import About, CannotReport, Result, demand_apart, demand_room, facts, write
 from tools.bench.world import agreement
 from tools.bench.world.judge import Played, judged, pictures
 from tools.bench.world.local import robot
@@ -89,9 +89,8 @@ def tried(scenario: Scenario, ends: Ends, twin: bool) -> list[Result]:
     begun = time.monotonic()
     played = asyncio.run(play(scenario, ends, say))
     results = []
-    for number, expected in enumerate(scenario.expect):
+    for number, (name, expected) in enumerate(zip(scenario.names, scenario.expect, strict=True)):
         passed, seen = judged(expected, played)
-        name = named(scenario, number)
         title = f"{scenario.title}: {expected}"
         plots = pictures(played) if number == 0 else ()
         seconds = time.monotonic() - begun if number == 0 else 0.0
@@ -102,11 +101,6 @@ def tried(scenario: Scenario, ends: Ends, twin: bool) -> list[Result]:
         told = "; ".join(filter(None, (one.skipped, one.said, *map(str, one.figures))))
         say(f"{one.outcome}  {one.title}\n        {told}")
     return results
-
-
-def named(scenario: Scenario, number: int) -> str:
-    """How the result of an expectation is called."""
-    return f"{scenario.name}.{number + 1}-{scenario.expect[number].what}"
 
 
 def twins(scenario: Scenario, played: Played) -> Result:
@@ -163,11 +157,22 @@ def chosen(options: argparse.Namespace) -> list[Scenario]:
         raise CannotPlay(
             f"--local is a daemon of this computer, without {', '.join(beside)}: leave one or the other out"
         )
-    scenarios = [load(find(name)) for name in options.scenario or ["lap"]]
+    files = [find(name) for name in options.scenario or ["lap"]]
+    _told_apart(files)
+    scenarios = [load(file) for file in files]
     for one in scenarios:
         if options.light.startswith("dac:") and any(fault.get("where") == "adc" for fault in one.faults):
             raise CannotPlay(f"{one.name}: no fault can be ordered of the robot computer's converter, behind a DAC")
     return scenarios
+
+
+def _told_apart(files: list[Path]) -> None:
+    """Refuse two of one name: in the report one's results would stand for the other's."""
+    for file in files:
+        if (first := next(one for one in files if one.stem == file.stem)) is not file:
+            why = f"{first} and {file} are both called so: name one of them otherwise"
+            twice = first.resolve() == file.resolve()
+            raise CannotPlay(f"{file.stem}: {'named twice: a run plays it once' if twice else why}")
 
 
 def configured(options: argparse.Namespace, scenarios: list[Scenario]) -> int:
@@ -195,7 +200,7 @@ def compared_with(options: argparse.Namespace, scenarios: list[Scenario]) -> Bef
     if options.against is None:
         return None
     before = read(options.against, NAME)
-    before.demand([named(one, number) for one in scenarios for number in range(len(one.expect))])
+    before.demand([name for one in scenarios for name in one.names])
     return before
 
 
@@ -207,15 +212,18 @@ def main(arguments: list[str] | None = None) -> int:
             say(f"{path.stem}: {load(path).title}")
         return 0
     results: list[Result] = []
+    scenarios: list[Scenario] = []
     left: list[Scenario] = []
     why = ""
     before = None
     try:
-        left = chosen(options)
+        scenarios = chosen(options)
         if options.write_config is not None:
-            return configured(options, left)
-        before = compared_with(options, left)
+            return configured(options, scenarios)
+        before = compared_with(options, scenarios)
         demand_room(options.out)
+        demand_apart(options.out, before)
+        left = list(scenarios)
         while left:
             with opposite(options, left[0]) as ends:
                 results += tried(left[0], ends, options.twin)
@@ -229,16 +237,24 @@ def main(arguments: list[str] | None = None) -> int:
         if not results:
             return CANNOT
         results += [Result(one.name, one.title, False, 0.0, "", skipped=f"not played: {why}") for one in left]
-    return told(options, results, before, broken_off=bool(why))
+    return told(options, results, About(NAME, TITLE, known(options, scenarios)), before, broken_off=bool(why))
 
 
-def told(options: argparse.Namespace, results: list[Result], before: Before | None, broken_off: bool) -> int:
-    """Write the report and say what came of it; the exit status."""
-    known = facts(
+def known(options: argparse.Namespace, scenarios: list[Scenario]) -> dict[str, str]:
+    """Facts of the run: where things went, and what was played, as it was read."""
+    played = {f"{SCENARIO}{one.name}": digest(one.text) for one in scenarios}
+    return facts(
         robot="a process here" if options.local else options.modbus, lidar=options.lidar or "pty",
-        light=options.light or "-", scenarios="\n".join(find(name).read_text() for name in options.scenario or ["lap"]),
+        light=options.light or "-", odometry=options.odometry or "-",
+        scenarios="\n".join(one.text for one in scenarios), **played,
     )  # fmt: skip
-    compared = write(options.out, results, About(NAME, TITLE, known), before)
+
+
+def told(
+    options: argparse.Namespace, results: list[Result], about: About, before: Before | None, broken_off: bool
+) -> int:
+    """Write the report and say what came of it; the exit status."""
+    compared = write(options.out, results, about, before)
     done = [one for one in results if not one.skipped]
     passed = sum(one.passed for one in done)
     say(f"{passed} of {len(done)} as expected; {options.out}/report.html")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from tools.bench.plots import Plot, Series, histogram
 from tools.bench.report import Figure, Seen
-from tools.bench.world.scenario import Expectation, Scenario
+from tools.bench.world.scenario import GAP_S, Expectation, Scenario
 from tools.clients.read_modbus import STATES
 from tools.sim.robot import Body
 
@@ -58,9 +58,10 @@ class Played:
     """All of a run.
 
     Attributes:
-        reads: of the whole drive. truth: true pose of the robot at ``t`` in the room's frame.
-        standing: poses read while it stood, before it set off. lamps: IDs of those overhead; strongest: the truly
-            strongest one's at a time, None: nothing is received.
+        reads: of the whole drive. truth: true poses (n, 3) of the robot in the room's frame, m and rad, at times (n,)
+            in s since it set off.
+        standing: poses read while it stood, before it set off, in its map, m and rad. lamps: IDs of those overhead;
+            strongest: the truly strongest one's at a time, s, None: nothing is received.
     """
 
     scenario: Scenario
@@ -140,16 +141,45 @@ def seen_from(at: Array, pose: Array, truth: Array) -> Array:
 
 def judged(expected: Expectation, played: Played) -> tuple[bool, Seen]:
     """Whether it is as expected, and what was seen."""
-    until = expected.until or played.scenario.drive.seconds
-    if expected.what in ("state", "fault", "clear"):
-        until = min(until, expected.from_ + expected.within)
+    until = _end(expected, played)
     window = [one for one in played.reads if expected.from_ <= one.t <= until]
     if not window:
         return False, Seen("nothing was read in that time")
     return JUDGES[expected.what](expected, played, window)
 
 
+def _end(expected: Expectation, played: Played) -> float:
+    """When its window ends, s."""
+    until = expected.until or played.scenario.drive.seconds
+    return min(until, expected.from_ + expected.within) if expected.what in ("state", "fault", "clear") else until
+
+
+def spans_of(expected: Expectation, played: Played) -> Array:
+    """(n,) s of the window for which each of all reads stands: the time since the one before, or since it set off.
+
+    One that nobody answers takes fifty times as long as one that is answered: counted, an outage would nearly vanish.
+    """
+    t = np.array([one.t for one in played.reads])
+    before = np.concatenate([[0.0], t[:-1]])
+    return np.asarray(np.maximum(np.minimum(t, _end(expected, played)) - np.maximum(before, expected.from_), 0.0))
+
+
+def _share_of(so: Callable[[Read], bool], expected: Expectation, played: Played) -> float:
+    """For which share of the window it was so."""
+    spans = spans_of(expected, played)
+    held = sum(span for one, span in zip(played.reads, spans.tolist(), strict=True) if span and so(one))
+    return held / float(spans.sum()) if spans.any() else 0.0
+
+
 Verdict = tuple[bool, Seen]
+
+
+def _unseen(expected: Expectation, played: Played, window: list[Read]) -> tuple[float, float]:
+    """The longest time in the window without a new pose, and when it began, s."""
+    new = [one.t for one in window if one.fresh and one.pose is not None]
+    t = np.array([expected.from_, *new, _end(expected, played)])
+    longest = int(np.argmax(np.diff(t)))
+    return float(np.diff(t)[longest]), float(t[longest])
 
 
 def _error(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
@@ -161,16 +191,21 @@ def _error(expected: Expectation, played: Played, window: list[Read]) -> Verdict
         return False, Seen("light has never told where the survey lies, so no pose is a place in it")
     metres, allowed = found.metres[within], expected.at_most + expected.sigmas * found.sigma[within]
     worst = int(np.argmax(metres - allowed))
+    unseen, since = _unseen(expected, played, window)
     figures = (
         Figure("error, median", 1e3 * float(np.median(metres)), "mm", "more", 0.5, 5.0),
         Figure("error, largest", 1e3 * float(metres.max()), "mm", "more", 0.5, 10.0),
         Figure("heading, largest", float(np.degrees(np.abs(found.off[within, 2]).max())), "deg", "more", 0.5, 0.5),
+        Figure("longest without a new pose", unseen, "s", "more", 0.5, 0.5),
     )
     said = f"{len(metres)} poses; {metres[worst]:.3f} m where {allowed[worst]:.3f} is allowed, "
     said += f"at {found.t[within][worst]:.1f} s"
     if metres[worst] > FAR * allowed[worst]:
         said += MOUNTED
-    return bool((metres <= allowed).all()), Seen(said, figures)
+    longest = expected.gap or GAP_S
+    if unseen > longest:
+        said += f"; no new pose for {unseen:.1f} s from {since:.1f} s on, where {longest:g} s are allowed (gap)"
+    return bool((metres <= allowed).all()) and unseen <= longest, Seen(said, figures)
 
 
 def _first(window: list[Read], so: Callable[[Read], bool], expected: Expectation, name: str) -> Verdict:
@@ -206,7 +241,7 @@ def _never(expected: Expectation, played: Played, window: list[Read]) -> Verdict
 
 
 def _share(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
-    share = float(np.mean([one.state in expected.is_ for one in window]))
+    share = _share_of(lambda one: one.state in expected.is_, expected, played)
     name = f"{' or '.join(map(str, expected.is_))}"
     return share >= expected.at_least, Seen("", (Figure(name, 100.0 * share, "%", "less", 0.05),))
 
@@ -224,7 +259,7 @@ def _age(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
 
 
 def _answers(expected: Expectation, played: Played, window: list[Read]) -> Verdict:
-    share = float(np.mean([one.answered for one in window]))
+    share = _share_of(lambda one: one.answered, expected, played)
     return share >= expected.at_least, Seen("", (Figure("answered", 100.0 * share, "%", "less", 0.01),))
 
 
@@ -233,8 +268,12 @@ def _lamps(expected: Expectation, played: Played, window: list[Read]) -> Verdict
     if not heard:
         return False, Seen("no lamp was received")
     strange = {lamp for one in heard for lamp, _ in one.lamps} - played.lamps
-    right = [one.lamps[0][0] == played.strongest(one.t_pose if math.isfinite(one.t_pose) else one.t) for one in heard]
-    share = float(np.mean(right)) * len(heard) / len(window)
+
+    def right(one: Read) -> bool:
+        at = one.t_pose if math.isfinite(one.t_pose) else one.t
+        return bool(one.lamps) and one.lamps[0][0] == played.strongest(at)
+
+    share = _share_of(right, expected, played)
     known = len({lamp for one in heard for lamp, _ in one.lamps} & played.lamps)
     figures = (
         Figure("strongest lamp right", 100.0 * share, "%", "less", 0.1),

@@ -35,7 +35,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,16 +51,21 @@ from tools.sim.scene_light import Lights
 CODES: Final = frozenset(map(int, Fault))
 BUILT_IN: Final = Path(__file__).parent / "scenarios"
 KINDS: Final = {
-    "error": "never further from the truth than `at_most` m and `sigmas` of the published sigma",
+    "error": "never further from the truth than `at_most` m and `sigmas` of the published sigma, and never longer than "
+    "`gap` s without a new pose (left out: 1 s)",
     "state": "one of the states `is` within `within` s after `from`",
     "never": "none of the states `is`",
-    "share": "the states `is` in at least `at_least` of the reads",
+    "share": "the states `is` for at least `at_least` of the time",
     "fault": "one of the faults `is` (codes) within `within` s after `from`",
     "clear": "no fault at all within `within` s after `from`",
     "age": "half of the poses that are read are no older than `at_most` s",
-    "answers": "at least `at_least` of the reads are answered",
-    "lamps": "the lamps received are in the building, the strongest one truly so in `at_least` of the reads",
+    "answers": "it answers for at least `at_least` of the time",
+    "lamps": "the lamps received are in the building, the strongest one truly so for `at_least` of the time",
 }
+
+GAP_S: Final = 1.0
+"""So long there may be no new pose where an error is judged: five periods of the slowest lidar here. Without a laser
+wheels carry the pose on, with a new one every 1.5 periods; where there are no wheels either, a file has to say more."""
 
 
 class ScenarioError(ValueError):
@@ -91,7 +96,7 @@ class DrivePart:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """``[[expect]]``: see :data:`KINDS`. Times in s since the robot set off; ``until`` 0: to the end."""
+    """``[[expect]]``: see :data:`KINDS`. Times in s since the robot set off; ``until`` 0: to the end; ``gap`` in s."""
 
     what: str
     is_: tuple[str | int, ...] = ()
@@ -101,17 +106,43 @@ class Expectation:
     at_most: float = 0.0
     at_least: float = 0.0
     sigmas: float = 0.0
+    gap: float = 0.0
 
     def __str__(self) -> str:
         wanted = " or ".join(map(str, self.is_))
-        numbers = {"at most": self.at_most, "at least": self.at_least, "sigmas": self.sigmas, "within s": self.within}
-        told = ", ".join(f"{name} {value:g}" for name, value in numbers.items() if value)
-        return " ".join(filter(None, (self.what, wanted, f"from {self.from_:g} s" if self.from_ else "", told)))
+        times = f"from {self.from_:g} s" if self.from_ else "", f"until {self.until:g} s" if self.until else ""
+        return " ".join(filter(None, (self.what, wanted, *times, ", ".join(self._bounds()))))
+
+    @property
+    def subject(self) -> str:
+        """What it is about and when, not how good it must be: ``state-TRACKING-from-16``."""
+        times = f"from-{self.from_:g}" if self.from_ else "", f"until-{self.until:g}" if self.until else ""
+        return "-".join(filter(None, (self.what, *map(str, self.is_), *times)))
+
+    @property
+    def whole(self) -> str:
+        """With how good it must be: ``state-TRACKING-from-16-within-s-10``."""
+        return "-".join([self.subject, *(bound.replace(" ", "-") for bound in self._bounds())])
+
+    def _bounds(self) -> list[str]:
+        numbers = {"at most": self.at_most, "at least": self.at_least, "sigmas": self.sigmas}
+        numbers |= {"within s": self.within, "gap s": self.gap}
+        return [f"{name} {value:g}" for name, value in numbers.items() if value]
+
+
+def named(expect: Sequence[Expectation]) -> list[str]:
+    """Their names in a report: by what they are about, so that another one between them renames none of them.
+
+    A bound is part of the name only where two differ in nothing else: what is measured can be compared with a run in
+    which more was allowed.
+    """
+    subjects = [one.subject for one in expect]
+    return [one.whole if subjects.count(one.subject) > 1 else one.subject for one in expect]
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A file. ``faults``: tables as :func:`hal.fake.faults.read_fault` takes them."""
+    """A file, ``text``. ``faults``: tables as :func:`hal.fake.faults.read_fault` takes them."""
 
     name: str
     title: str
@@ -119,6 +150,12 @@ class Scenario:
     drive: DrivePart = field(default_factory=DrivePart)
     faults: tuple[Mapping[str, Any], ...] = ()
     expect: tuple[Expectation, ...] = ()
+    text: str = ""
+
+    @property
+    def names(self) -> list[str]:
+        """How the results of what is expected are called."""
+        return [f"{self.name}.{name}" for name in named(self.expect)]
 
     def scene(self, held: bool) -> SimulatedScene:
         """The world of it; a robot that is ``held`` waits to be released."""
@@ -152,13 +189,14 @@ def load(path: Path) -> Scenario:
         ScenarioError: it cannot be read, or something in it is wrong.
     """
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        tree = tomllib.loads(text)
     except OSError as error:
         raise ScenarioError(f"{path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from error
     try:
-        return _scenario(path.stem, tree)
+        return replace(_scenario(path.stem, tree), text=text)
     except ValueError as error:
         raise ScenarioError(f"{path}: {error}") from error
 
@@ -180,9 +218,18 @@ def _scenario(name: str, tree: dict[str, Any]) -> Scenario:
     if not wanted:
         raise ValueError("expect: a scenario that expects nothing cannot fail")
     expect = tuple(_expectation(f"expect[{k}]", table, world) for k, table in enumerate(wanted))
+    _told_apart(expect)
     orders.check(tables, room.model(world.lidar), world.lamps)
     _in_time(drive.seconds, tables, expect)
     return Scenario(name, str(tree.get("title", name)), world, drive, tuple(tables), expect)
+
+
+def _told_apart(expect: Sequence[Expectation]) -> None:
+    """Refuse two that say the same: one's result would stand for the other's."""
+    names = named(expect)
+    for k, name in enumerate(names):
+        if (first := names.index(name)) < k:
+            raise ValueError(f"expect[{k}]: the same as expect[{first}] ({name}); leave one of them out")
 
 
 def _in_time(seconds: float, faults: Sequence[Mapping[str, Any]], expect: Sequence[Expectation]) -> None:
@@ -233,7 +280,7 @@ def _expectation(path: str, table: dict[str, Any], world: WorldPart) -> Expectat
     if what not in KINDS:
         raise ValueError(f"{path}.what: {what!r} is none of {', '.join(KINDS)}")
     values: dict[str, Any] = {"what": what}
-    numbers = ("from", "until", "within", "at_most", "at_least", "sigmas")
+    numbers = ("from", "until", "within", "at_most", "at_least", "sigmas", "gap")
     for key, value in table.items():
         if key in numbers:
             values[f"{key}_" if key == "from" else key] = _like(f"{path}.{key}", value, 0.0)
