@@ -59,6 +59,7 @@ def goes_on(drive: Run, wrap_s: float) -> None:
 
 @pytest.mark.jit
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_three_wraps_move_no_pose() -> None:
     """Nothing is said of the hours between: so slow a lidar, of so few beams, loses itself now and then."""
     drive = driven(WRAPS * WRAP_S + 2.0 * AROUND_S)
