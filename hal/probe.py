@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hal.errors import HalError
+from hal.errors import DeviceMissing, HalError
 from hal.hokuyo import discover
 from hal.hokuyo.line import Line
 from hal.hokuyo.scip import BAUD_RATES
@@ -73,6 +73,8 @@ async def identify_at(opener: PortOpener, device: str, baud: int = 0) -> Finding
             await session.settle()
             identity = await session.identify()
             await session.quiet()
+        except DeviceMissing as error:  # a server of something else hangs up on whom it does not understand
+            raise session.stranger(session.line.heard) if session.line.strange else error from error
         finally:
             session.line.close()
     except HalError as error:

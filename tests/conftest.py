@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import gc
 import os
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -30,17 +32,29 @@ FIRST = (
     "logs/test_figures.py",
 )
 """Files that take minutes, longest first: where files are shared out to the cores none of them is begun last."""
+COMPILING_S = 900.0
+LIMIT = pytest.StashKey[tuple[pytest.Item, Any]]()
+"""The test whose time runs, and its limit as pytest-timeout has it."""
+
+
+def named_by(text: str) -> str:
+    """An option that names something: empty it is a variable of the shell that nobody has set."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("it is empty: name one, or leave the option out")
+    return text
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--lidar", help="fake, or a real device: /dev/ttyACM0, tcp://192.168.0.10:10940")
-    parser.addoption("--adc", help="fake, or a real converter: /dev/i2c-1@0x4d, /dev/i2c-1@0x54,adc121c021")
+    lidars = "fake, or a real device: /dev/ttyACM0, /dev/ttyUSB0@115200, tcp://192.168.0.10:10940"
+    parser.addoption("--lidar", type=named_by, help=lidars)
+    converters = "fake, or a real converter: /dev/i2c-1@0x4d, /dev/i2c-1@0x54,adc121c021"
+    parser.addoption("--adc", type=named_by, help=converters)
     hil = parser.getgroup("tests/hil", "the suite on devices (docs/bench.md)")
     hil.addoption("--have", default="", help="what real devices can be given: motion,light")
     hil.addoption(
         "--operator", default="", help="who plugs and covers: terminal (a person there), or a unix socket for orders"
     )
-    hil.addoption("--program", default="", help="the lumiloop to try; default: of this tree")
+    hil.addoption("--program", type=named_by, help="the lumiloop to try; default: of this tree")
     hil.addoption("--odometry-port", type=int, default=5601, help="UDP port to which the robot sends odometry")
     hil.addoption("--walk-s", type=float, default=60.0, help="seconds of the calibration walk on a real robot")
     hil.addoption("--hil-report", metavar="DIR", help="write report.html, junit.xml and results.json of tests/hil")
@@ -75,16 +89,53 @@ def log_root() -> Path:
 @pytest.fixture(scope="session")
 def warm_kernels(request: pytest.FixtureRequest) -> None:
     """Compile the kernels of this tree once, before anything is judged against the wall clock."""
+    compile_kernels(request.config)
+
+
+def compile_kernels(config: pytest.Config) -> None:
+    """Compile the kernels of this tree where they are missing; that is said, and no test's time is taken for it."""
     from daemon.warmup import is_warm
 
-    plugins = request.config.pluginmanager
+    plugins = config.pluginmanager
     terminal, capture = plugins.get_plugin("terminalreporter"), plugins.get_plugin("capturemanager")
     if terminal is not None and not is_warm(lights=False):
         with contextlib.nullcontext() if capture is None else capture.global_and_fixture_disabled():
             terminal.ensure_newline()
             terminal.write_line("the kernels of this tree are compiled first, once: that takes a minute or two")
     command = [sys.executable, "-c", "from daemon.warmup import load; load()"]
-    subprocess.run(command, cwd=ROOT, check=True, timeout=900)
+    with untimed(config):
+        subprocess.run(command, cwd=ROOT, check=True, timeout=COMPILING_S)
+
+
+@contextlib.contextmanager
+def untimed(config: pytest.Config) -> Iterator[None]:
+    """The time of the test that is being set up stands still meanwhile, and begins anew afterwards.
+
+    A Raspberry Pi compiles for longer than a test may take, and pytest-timeout counts what a test waits for, too.
+    """
+    running = config.stash.get(LIMIT, None)
+    if running is None:
+        yield
+        return
+    item, settings = running
+    config.hook.pytest_timeout_cancel_timer(item=item)
+    try:
+        yield
+    finally:
+        config.hook.pytest_timeout_set_timer(item=item, settings=settings)
+
+
+@pytest.hookimpl(tryfirst=True, optionalhook=True)
+def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> None:
+    """Remember whose time runs; the timer itself is pytest-timeout's."""
+    item.config.stash[LIMIT] = item, settings
+
+
+@pytest.hookimpl(tryfirst=True, optionalhook=True)
+def pytest_timeout_cancel_timer(item: pytest.Item) -> None:
+    """Nobody's does."""
+    if LIMIT in item.config.stash:
+        del item.config.stash[LIMIT]
 
 
 @pytest.fixture(autouse=True)

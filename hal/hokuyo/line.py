@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Final
 
 from hal.errors import HalError
 from hal.hokuyo.scip import DATA, BadFrame, FrameSplitter, Reply, parse_reply
 from hal.port import Port
 
 OnFrame = Callable[[bytes, float], None]
+_HEARD: Final = 64
+_SHOWN: Final = 20
 
 
 class Line:
@@ -18,12 +21,14 @@ class Line:
     Attributes:
         on_frame: gets every frame that is not the reply being waited for, with its arrival time; None: dropped.
         recognised: frames with a valid status line so far; tells a right line rate from a wrong one.
+        heard: the first bytes that have come, whatever they were; who empties it gets the next ones.
     """
 
     def __init__(self, port: Port) -> None:
         self.port = port
         self.on_frame: OnFrame | None = None
         self.recognised = 0
+        self.heard = b""
         self._splitter = FrameSplitter()
         self._echo = b""
         self._reply: asyncio.Future[bytes] | None = None
@@ -35,6 +40,11 @@ class Line:
     def dropped_bytes(self) -> int:
         """Bytes that could not be part of any frame."""
         return self._splitter.dropped_bytes
+
+    @property
+    def strange(self) -> bool:
+        """Whether something talks there and none of it was SCIP."""
+        return bool(self.heard) and not self.recognised
 
     @property
     def lost(self) -> HalError | None:
@@ -72,6 +82,8 @@ class Line:
         self.port.close()
 
     def _take(self, data: bytes, t_rx: float) -> None:
+        if len(self.heard) < _HEARD:
+            self.heard = (self.heard + data)[:_HEARD]
         for frame in self._splitter.feed(data):
             if self._answers(frame):
                 assert self._reply is not None
@@ -93,6 +105,16 @@ class Line:
             self._reply.set_exception(error)
         if self._on_lost is not None:
             self._on_lost()
+
+
+def printable(data: bytes) -> str:
+    """The beginning of what was heard as a person may read it, a dot for each byte that is no letter."""
+    return "".join(chr(one) if 32 <= one < 127 else "." for one in data.strip()[:_SHOWN])
+
+
+def legible(data: bytes) -> float:
+    """Share of bytes that are letters: at a wrong line rate hardly any are."""
+    return sum(32 <= one < 127 or one in b"\r\n" for one in data) / max(len(data), 1)
 
 
 def _well_formed(frame: bytes) -> bool:

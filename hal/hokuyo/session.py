@@ -23,7 +23,7 @@ from typing import Final
 
 from hal.errors import DataInvalid, DeviceFault, DeviceRefused, HalError
 from hal.hokuyo import scip
-from hal.hokuyo.line import Line, OnFrame, reply_or_none
+from hal.hokuyo.line import Line, OnFrame, legible, printable, reply_or_none
 from hal.hokuyo.models import BEFORE_KNOWN, Identity, ModelFacts, identify
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import BadFrame, Reply, parse_reply, parse_text
@@ -42,6 +42,8 @@ _AFTER_RATE_S: Final = 0.15
 _AFTER_REBOOT_S: Final = 2.0
 _POWER_CYCLE: Final = "switch its power off and on"
 _NO_ANSWER: Final = "is it a HOKUYO, powered, its cable right?"
+_UNREADABLE: Final = "only unreadable bytes come"
+_OTHER_PORT: Final = "name the lidar's own port, and no line rate behind it"
 
 
 class AbnormalState(DeviceFault):
@@ -76,7 +78,7 @@ class Session:
         """Make the sensor idle in SCIP 2.x, whatever it is doing.
 
         Raises:
-            DeviceFault: nothing answers, or it will not settle. AbnormalState: it reports 0L.
+            DeviceFault: nothing answers, or what is no SCIP, or it will not settle. AbnormalState: it reports 0L.
         """
         status = ""
         for _ in range(6):
@@ -98,9 +100,21 @@ class Session:
             reply = await self._try(scip.QT, _QT_RS232_S if self.baud else _QT_S)
             if reply is not None:
                 return reply
-        heard = "only unreadable bytes come" if self.line.dropped_bytes else "nothing answers"
+        if self.line.strange:
+            raise self.stranger(self.line.heard)
+        heard = _UNREADABLE if self.line.dropped_bytes else "nothing answers"
         remedy = "is another client connected? it serves one" if self.device.startswith("tcp:") else _NO_ANSWER
         raise DeviceFault(self.device, heard, remedy)
+
+    def stranger(self, heard: bytes) -> DeviceFault:
+        """The error where something talks that is no SCIP sensor; what it says is shown, for a person to know it by.
+
+        It stands in the remedy: a problem is logged once for its text, and these bytes are others each time.
+        """
+        other = "name the lidar's own address and port" if self.device.startswith("tcp:") else _OTHER_PORT
+        return DeviceFault(
+            self.device, _UNREADABLE, f"something is there that is not SCIP, {printable(heard)!r}: {other}"
+        )
 
     async def find_rate(self, first: int = 0) -> None:
         """Find the rate of an RS-232 line: ``first``, then every rate SCIP knows.
@@ -109,7 +123,9 @@ class Session:
             DeviceFault: no rate gives an answer.
         """
         rates: Sequence[int] = [first, *scip.BAUD_RATES] if first else scip.BAUD_RATES
+        strange = b""
         for rate in dict.fromkeys(rates):
+            self.line.heard = b""
             try:
                 self.line.port.set_baud(rate)
             except DeviceRefused:  # this side cannot do it
@@ -119,6 +135,9 @@ class Session:
             if reply is not None or self.line.recognised > before:
                 self.baud = rate
                 return
+            strange = max(strange, self.line.heard, key=legible)
+        if strange:
+            raise self.stranger(strange)
         raise DeviceFault(self.device, "nothing answers at any line rate", _NO_ANSWER)
 
     async def reset(self) -> None:

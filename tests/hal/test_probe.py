@@ -14,6 +14,7 @@ from hal.fake.hokuyo import FakeHokuyo
 from hal.fake.models import URG_04LX, UTM_30LX, Unit
 from hal.fake.transport import FakeOpener
 from hal.hokuyo import discover
+from hal.port import Port, memory_pair
 from hal.probe import Finding, identify_at, probe
 from tests.hal.hokuyo.bench import Scene
 
@@ -51,6 +52,25 @@ def test_who_is_where() -> None:
     assert "nothing answers" in str(c)
     assert str(Finding("/dev/x")) == "/dev/x: nothing known"
     assert isinstance(d.error, DeviceMissing)
+
+
+def test_a_server_of_something_else_that_hangs_up_is_shown_by_its_first_words() -> None:
+    async def body() -> tuple[Finding, Finding]:
+        clock = LoopClock(asyncio.get_running_loop())
+
+        async def serves(device: str, baud: int) -> Port:
+            ours, its = memory_pair(clock, device)
+            its.start(lambda data, _t: its.close(), lambda error: None)
+            if "ssh" in device:
+                its.write(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n")
+            return ours
+
+        return await identify_at(serves, "tcp://ssh:22"), await identify_at(serves, "tcp://mute:22")
+
+    banner, mute = run_virtual(body())
+    assert "only unreadable bytes come" in str(banner)
+    assert "'SSH-2.0-OpenSSH_9.2p': name the lidar's own address and port" in str(banner)
+    assert isinstance(mute.error, DeviceMissing)
 
 
 def test_candidates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from hal.errors import HalError
-from tests.hil.ends import FAKE, NONE, AdcEnd, LidarEnd, Operator, operator_for, where_on_a_bus
+from tests.hil.ends import FAKE, NONE, AdcEnd, LidarEnd, Operator, operator_for, place_of, where_on_a_bus
 from tests.hil.presence import Presence
-from tests.hil.programs import Served, program, served_lidar
+from tests.hil.programs import Served, demand_lumiloop, program, served_lidar
 from tests.hil.walking import Walked, walk_real, walk_simulated
 from tools.bench.against import Before, CannotCompare, read
 from tools.bench.plots import Plot
@@ -63,10 +63,15 @@ def told(request: pytest.FixtureRequest) -> Telling:
 
 @pytest.fixture(autouse=True)
 def compiled_before_the_clock_runs(request: pytest.FixtureRequest) -> None:
-    """As for all tests; but first the device is looked at: who has named a wrong one hears of it at once."""
+    """As for all tests; but first the device is looked at: who has named a wrong one hears of it at once.
+
+    A program that was named has kernels of its own; for a test of it nothing of this tree need be compiled.
+    """
     for fixture, option in DEVICE_OF.items():
         if fixture in request.fixturenames:
             _device(request, option)
+    if "lumiloop" in request.fixturenames and request.config.getoption("--program"):
+        return
     if request.node.get_closest_marker("realtime") or request.node.get_closest_marker("system"):
         request.getfixturevalue("warm_kernels")
 
@@ -107,7 +112,7 @@ def walk(request: pytest.FixtureRequest, lumiloop: list[str], tmp_path: Path) ->
 @pytest.fixture
 def lumiloop(request: pytest.FixtureRequest) -> list[str]:
     """The words that start the program under test."""
-    return program(str(request.config.getoption("--program")))
+    return program(request.config.getoption("--program") or "")
 
 
 def _operator(request: pytest.FixtureRequest) -> Operator | None:
@@ -178,8 +183,13 @@ def pytest_configure(config: pytest.Config) -> None:
     """See early that options say something, that the run to compare with can be read, and the report be written."""
     config.stash[RESULTS] = {}
     config.stash[PRESENCE] = Presence()
+    place_of(named(config, "lidar"))
     if (adc := named(config, "adc")) != NONE:
         where_on_a_bus(adc)
+    if not 1 <= (port := config.getoption("--odometry-port")) <= 65535:
+        raise pytest.UsageError(f"--odometry-port {port}: name a port from 1 to 65535, to which the robot sends")
+    if wanted := config.getoption("--program"):
+        demand_lumiloop(wanted)
     _operator_of(config)
     _there(config)
     folder = config.getoption("--hil-report")

@@ -18,6 +18,7 @@ from typing import Final, Generic, Protocol, TypeVar
 
 import pytest
 
+from daemon.endpoints import LidarPlace, parse_lidar
 from hal.adc import RawSamples
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
 from hal.fake.adc import FakeAdc, FakeBuses
@@ -35,6 +36,7 @@ from hal.opening import open_bus, open_port
 from hal.photodiode.chips import chip_named
 from hal.photodiode.driver import PhotodiodeAdc
 from hal.port import PortOpener
+from hal.probe import Finding, identify_at
 
 FAKE: Final = "fake"
 NONE: Final = "none"
@@ -196,6 +198,18 @@ class End(ABC, Generic[Block]):
         return self.clock.now() - begun
 
 
+def place_of(name: str) -> LidarPlace:
+    """Where the lidar is that ``--lidar`` names, and its rate where one is written behind it, as for the daemon.
+
+    Raises:
+        pytest.UsageError: that is no rate.
+    """
+    try:
+        return parse_lidar(name)
+    except ValueError as error:
+        raise pytest.UsageError(f"--lidar {name}: {error}; without one it is found") from error
+
+
 @dataclass
 class LidarEnd(End[RawScan]):
     """A lidar; ``fake`` is None on a real device."""
@@ -203,10 +217,17 @@ class LidarEnd(End[RawScan]):
     opener: PortOpener = open_port
     fake: FakeHokuyo | None = None
 
+    def __post_init__(self) -> None:
+        self.place = place_of(self.name if self.real else LINE)
+
     @property
     def device(self) -> str:
         """What a driver opens."""
-        return self.name if self.real else LINE
+        return self.place.device
+
+    async def identify(self) -> Finding:
+        """Who it is, asked as `lumiloop probe` asks."""
+        return await identify_at(self.opener, self.device, self.place.baud)
 
     def plug(self) -> dict[str, Target]:
         """One of the UTM kind, in a room."""
@@ -228,7 +249,8 @@ class LidarEnd(End[RawScan]):
 
     def driver(self) -> HokuyoDriver:
         """A driver of our own on it."""
-        return HokuyoDriver(self.device, clock=self.clock, opener=self.opener)
+        place = self.place
+        return HokuyoDriver(place.device, clock=self.clock, opener=self.opener, serial=place.serial, baud=place.baud)
 
 
 def where_on_a_bus(name: str) -> tuple[str, int, str]:

@@ -12,14 +12,12 @@ from hal.i2c import NACKS, AsyncBus, BusOpener, read
 from hal.opening import open_bus
 from hal.photodiode.probe import probe_bus
 from hal.photodiode.trouble import explain, policy_for
-from hal.probe import identify_at
 from tests.hil.ends import AdcEnd, LidarEnd
 
 
 def lidar_lacks(name: str) -> HalError | None:
     """Why nothing can be tried on this lidar; None: it answers."""
-    end = LidarEnd(name)
-    return asyncio.run(identify_at(end.opener, end.device)).error
+    return asyncio.run(LidarEnd(name).identify()).error
 
 
 def adc_lacks(name: str, opener: BusOpener = open_bus) -> HalError | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -25,6 +26,9 @@ from tools.clients.read_modbus import Reader
 
 ROOT: Final = Path(__file__).parents[2]
 START_S: Final = 60.0
+ANSWER_S: Final = 30.0
+"""In which a program has to say its version, on a small computer that reads it from its card for the first time."""
+INSTALLED: Final = "an installation has /opt/lumiloop/bin/lumiloop"
 TOLD_TO_END: Final = ("setpriv", "--pdeathsig", "TERM")
 """Before the words of the program under test: when the suite is killed it ends as it should, the laser off."""
 
@@ -44,8 +48,27 @@ def program(named: str) -> list[str]:
         return [sys.executable, "-m", "daemon"]
     found = shutil.which(named)
     if found is None:
-        raise pytest.UsageError(f"--program {named}: no such program; an installation has /opt/lumiloop/bin/lumiloop")
-    return [found]
+        wrong = "it may not be executed" if Path(named).is_file() else "no such program"
+        raise pytest.UsageError(f"--program {named}: {wrong}; {INSTALLED}")
+    return [str(Path(found).absolute())]  # it is started in another folder
+
+
+def demand_lumiloop(named: str, patience_s: float = ANSWER_S) -> None:
+    """Raise `pytest.UsageError` unless this program says, asked for its version, that it is lumiloop."""
+    words = [*program(named), "--version"]
+    try:
+        done = subprocess.run(words, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=patience_s)
+    except subprocess.TimeoutExpired as error:
+        wrong = f"asked for its --version it says nothing within {patience_s:g} s"
+        raise pytest.UsageError(f"--program {named}: {wrong}; {INSTALLED}") from error
+    except OSError as error:
+        raise pytest.UsageError(f"--program {named}: it cannot be started: {error.strerror}; {INSTALLED}") from error
+    said = done.stdout.decode(errors="replace").strip()
+    if done.returncode or not re.fullmatch(r"lumiloop \S+", said):
+        complained = done.stderr.decode(errors="replace").strip()
+        line = said.splitlines()[0] if said else complained.splitlines()[-1] if complained else "nothing"
+        wrong = f"no lumiloop: asked for its --version it ends with {done.returncode} and says {line[:60]!r}"
+        raise pytest.UsageError(f"--program {named}: {wrong}; {INSTALLED}")
 
 
 @contextmanager

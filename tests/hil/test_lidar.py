@@ -10,7 +10,6 @@ import pytest
 from hal.errors import DeviceMissing
 from hal.hokuyo.models import UNKNOWN_MODEL, facts_of
 from hal.lidar import VALID, Link, RawScan
-from hal.probe import identify_at
 from tests.hil.conftest import Telling
 from tests.hil.ends import LidarEnd, asked, ended
 from tools.bench.plots import Plot, Series, histogram
@@ -28,9 +27,9 @@ WRAP = 1 << 24
 
 async def test_says_who_it_is(lidar: LidarEnd, told: Telling) -> None:
     """It says who it is, twice the same."""
-    first = await identify_at(lidar.opener, lidar.device)
+    first = await lidar.identify()
     await asyncio.sleep(0.05)
-    second = await identify_at(lidar.opener, lidar.device)
+    second = await lidar.identify()
     assert first.error is None, str(first)
     told.say(str(first))
     geometry = first.geometry
@@ -145,7 +144,7 @@ async def test_the_laser_is_off_when_the_driver_has_gone(lidar: LidarEnd, told: 
     counts = []
     for _ in range(3):
         counts.append(len(await lidar.measure(0.5)))
-        port = await lidar.opener(lidar.device, 115200)
+        port = await lidar.opener(lidar.device, lidar.place.baud or 115200)
         heard: list[int] = []
         port.start(lambda data, _t, heard=heard: heard.append(len(data)), lambda _error: None)  # type: ignore[misc]
         await asyncio.sleep(0.3)

@@ -166,6 +166,15 @@ def test_another_benchs_report_is_refused(tmp_path: Path) -> None:
         before.demand(["drives"])
 
 
+def test_a_run_that_has_tried_none_of_it_is_refused(tmp_path: Path) -> None:
+    """Nothing could become worse than what was skipped; one that was tried is enough."""
+    kept(tmp_path, GOOD, LEFT, replace(LEFT, name="turns"))
+    before = read(tmp_path, "bench-vm")
+    with pytest.raises(CannotCompare, match=r"nothing of what is to be tried now: turns, walks was skipped then; name"):
+        before.demand(["walks", "turns", "flies"])
+    before.demand(["walks", "boots"])
+
+
 def test_an_older_report_that_names_no_bench_is_taken_and_that_is_said(tmp_path: Path) -> None:
     old = json.loads(kept(tmp_path, GOOD).read_text())
     del old["bench"]

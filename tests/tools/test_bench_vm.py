@@ -25,7 +25,7 @@ from daemon.publish.snapshot import NO_CONDITION
 from tools.bench.modbus import example
 from tools.bench.otherclock import OtherClock
 from tools.bench.vm import __main__ as command
-from tools.bench.vm import bench, image, places, reference, trying_system, world
+from tools.bench.vm import bench, image, places, reference, trying_system, whole, world
 from tools.bench.vm.__main__ import chosen
 from tools.bench.vm.common import ALONE
 from tools.bench.vm.guest import agent
@@ -145,6 +145,7 @@ def test_an_image_that_is_not_whole_is_made_anew(tmp_path: Path, monkeypatch: py
     half.folder.mkdir()
     for path in (half.disk, half.kernel, half.initrd):
         path.write_bytes(b"x")
+    whole.note(half.folder, half.parts)
     with image.image(said.append) as made:
         assert made == half
 

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tools.bench.vm import booted, image, places
+from tools.bench.vm import booted, image, places, whole
 from tools.bench.vm import machine as machines
 from tools.bench.vm.machine import Machine, Order, Ports, command_line
 
@@ -103,6 +103,8 @@ def test_what_was_kept_is_of_one_qemu_and_one_command_line(tmp_path: Path, monke
     (tmp_path / f"booted-{key}" / "told.json").write_text('{"seconds": 12.5}')
     for name in ("disk", "memory"):
         (tmp_path / f"booted-{key}" / name).write_bytes(b"x")
+    kept = booted.Booted(made, tmp_path / f"booted-{key}")
+    whole.note(kept.folder, kept.parts)
     assert booted.booted(made, print).seconds == 12.5
     monkeypatch.setattr(booted, "command_line", lambda *given: [*command_line(*given), "-no-hpet"])
     assert booted._key(made) != key
@@ -144,7 +146,7 @@ def test_what_was_kept_is_not_gone_on_from_where_it_is_not_whole(
     (kept / "memory").write_bytes(b"")
     (kept / "told.json").unlink()
     assert booted.booted(image.Image(tmp_path), said.append).lacks() == ""
-    assert f"{kept} is not whole (no memory, no told.json)" in said[2]
+    assert f"{kept} was not whole (no memory, no told.json)" in said[2]
 
 
 @pytest.mark.parametrize("stage", ["wait_until_up", "run"])

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tools.bench.vm import booted, image, places
+from tools.bench.vm.whole import note
 
 ROOT = Path(__file__).parents[2]
 HOLDS = """
@@ -42,6 +43,7 @@ def whole(folder: Path) -> Path:
     folder.mkdir()
     for name in ("disk", "vmlinux", "initrd"):
         (folder / name).write_bytes(b"x")
+    note(folder, image.Image(folder).parts)
     return folder
 
 

@@ -18,6 +18,7 @@ NAMED: Final = 6
 """So many names of what cannot be compared are told."""
 ENDS: Final = ("computer", "robot", "lidar", "adc", "light", "odometry", "have", "walk-s", "configuration")
 """Facts that say what was measured: where they differ, a figure may differ for that reason."""
+SKIPPED: Final = "skipped"
 SCENARIO: Final = "scenario "
 """So begin, before a scenario's name, the facts that say by its digest what was played."""
 
@@ -68,11 +69,17 @@ class Before:
     results: dict[str, Old]
 
     def demand(self, names: Collection[str]) -> None:
-        """Raise `CannotCompare` where it has nothing of that by which this run's results will be called."""
-        if names and not set(names) & set(self.results):
+        """Raise `CannotCompare` where nothing was tried of that by which this run's results will be called."""
+        shared = sorted(set(names) & set(self.results))
+        if names and not shared:
             raise CannotCompare(
                 f"{self.file} has nothing of what is to be tried now ({_some(sorted(names))}); it has "
                 f"{_some(sorted(self.results)) or 'no results'}"
+            )
+        if shared and all(self.results[name].outcome == SKIPPED for name in shared):
+            raise CannotCompare(
+                f"{self.file} has nothing of what is to be tried now: {_some(shared)} was skipped then; name a run "
+                "that has tried it"
             )
 
 
@@ -116,7 +123,7 @@ def read(against: Path, bench: str) -> Before:
 
 
 def _old(one: _KeptResult) -> Old:
-    outcome = "skipped" if one.skipped else "passed" if one.passed else "FAILED"
+    outcome = SKIPPED if one.skipped else "passed" if one.passed else "FAILED"
     figures = {figure.name: figure.value for figure in one.figures}
     return Old(outcome, one.seconds, figures, frozenset(figure.name for figure in one.figures if figure.worse))
 

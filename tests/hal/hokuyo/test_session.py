@@ -105,6 +105,20 @@ class TestSettle:
         with pytest.raises(DeviceFault, match="only unreadable bytes come"):
             self.run(Scripted(QT=[b"\x80" * 300]))
 
+    @pytest.mark.parametrize(
+        ("said", "shown"),
+        [
+            (b"$GPGGA,123519,4807.038,N\r\n", r"'\$GPGGA,123519,4807\.0'"),
+            (b"\nQT\n", "'QT..QT..QT'"),
+            (b"\x00\xffhello\n\n", r"'\.\.hello"),
+        ],
+        ids=["NMEA", "echo", "half of it no letters"],
+    )
+    def test_what_talks_and_is_no_lidar_is_shown(self, said: bytes, shown: str) -> None:
+        with pytest.raises(DeviceFault, match=f"only unreadable bytes come .*not SCIP, {shown}") as told:
+            self.run(Scripted(QT=[said]))
+        assert told.value.problem == "only unreadable bytes come", "it is logged once for this text"
+
     def test_abnormal(self) -> None:
         with pytest.raises(AbnormalState, match=r"0L.*power off and on"):
             self.run(Scripted(QT=["0L"]))
@@ -290,6 +304,15 @@ class TestRate:
         with pytest.raises(DeviceFault, match="nothing answers at any line rate"):
             with_session(script, lambda session: session.find_rate(250000))
         assert script.bauds == [250000, 19200, 38400, 57600, 115200, 500000, 750000]
+
+    def test_what_talks_and_is_no_lidar_is_shown_as_it_is_read_best(self) -> None:
+        """At all rates but its own it is no text."""
+        noise = b"\x80\xf8\x00" * 10
+        script = Scripted(QT=[None, noise, b"$GPRMC,1235\r\n", noise])
+        with pytest.raises(
+            DeviceFault, match=r"only unreadable bytes come .*'\$GPRMC,1235': name the lidar's own port"
+        ):
+            with_session(script, lambda session: session.find_rate())
 
 
 class TestStart:

@@ -24,6 +24,7 @@ from tools.bench.vm.scenarios import SCENARIOS, SHARES
 
 ROOM = 4_000_000_000
 CANNOT = 2
+OTHERS = "run it as that user, or name another place for it with XDG_CACHE_HOME"
 NAME = "bench-vm"
 CONFIGURATION = Path(__file__).parent / "guest" / "lumiloop.toml"
 
@@ -86,7 +87,9 @@ def main() -> int:
         say(f"the virtual bench cannot run: {reason}")
         return CANNOT
     except OSError as error:
-        owner = "; what is kept there is of the user who made it" if isinstance(error, PermissionError) else ""
+        owner = (
+            f"; what is kept there is of the user who made it: {OTHERS}" if isinstance(error, PermissionError) else ""
+        )
         say(f"the virtual bench cannot run: {error.filename or 'this computer'}: {error.strerror}{owner}")
         return CANNOT
     except KeyboardInterrupt:

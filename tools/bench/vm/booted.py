@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from tools.bench.vm import whole
 from tools.bench.vm.image import Image, Say
 from tools.bench.vm.machine import Order, Ports, Start, all_well, command_line, free_for_both, free_port, started
-from tools.bench.vm.places import CannotBench, workspace
+from tools.bench.vm.places import CannotBench, clear, remedy, workspace
 
 ROOM: Final = 2_000_000_000
 QEMU: Final = "qemu-system-x86_64"
@@ -56,9 +57,13 @@ class Booted:
         return float(json.loads((self.folder / "told.json").read_text())["seconds"])
 
     def lacks(self) -> str:
-        """What is missing or empty; empty text: it is whole."""
-        parts = (self.disk, self.memory, self.folder / "told.json")
-        return ", ".join(f"no {part.name}" for part in parts if not part.is_file() or not part.stat().st_size)
+        """What is missing or other than it was kept; empty text: it is whole."""
+        return whole.lacks(self.folder, self.parts)
+
+    @property
+    def parts(self) -> tuple[Path, ...]:
+        """All that is kept."""
+        return self.disk, self.memory, self.folder / "told.json"
 
 
 def booted(image: Image, say: Say) -> Booted:
@@ -72,7 +77,8 @@ def booted(image: Image, say: Say) -> Booted:
     if not lacks:
         return made
     if made.folder.exists():
-        say(f"{made.folder} is not whole ({lacks}); it is booted anew")
+        clear(made.folder, lacks)
+        say(f"{made.folder} was not whole ({lacks}); it is booted anew")
     for old in image.folder.glob("booted-*"):  # of another QEMU, or not whole
         shutil.rmtree(old, ignore_errors=True)
     say("booting the emulated computer for the first time")
@@ -83,6 +89,7 @@ def booted(image: Image, say: Say) -> Booted:
             part.mkdir()
             seconds = _boot(folder, Booted(image, part))
         (part / "told.json").write_text(json.dumps({"seconds": seconds}))
+        whole.note(part, Booted(image, part).parts)
         part.replace(made.folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -104,8 +111,9 @@ def _boot(folder: Path, made: Booted) -> float:
             seconds = time.monotonic() - begun
             machine.run(*READ, seconds=60.0)
             machine.run("sync")
-        except Order as error:
-            raise CannotBench(f"the emulated computer has not come up well: {error}") from error
+        except (Order, CannotBench) as error:
+            wrong = f"the emulated computer has not come up well: {error}"
+            raise CannotBench(f"{wrong}\nif it never does: {remedy(made.image.folder)}") from error
         machine.keep(made.memory)
     return seconds
 

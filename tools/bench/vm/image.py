@@ -21,7 +21,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tools.bench.vm.places import LEASH, CannotBench, cache, discard, held, missing, workspace
+from tools.bench.vm import whole
+from tools.bench.vm.places import LEASH, CannotBench, cache, clear, discard, held, missing, workspace
 
 ROOT = Path(__file__).parents[3]
 GUEST = Path(__file__).parent / "guest"
@@ -81,9 +82,13 @@ class Image:
         return self.folder / "initrd"
 
     def lacks(self) -> str:
-        """What is missing or empty; empty text: it is whole."""
-        parts = (self.disk, self.kernel, self.initrd)
-        return ", ".join(f"no {part.name}" for part in parts if not part.is_file() or not part.stat().st_size)
+        """What is missing or other than it was made; empty text: it is whole."""
+        return whole.lacks(self.folder, self.parts)
+
+    @property
+    def parts(self) -> tuple[Path, ...]:
+        """All three."""
+        return self.disk, self.kernel, self.initrd
 
 
 def discard_parts(say: Say) -> None:
@@ -146,8 +151,8 @@ def image(say: Say) -> Iterator[Image]:
 def _see_to(made: Image, say: Say) -> None:
     """Make it where it is not there, or not whole; others that nobody uses go then."""
     if made.folder.exists() and (lacks := made.lacks()):
-        say(f"{made.folder} is not whole ({lacks}): it is made anew")
-        shutil.rmtree(made.folder, ignore_errors=True)
+        clear(made.folder, lacks)
+        say(f"{made.folder} was not whole ({lacks}): it is made anew")
     if reason := missing(build=not made.folder.exists()):
         raise CannotBench(reason)
     if not made.folder.exists():
@@ -262,6 +267,7 @@ def _make_image(folder: Path, made: Image, say: Say) -> None:
             disk.truncate(DISK_BYTES)
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
         _do(["mkfs.ext4", "-q", "-F", "-d", str(root), str(part / "disk")], "making the disk", {"PATH": path})
+        whole.note(part, Image(part).parts)
         part.replace(made.folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tools.bench.vm.image import Image
-from tools.bench.vm.places import LEASH, BrokenOff, CannotBench
+from tools.bench.vm.places import LEASH, BrokenOff, CannotBench, remedy
 
 BOOT_S, QUIT_S, LOOK_S, KEEP_S = 400.0, 10.0, 0.5, 120.0
 DEAF_S = 60.0
@@ -97,6 +97,9 @@ class Order(Exception):
 class Machine:
     """A running one. Made by :func:`started`."""
 
+    kept: Path | None = None
+    """The folder of what it goes on from."""
+
     def __init__(
         self, process: subprocess.Popen[bytes], folder: Path, ports: Ports, broken_off: threading.Event
     ) -> None:
@@ -122,13 +125,14 @@ class Machine:
             CannotBench: QEMU does not take the state, or nobody answers inside.
         """
         begun = time.monotonic()
-        self._until_status("paused", "taking the state that was kept")
-        self._agent, self._heard = self._connected("agent"), b""
-        self._monitor("cont")
         try:
+            self._until_status("paused", "taking the state that was kept")
+            self._agent, self._heard = self._connected("agent"), b""
+            self._monitor("cont")
             self.run("date", "-s", f"@{time.time():.3f}")
-        except Order as error:
-            raise CannotBench(f"the emulated computer does not go on: {error}") from error
+        except (Order, CannotBench) as error:
+            wrong = f"the emulated computer does not go on: {error}"
+            raise CannotBench(f"{wrong}\nif it never does: {remedy(self.kept)}" if self.kept else wrong) from error
         return time.monotonic() - begun
 
     def keep(self, path: Path) -> None:
@@ -168,7 +172,9 @@ class Machine:
             if left <= 0.0:
                 return None
             if select.select([self._agent], [], [], min(left, LOOK_S))[0]:
-                piece = self._agent.recv(65536)
+                piece = b""
+                with suppress(OSError):  # it may end at any word
+                    piece = self._agent.recv(65536)
                 if not piece:
                     raise self._cut()
                 self._heard += piece
@@ -386,5 +392,6 @@ def started(start: Start, folder: Path, ports: Ports, broken_off: threading.Even
             env=environment,
         )
         machine = Machine(process, folder, ports, broken_off)
+        machine.kept = start.memory.parent if start.memory else None
         stack.callback(machine.stop)
         yield machine

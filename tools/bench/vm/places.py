@@ -76,6 +76,21 @@ def workspace(name: str, room: int) -> Iterator[Path]:
         shutil.rmtree(folder)
 
 
+def remedy(folder: Path) -> str:
+    """What to do about something in the cache that is of no use."""
+    return (
+        f"remove {folder} as its owner or as root, then it is made anew; XDG_CACHE_HOME can name another place for "
+        "what is kept"
+    )
+
+
+def clear(folder: Path, lacks: str) -> None:
+    """Remove what is not whole; raises `CannotBench` where this user may not."""
+    shutil.rmtree(folder, ignore_errors=True)
+    if folder.exists():
+        raise CannotBench(f"{folder} is not whole ({lacks}), and this user may not remove it: {remedy(folder)}")
+
+
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
     """Meanwhile :func:`discard` of any process leaves the folder alone; who may only read it can hold it, too.

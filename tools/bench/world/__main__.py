@@ -22,12 +22,13 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
+from daemon.warmup import CannotLoad
 from hal.errors import HalError
 from tools.bench.against import SCENARIO, Before, CannotCompare, digest, read
 from tools.bench.report import About, CannotReport, Result, demand_apart, demand_room, facts, write
 from tools.bench.world import agreement
 from tools.bench.world.judge import Played, judged, pictures
-from tools.bench.world.local import robot
+from tools.bench.world.local import robot, warm
 from tools.bench.world.robotside import write_config
 from tools.bench.world.scenario import BUILT_IN, Scenario, find, load
 from tools.bench.world.stage import LINES, CannotPlay, Ends, is_line, is_port, play
@@ -145,7 +146,9 @@ def ends_of(options: argparse.Namespace) -> Ends:
 
 @contextmanager
 def opposite(options: argparse.Namespace, scenario: Scenario) -> Generator[Ends]:
-    """The robot computer: the one that is named, or a process here."""
+    """The robot computer: the one that is named, or a process here, which finds all of its kernels compiled."""
+    if options.local:
+        warm(scenario.world.lamps, say)
     with robot(scenario) if options.local else nullcontext(ends_of(options)) as ends:
         yield ends
 
@@ -228,7 +231,7 @@ def main(arguments: list[str] | None = None) -> int:
             with opposite(options, left[0]) as ends:
                 results += tried(left[0], ends, options.twin)
             del left[0]
-    except (CannotPlay, CannotCompare, CannotReport, HalError, ValueError, OSError) as reason:
+    except (CannotPlay, CannotLoad, CannotCompare, CannotReport, HalError, ValueError, OSError) as reason:
         why = f"cannot be played: {reason}"
     except KeyboardInterrupt:
         why = "ended before its end"

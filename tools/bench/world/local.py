@@ -8,15 +8,35 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from daemon import warmup
 from tools.bench.report import ROOT
 from tools.bench.vm.places import LEASH
 from tools.bench.world.scenario import Scenario
-from tools.bench.world.stage import Ends
+from tools.bench.world.stage import CannotPlay, Ends
 from tools.sim.serve_light import write_plan
+
+
+def warm(lamps: bool, say: Callable[[str], None]) -> None:
+    """Compile what the daemon will load before anybody waits for its pose; that is said where it takes its time.
+
+    In another process, as the daemon is one: this one keeps its memory for the world.
+
+    Raises:
+        CannotPlay: it cannot be compiled; says why. CannotLoad: there is nowhere to keep it.
+    """
+    light = ["--set", "photodiode.bus=unix:/bus"] if lamps else []
+    command = [*LEASH, sys.executable, "-m", "daemon", "warm", *light]
+
+    def compiles() -> None:
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        if done.returncode:
+            raise CannotPlay(f"the daemon's kernels are not compiled: {done.stderr.strip()}")
+
+    warmup.load_aloud(say, "warm-lights" if lamps else "warm", compiles)
 
 
 @contextmanager
