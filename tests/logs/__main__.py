@@ -27,7 +27,7 @@ def checked(entry: Entry, root: Path | None) -> golden.Verdict:
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
     try:
-        return golden.compared(entry.name, ledger.final(), [loop for _, loop in ledger.loops], entry.every)
+        return golden.held(entry.name, ledger, entry.every)
     except golden.Damaged as error:
         return golden.Verdict(False, str(error))
 

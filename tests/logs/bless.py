@@ -22,25 +22,33 @@ if TYPE_CHECKING:
 
 
 def bless(entry: Entry, root: Path | None, reason: str, into: Path | None = None) -> str:
-    """Write one golden file, or this machine's own ``into`` a folder; returns what changed, for people."""
+    """Write one log's golden files, or this machine's own ``into`` a folder; returns what changed, for people."""
     from tests.logs import golden
-    from tests.logs.catalog import ledger_of, origin, replayed
+    from tests.logs.catalog import ledger_of, replayed
 
     with tempfile.TemporaryDirectory() as folder:
         ledger = ledger_of(replayed(entry, root, Path(folder)))
-    trajectory, loops = ledger.final(), [loop for _, loop in ledger.loops]
-    before = (into or golden.FOLDER) / f"{entry.name}.txt"
+    loops = [loop for _, loop in ledger.loops]
+    told = golden.both(entry.name, ledger)
+    return "\n".join(_bless(name, entry, trajectory, loops, reason, into) for name, trajectory in told.items())
+
+
+def _bless(name: str, entry: Entry, trajectory: Trajectory, loops: list[Loop], reason: str, into: Path | None) -> str:
+    """Write one file; what changed."""
+    from tests.logs import golden
+    from tests.logs.catalog import origin
+
     moved = "new"
-    if before.exists():
+    if ((into or golden.FOLDER) / f"{name}.txt").exists():
         try:
-            moved = _moved(golden.load(entry.name, into), entry, trajectory, loops)
+            moved = _moved(golden.load(name, into), entry, trajectory, loops)
         except golden.Damaged as error:
             moved = f"new, what was there is damaged: {error}"
         if not moved:
-            return f"{entry.name}: unchanged"
+            return f"{name}: unchanged"
     facts = golden.facts_of(trajectory, loops, origin(entry), reason)
-    path = golden.save(entry.name, trajectory, entry.every, facts, into)
-    return f"{entry.name}: {moved}; {path}"
+    path = golden.save(name, trajectory, entry.every, facts, into)
+    return f"{name}: {moved}; {path}"
 
 
 def _moved(old: golden.Golden, entry: Entry, trajectory: Trajectory, loops: list[Loop]) -> str:

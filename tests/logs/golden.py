@@ -1,9 +1,11 @@
 """Golden trajectories: small text files that say where the robot was, when replay was last blessed, and why.
 
 A change of the estimator changes them; the change is then looked at, and blessed in the same commit with its reason.
-The file holds one pose in many and a digest of all. Kernels compiled for another processor round differently, so the
-tight tolerance counts only where versions and processor are those of the blessing. On another machine the tight one
-counts against a reference of its own, where one was made (``bless --here``); it is not committed.
+Of each log there are two files: the poses as they are at the end, and as they were published live (``NAME.live``),
+which no loop that is closed later has put right. A file holds one pose in many and a digest of all. Kernels compiled
+for another processor round differently, so the tight tolerance counts only where versions and processor are those of
+the blessing. On another machine the tight one counts against a reference of its own, where one was made
+(``bless --here``); it is not committed.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import llvmlite.binding
 import numpy as np
 import numpy.typing as npt
 
+from daemon.ledger import Ledger
 from daemon.results import Trajectory, tum
 from daemon.versions import versions
 from estimator.result import Loop
@@ -96,6 +99,18 @@ def judged(blessed: Golden, trajectory: Trajectory, loops: Sequence[Loop], every
     return Verdict(not wrong, said)
 
 
+def both(name: str, ledger: Ledger) -> dict[str, Trajectory]:
+    """By the names of their files: the poses at the end, and those published live, with their states."""
+    return {name: ledger.final(), f"{name}.live": ledger.online()}
+
+
+def held(name: str, ledger: Ledger, every: int) -> Verdict:
+    """Of one replay: both of its trajectories against what was blessed; see :func:`compared`."""
+    loops = [loop for _, loop in ledger.loops]
+    verdicts = [compared(file, told, loops, every) for file, told in both(name, ledger).items()]
+    return Verdict(all(one.same for one in verdicts), "; live, ".join(one.said for one in verdicts))
+
+
 def compared(name: str, trajectory: Trajectory, loops: Sequence[Loop], every: int) -> Verdict:
     """With the committed file; where that is of another machine also with this one's reference, if there is one.
 
@@ -150,7 +165,11 @@ def load(name: str, folder: Path | None = None) -> Golden:
     """
     path = (folder or FOLDER) / f"{name}.txt"
     facts = {}
-    for line in path.read_text().splitlines():
+    try:
+        text = path.read_text()
+    except FileNotFoundError as error:
+        raise Damaged(f"{path}: no such file; git checkout it, or bless it anew: {REMEDY}") from error
+    for line in text.splitlines():
         if line.startswith("# "):
             key, _, value = line[2:].partition(": ")
             facts[key] = value

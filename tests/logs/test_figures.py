@@ -25,10 +25,8 @@ def cases() -> list[object]:
 
 
 @pytest.mark.parametrize("entry", cases())
-def test_the_trajectory_is_the_blessed_one(entry: Entry, outcome_of: Replayed) -> None:
-    ledger = ledger_of(outcome_of(entry.name))
-    loops = [loop for _, loop in ledger.loops]
-    verdict = golden.compared(entry.name, ledger.final(), loops, entry.every)
+def test_the_trajectories_are_the_blessed_ones(entry: Entry, outcome_of: Replayed) -> None:
+    verdict = golden.held(entry.name, ledger_of(outcome_of(entry.name)), entry.every)
     assert verdict.same, f"{entry.name}: {verdict.said}; look at the change; if it is meant: {golden.REMEDY}"
 
 
