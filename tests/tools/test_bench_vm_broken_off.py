@@ -28,7 +28,14 @@ image._install = lambda folder, root, say: image._do(["sh", "-c", script], "inst
 sys.exit(command.main())
 """
 """A step that starts others and mounts something, and one beside it in another thread."""
-BASE = "from tests.systemd import container; container.base()"
+BASE = """
+import sys
+from pathlib import Path
+from tests.systemd import container
+from tools.bench.vm import places
+places.MEMORY = Path(sys.argv.pop())
+container.base()
+"""
 DEBIAN = """#!/bin/sh
 mount -t tmpfs {place.name} {place}
 touch {place}/there
@@ -76,7 +83,8 @@ def test_what_makes_the_containers_base_ends_with_the_session_and_leaves_no_moun
     (programs / "mmdebstrap").chmod(0o755)
     cache = tmp_path / "cache"
     path = f"{programs}:{os.environ['PATH']}"
-    assert _broken_off([sys.executable, "-c", BASE], number, place, PATH=path, XDG_CACHE_HOME=str(cache)) != 0
+    command = [sys.executable, "-c", BASE, str(tmp_path)]
+    assert _broken_off(command, number, place, PATH=path, XDG_CACHE_HOME=str(cache)) != 0
     assert [one for one in cache.rglob("*") if one.is_file()] == []
 
 
