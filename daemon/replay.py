@@ -178,9 +178,10 @@ def start_for(source: Source, used: Config, lights: Lights | None, given: Given)
         if named or any(key.startswith("map.") for key in given.keys):
             store, start = started(used.map, lights, mend=False)
             if store is not None and start is None:
+                lacks = f"{store.folder} holds no map that can be used"
                 if "map.folder" in given.keys:
-                    raise DataInvalid(str(store.folder), "it holds no map that can be used", "or --set map.folder=none")
-                source.report.notes.append(f"{store.folder} holds no map that can be used: replayed without one")
+                    raise DataInvalid(str(source.path), lacks, "name another folder, or --set map.folder=none")
+                source.report.notes.append(f"{lacks}: replayed without one")
             return start
         if not source.recorded or MAP not in source.header:
             return None
@@ -263,9 +264,8 @@ def _verdict(outcome: Outcome) -> int:
         return cli.fail("none of the matches asked for is in the log; the other results are written")
     log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
     speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
-    sys.stderr.write(f"replay: {len(rerun.ledger)} poses, {speed}\n")
-    if said := guessed(rerun.ledger.online()):
-        sys.stderr.write(f"replay: {said}\n")
+    for sentence in filter(None, (f"{len(rerun.ledger)} poses, {speed}", guessed(rerun.ledger.online()))):
+        sys.stderr.write(f"replay: {sentence}\n")
     return cli.OK
 
 

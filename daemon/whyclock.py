@@ -9,8 +9,6 @@ of its part, and whatever is told around it as well.
 from __future__ import annotations
 
 import json
-import struct
-import zlib
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -20,12 +18,10 @@ from daemon.disk import CLOCK, STEP_S
 from daemon.flight import ABOUT
 from daemon.moment import state_beside
 from daemon.whymoment import clock
-from hal.replay.recording import HEAD, MAGIC
+from hal.replay.recording import header_of
 
 EVER_S: Final = 1e11
 """Beyond the year 5000."""
-_START: Final = struct.Struct(HEAD["head of a segment"])
-_CRC: Final = struct.Struct("<I")
 
 Pair = tuple[float, float]
 """Both clocks at one moment, s: ``t_mono``, UTC."""
@@ -45,7 +41,7 @@ def parts(folder: Path, segments: Sequence[Path], begun: Pair, t_mono: float) ->
     Where no segment says them (they are of older software), a dump that does counts for all that is in it: it was made
     at its end, and clocks are set soon after a start. When that was is not known.
     """
-    told = [pair for segment in segments if (pair := _of_head(segment)) is not None]
+    told = [pair for segment in segments if (pair := _of(header_of(segment))) is not None]
     dumped = _of_dump(folder)
     if dumped is not None and not told:
         step = _ahead(dumped) - _ahead(begun)
@@ -89,20 +85,6 @@ def pair_of(t_mono: Any, t_utc: Any) -> Pair | None:
 def _of(header: Any) -> Pair | None:
     told = header.get(CLOCK) if isinstance(header, dict) else None
     return pair_of(*told) if isinstance(told, list) and len(told) == 2 else None
-
-
-def _of_head(segment: Path) -> Pair | None:
-    """Of a segment's head alone: segments are large."""
-    try:
-        with segment.open("rb") as file:
-            start = file.read(_START.size)
-            length = _START.unpack(start)[2] if start.startswith(MAGIC) else 0
-            text, crc = file.read(length), file.read(_CRC.size)
-        if _CRC.unpack(crc)[0] != zlib.crc32(start + text):
-            return None
-        return _of(json.loads(text))
-    except (OSError, struct.error, ValueError, RecursionError):  # whoever replays a torn head says that it is torn
-        return None
 
 
 def _of_state(segments: Sequence[Path]) -> list[Pair]:

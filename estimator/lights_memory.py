@@ -40,10 +40,10 @@ def fresh_gains(lights: Lights) -> Learned:
     return learned
 
 
-def new_variance(lights: Lights, lamp_id: int) -> Array:
-    """Of a lamp of which nothing has been learned."""
-    lean = lights.settings.model.lean
-    return np.array((lights.catalogue.by_id[lamp_id].sigma_ln, lean, lean)) ** 2
+def new_variance(lights: Lights, lamp_id: int) -> tuple[float, float, float]:
+    """Of (ln gain, lean x, lean y) of a lamp of which nothing has been learned."""
+    gain, lean = lights.catalogue.by_id[lamp_id].sigma_ln, lights.settings.model.lean
+    return gain * gain, lean * lean, lean * lean
 
 
 def gains_known(lights: Lights) -> Learned:
@@ -58,8 +58,7 @@ def expected_of(lights: Lights, lamp_id: int) -> tuple[Sequence[float], Sequence
     """
     if known := lights.recalled.get(lamp_id):
         return known[0].tolist(), known[1].tolist()
-    gain, lean = lights.catalogue.by_id[lamp_id].sigma_ln, lights.settings.model.lean
-    return (0.0, 0.0, 0.0), (gain * gain, lean * lean, lean * lean)
+    return (0.0, 0.0, 0.0), new_variance(lights, lamp_id)
 
 
 def bend(lights: Lights, used: list[Sight]) -> None:

@@ -250,6 +250,19 @@ def open_recording(path: Path) -> Recording:
     raise DataInvalid(str(segments[0]), "not a recording: no segment has a readable head", "check the path")
 
 
+def header_of(segment: Path) -> dict[str, Any] | None:
+    """A segment's header, and no more of it is read; None where it cannot be read, or is damaged."""
+    try:
+        with segment.open("rb") as file:
+            start = file.read(_START.size)
+            whole = len(start) == _START.size and start.startswith(MAGIC)
+            length = min(_START.unpack(start)[2], segment.stat().st_size) if whole else 0  # a damaged one asks for all
+            rest = file.read(length + _CRC.size)
+    except OSError:
+        return None
+    return _read_head(start + rest)[0]
+
+
 def looks_like_recording(head: bytes) -> bool:
     """Whether a file beginning with ``head`` is a segment."""
     return head.startswith(MAGIC)
@@ -280,7 +293,7 @@ def _read_head(data: bytes) -> tuple[dict[str, Any] | None, int]:
         return None, 0
     try:
         header = json.loads(data[_START.size : end])
-    except ValueError:  # the sum is right, and yet it is no JSON: not ours
+    except (ValueError, RecursionError):  # the sum is right, and yet it is no JSON: not ours
         return None, 0
     return (header, end + _CRC.size) if isinstance(header, dict) else (None, 0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import subprocess
@@ -128,9 +129,9 @@ def test_a_computer_that_does_not_come_up_leaves_nothing_half_done(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_was_kept_is_not_gone_on_from_where_it_is_not_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def stood_in_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first boot that takes no time."""
+
     def boots(folder: Path, made: booted.Booted) -> float:
         made.disk.write_bytes(b"x")
         made.memory.write_bytes(b"x")
@@ -138,6 +139,12 @@ def test_what_was_kept_is_not_gone_on_from_where_it_is_not_whole(
 
     monkeypatch.setattr(booted, "QEMU", "echo")
     monkeypatch.setattr(booted, "_boot", boots)
+
+
+def test_what_was_kept_is_not_gone_on_from_where_it_is_not_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stood_in_for(monkeypatch)
     said: list[str] = []
     assert booted.booted(image.Image(tmp_path), said.append).seconds == 31.5
     assert booted.booted(image.Image(tmp_path), said.append).lacks() == ""
@@ -175,3 +182,15 @@ def test_a_qemu_that_says_nothing_any_more_is_told(tmp_path: Path, monkeypatch: 
         machine._monitor("cont")
     machine.stop()
     listener.close()
+
+
+def test_a_first_boot_takes_the_place_of_a_killed_one_of_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stood_in_for(monkeypatch)
+    left = tmp_path / f"part-{os.getpid()}"
+    left.mkdir()
+    (left / "rest").touch()
+    made = booted.booted(image.Image(tmp_path), lambda text: None)
+    assert made.seconds == 31.5
+    assert not (made.folder / "rest").exists()

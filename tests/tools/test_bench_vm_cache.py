@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.bench.vm import booted, image, places
+from tools.bench.vm import image, places
 from tools.bench.vm.whole import note
 
 ROOT = Path(__file__).parents[2]
@@ -116,21 +116,3 @@ def test_what_a_killed_first_boot_has_left_is_removed(number: int, cache: Path) 
         assert not left.exists()
         assert others.exists(), "that process goes on"
     assert said == [f"removing {left}: left half done by a process that was ended"]
-
-
-def test_a_first_boot_takes_the_place_of_a_killed_one_of_its_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def boots(folder: Path, made: booted.Booted) -> float:
-        made.disk.write_bytes(b"x")
-        made.memory.write_bytes(b"x")
-        return 31.5
-
-    monkeypatch.setattr(booted, "QEMU", "echo")
-    monkeypatch.setattr(booted, "_boot", boots)
-    left = tmp_path / f"part-{os.getpid()}"
-    left.mkdir()
-    (left / "rest").touch()
-    made = booted.booted(image.Image(tmp_path), lambda text: None)
-    assert made.seconds == 31.5
-    assert not (made.folder / "rest").exists()

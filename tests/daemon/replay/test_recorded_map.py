@@ -93,7 +93,7 @@ def test_a_named_folder_without_a_map_is_refused_one_of_a_configuration_is_noted
     words = ["replay", str(run[0] / "first"), "--out", str(tmp_path / "out")]
     assert cli.main([*words, "--set", f"map.folder={empty}"]) == cli.FAILED
     said = capsys.readouterr().err
-    assert f"{empty}: it holds no map that can be used" in said
+    assert f"{empty} holds no map that can be used (name another folder" in said
     assert "--set map.folder=none" in said
     assert cli.main([*words, "--set", "map.folder=none"]) == cli.OK
     assert "holds no map" not in capsys.readouterr().err

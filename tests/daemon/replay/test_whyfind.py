@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from daemon.why import NoMoment, Span, find, meant, whole_second, width
+from tests.daemon.replay.zones import BERLIN, local_time
 
 AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
 SPAN = Span(Path("rec"), AT, AT + 3600.0, AT - 100.0)
@@ -77,12 +77,8 @@ def test_what_is_no_time_is_refused_with_the_ways_to_write_one(words: str) -> No
 
 
 def test_a_time_beyond_all_calendars_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as there:
-        there.setenv("TZ", "EST5")
-        time.tzset()
-        with pytest.raises(NoMoment, match="write 21:14:07"):
-            meant("9999-12-31T23:59", SPAN)
-    time.tzset()
+    with local_time(monkeypatch, "EST5"), pytest.raises(NoMoment, match="write 21:14:07"):
+        meant("9999-12-31T23:59", SPAN)
 
 
 def test_of_two_recordings_the_one_with_more_before_it_is_taken() -> None:
@@ -135,12 +131,8 @@ def test_how_wide_that_is(words: str, wide: float) -> None:
 
 @pytest.fixture
 def berlin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Summer time ends on 2026-10-25 at 03:00."""
-    with monkeypatch.context() as there:
-        there.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
-        time.tzset()
+    with local_time(monkeypatch, BERLIN):
         yield
-    time.tzset()
 
 
 def instant(text: str) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -15,6 +14,7 @@ from daemon.publish.snapshot import Snapshot, State
 from daemon.reasons import Reason
 from daemon.whymoment import Moment, chosen, clock, first_change, moment_of, of_day
 from daemon.whysaid import report
+from tests.daemon.replay.zones import BERLIN, local_time
 
 AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
 NOTHING = Snapshot(1, 1.0, 1.0, 0.0, State.DEGRADED, Reason.NONE)
@@ -24,11 +24,8 @@ WELL = Moment(0.0, State.DEGRADED, NOTHING, None, None, True, None, 0, ())
 @pytest.fixture(autouse=True)
 def utc(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Times are printed as local ones."""
-    with monkeypatch.context() as there:
-        there.setenv("TZ", "UTC0")
-        time.tzset()
+    with local_time(monkeypatch, "UTC0"):
         yield
-    time.tzset()
 
 
 def cycles(*after: float, fault: float) -> list[Moment]:
@@ -119,8 +116,5 @@ def test_before_its_first_cycle_no_time_is_less_than_none() -> None:
 def test_a_time_is_told_with_the_offset_of_its_own_day_and_hour(
     utc: float, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as there:
-        there.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
-        time.tzset()
+    with local_time(monkeypatch, BERLIN):
         assert clock(utc) == said
-    time.tzset()

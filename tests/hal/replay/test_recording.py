@@ -15,11 +15,15 @@ from hal.errors import DataInvalid, DeviceMissing
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from hal.replay.recording import (
+    HEAD,
     LONGEST,
+    MAGIC,
     MARKER,
+    VERSION,
     Frame,
     Kind,
     Recording,
+    header_of,
     open_recording,
     pack_frame,
     pack_head,
@@ -193,3 +197,22 @@ def test_megabytes_of_what_looks_like_records_take_no_hours(tmp_path: Path) -> N
     frames, _ = read(tmp_path / segment_name(0))
     assert frames == FRAMES[:3]
     assert time.thread_time() - begin < 40.0  # half a second on an idle machine; hours with every sum computed
+
+
+def test_a_header_is_read_without_the_records_behind_it(tmp_path: Path) -> None:
+    segment = tmp_path / "000000.lumilog"
+    whole = pack_head({"recording": "a", "segment": 0})
+    segment.write_bytes(whole + b"whatever follows")
+    assert header_of(segment) == {"recording": "a", "segment": 0}
+    too_long = whole[: whole.index(b"{") - 4] + b"\xff" * 4 + whole[whole.index(b"{") :]
+    too_deep = b"[" * 100_000
+    for damaged in (b"", whole[:3], whole[:-1], whole[:-1] + b"x", too_long, deep_head(too_deep)):
+        segment.write_bytes(damaged)
+        assert header_of(segment) is None
+    assert header_of(tmp_path / "none") is None
+
+
+def deep_head(text: bytes) -> bytes:
+    """A head with a right sum over a text that is no header."""
+    start = struct.pack(HEAD["head of a segment"], MAGIC, VERSION, len(text)) + text
+    return start + struct.pack("<I", zlib.crc32(start))

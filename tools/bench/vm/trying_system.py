@@ -145,7 +145,7 @@ def answers_modbus(bench: Bench) -> Seen:
         answered = sum(bool(bench.read(over_tcp, tries=1)) for _ in range(ASKED))
         each = 1e3 * (time.monotonic() - begun) / ASKED
         figures.append(
-            Figure(f"{name}: answered", 100.0 * answered / ASKED, "%", "less", 0.0, 100.0 * LOST_UDP / ASKED)
+            Figure(f"{name}: answered", 100.0 * answered / ASKED, "%", "less", 0.0, 100.0 * may_be_lost / ASKED)
         )
         figures.append(Figure(f"{name}: a read takes", each, "ms"))
         if answered < ASKED - may_be_lost:
