@@ -213,8 +213,8 @@ def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest
     assert f"{maps}: no map in it yet{words}" in said()
     other.save(content(Shape(submaps=3, map_id=7)), 7)
     assert f"of 3 submaps is good{words}" in said()
-    assert "403" not in said("--set", "map.localise=true"), "nothing is kept then"
+    assert "fault 403" not in said("--set", "map.localise=true"), "nothing is kept then"
     other.close()
-    assert "403" not in said()
+    assert "fault 403" not in said()
     (maps / "lock").chmod(0o444)
-    assert ("403" in said()) is (os.geteuid() != 0), "root may write everywhere"
+    assert ("fault 403" in said()) is (os.geteuid() != 0), "root may write everywhere"
