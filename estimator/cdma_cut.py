@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma_kernels import invert
+from estimator.cdma_kernels import first_from, invert
 from estimator.cdma_newton import reduce_rows
 from estimator.kernel import kernel
 
@@ -44,7 +44,7 @@ def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8)
         for p in range(periods):
             bounds[i, p] = at
             limit = (length - phase) / lamps[1, i]
-            at += np.searchsorted(x[at:], limit)
+            at = first_from(x, at, limit)
             phase -= length
         bounds[i, periods] = size
     count = 0

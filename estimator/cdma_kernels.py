@@ -14,6 +14,23 @@ F4 = npt.NDArray[np.float32]
 I8 = npt.NDArray[np.int64]
 
 
+@kernel("i8(f8[:], i8, f8)", inner=True)
+def first_from(x: F8, begin: int, limit: float) -> int:
+    """Index of the first of (N,) times, non-decreasing, that is ``limit`` or later, from ``begin`` on; N: none is.
+
+    `np.searchsorted` would have every start that finds this kernel compiled load numba's part that asks for scipy's
+    BLAS, and scipy with it: half of what loading the decoder takes, and 16 MB.
+    """
+    low, high = begin, x.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if x[middle] < limit or limit != limit:  # no number: behind all of them, as numpy has it
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @kernel("i8[:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1])")
 def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) -> I8:
     """Received waveform of each lamp at amplitude 1, and its derivative with respect to the code phase.
@@ -41,7 +58,7 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
         begin, period = 0, 0
         while begin < n_samples and period < signs.shape[1]:
             bounds[i, period] = begin
-            sign, end = signs[i, period], begin + np.searchsorted(samples[0, begin:], (length - phase) / rate)
+            sign, end = signs[i, period], first_from(samples[0], begin, (length - phase) / rate)
             sent[0] = chips[i, length - 1] * before
             for c in range(length):
                 sent[c + 1] = chips[i, c] * sign

@@ -179,10 +179,13 @@ def test_a_first_start_waits_for_another_and_says_so(
     assert f"it holds {tmp_path / 'lock'}" in caplog.text
 
 
-def test_a_start_loads_nothing_it_does_not_use() -> None:
+@pytest.mark.parametrize("overrides", [(), ("photodiode.bus=/dev/i2c-1",)])
+def test_a_start_loads_nothing_it_does_not_use(overrides: tuple[str, ...]) -> None:
     """scipy alone would cost a third of a warm start and 17 MB; it is there for work that is not done at the start."""
     code = (
-        "import sys; import daemon.main; from daemon import warmup; warmup.load()\n"
+        "import sys; import daemon.main; from daemon import warmup\n"
+        "from daemon.configfile import load; from daemon.lights import load_lights\n"
+        f"lit = warmup.load(load_lights(load(None, {overrides}))).code_us > 0.0; assert lit is {bool(overrides)}\n"
         "heavy = {'scipy.linalg', 'scipy.sparse', 'scipy.spatial', 'pymodbus.server', 'serial', 'matplotlib'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimator import cdma_cut, cdma_kernels
 from estimator.cdma_profile import PROFILE_A
@@ -33,6 +36,16 @@ def slow_value(chips: np.ndarray, signs: np.ndarray, u: float) -> float:
 
     k = int(np.floor(u))
     return chip(k) * pulse(0, u - k) + chip(k - 1) * pulse(1, u - k)
+
+
+@given(
+    times=st.lists(st.sampled_from([-math.inf, -2.0, -1.0, 0.0, 0.5, 1.0, 3.0, math.inf]), max_size=40).map(sorted),
+    begin=st.integers(0, 40),
+    limit=st.sampled_from([-math.inf, -1.5, -1.0, 0.0, 0.5, 2.0, 3.0, math.inf, math.nan]),
+)
+def test_the_first_time_from_a_limit_on(times: list[float], begin: int, limit: float) -> None:
+    x, begin = np.array(times), min(begin, len(times))
+    assert cdma_kernels.first_from(x, begin, limit) == begin + np.searchsorted(x[begin:], limit)
 
 
 def test_columns_follow_the_code_with_its_signs() -> None:

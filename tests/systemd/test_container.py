@@ -261,9 +261,11 @@ def test_it_is_removed_without_a_trace_but_what_it_has_learned(machine: Containe
     machine.run("dpkg", "--remove", "lumiloop")
     places = [machine.root / place for place in ("opt", "usr/bin", "usr/lib", "usr/share")]
     assert [path for place in places for path in place.rglob("*lumiloop*")] == []
-    assert (machine.root / "etc/lumiloop/lumiloop.toml").exists()
+    own = [machine.root / place for place in ("etc/lumiloop/lumiloop.toml", "var/lib/private/lumiloop", CACHE)]
+    assert [path for path in own if not path.exists()] == []
     machine.run("dpkg", "--purge", "lumiloop")
-    assert not (machine.root / "etc/lumiloop").exists()
+    kept = [machine.root / place for place in ("etc", "var/lib/private", "var/lib", "var/cache/private", "var/cache")]
+    assert [path for place in kept for path in place.glob("lumiloop*")] == []
 
 
 def _main(machine: Container) -> int:

@@ -15,7 +15,7 @@ import pytest
 
 from tools.bench.report import About, Figure, Result, Seen, write
 from tools.bench.vm import __main__ as command
-from tools.bench.vm import common, trying_removal, trying_system
+from tools.bench.vm import common, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.machine import Order
 from tools.bench.world import agreement
@@ -103,11 +103,11 @@ def test_a_slower_computer_may_be_later(
 
 
 def test_what_a_busy_computer_keeps_waiting_is_slow_too() -> None:
-    told = {"worked": iter([3.0, 3.5]), "waited": iter([1.0, 1.3])}
+    told = {"worked": iter([3.0, 3.5, 4.0, 4.5, 5.0, 5.5]), "waited": iter([1.0, 1.9, 2.0, 2.3, 3.0, 3.4])}
     machine = SimpleNamespace(
         run=lambda *_: "", worked_s=lambda: next(told["worked"]), waited_s=lambda: next(told["waited"])
     )
-    assert common.pace(machine) == pytest.approx(0.8)  # type: ignore[arg-type]  # all that is asked
+    assert common.pace(machine) == pytest.approx(0.8)  # type: ignore[arg-type]  # the least of them
 
 
 def test_a_drive_whose_end_was_left_undone_agrees_until_then(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,30 +144,6 @@ def test_a_place_that_nobody_claims_is_compared_with_nothing() -> None:
     nowhere.memory["drive"] = [Heard(0.2, 0.2, 1, None, 0.0)] * 20
     with pytest.raises(Order, match="no pose of the drive claims a place"):
         trying_system.agrees_with_outside(nowhere)
-
-
-FILES = {
-    "installed": {"/opt/lumiloop", "/usr/bin/lumiloop"},
-    "own": {"/etc/lumiloop", "/etc/lumiloop/lumiloop.toml", "/var/lib/lumiloop", "/var/lib/private/lumiloop"},
-}
-
-
-@pytest.mark.parametrize("kept", ["", "/opt/lumiloop", "/var/lib/private/lumiloop", "/usr/bin/lumiloop"])
-def test_what_is_left_of_a_removed_package_is_named(kept: str) -> None:
-    there = set().union(*FILES.values())
-
-    def run(*words: str, **more: object) -> str:
-        if words[0] == "dpkg":
-            there.difference_update(FILES["installed" if words[1] == "--remove" else "own"] - {kept})
-        if words[0] == "sh":
-            return "\n".join(path for path in words[2].split() if path in there)
-        return "inactive"
-
-    if not kept:
-        assert trying_removal.is_removed(inside(run)) == "nothing is left"
-    else:
-        with pytest.raises(Order, match=f"left: .*{kept}"):
-            trying_removal.is_removed(inside(run))
 
 
 def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(

@@ -27,7 +27,7 @@ from tools.bench.vm.places import LEASH, CannotBench, cache, clear, discard, hel
 ROOT = Path(__file__).parents[3]
 GUEST = Path(__file__).parent / "guest"
 SUITE = "bookworm"
-PACKAGES = ("systemd", "systemd-sysv", "dbus", "udev", "python3", "kmod", "iproute2", "linux-image-amd64")
+PACKAGES = ("systemd", "systemd-sysv", "udev", "python3", "kmod", "iproute2", "linux-image-amd64")
 ONLY_TO_BUILD = ("linux-headers-amd64", "gcc", "make")
 SMALL_RAM_DISK = "MODULES=list\nCOMPRESS=lz4\n"
 IN_RAM_DISK = "virtio_pci\nvirtio_blk\next4\n"
@@ -307,7 +307,7 @@ def _furnish(root: Path) -> None:
     places = {
         "agent.py": "usr/lib/bench/agent.py",
         "bench-agent.service": "etc/systemd/system/bench-agent.service",
-        "10-eth0.network": "etc/systemd/network/10-eth0.network",
+        "bench-network.service": "etc/systemd/system/bench-network.service",
         "generic.conf": "etc/systemd/system/lumiloop.service.d/generic.conf",
         "lumiloop.toml": "etc/lumiloop/lumiloop.toml",
     }
@@ -319,7 +319,7 @@ def _furnish(root: Path) -> None:
     shutil.copy(GUEST / "generic.conf", warm_up)
     (root / "etc/hostname").write_text("robot\n")
     (root / "var/log/journal").mkdir(exist_ok=True)
-    _do(["chroot", str(root), "systemctl", "enable", "-q", "bench-agent", "systemd-networkd"], "enabling units")
+    _do(["chroot", str(root), "systemctl", "enable", "-q", "bench-agent", "bench-network"], "enabling units")
     timers = ["apt-daily.timer", "apt-daily-upgrade.timer", "e2scrub_all.timer", "fstrim.timer", "dpkg-db-backup.timer"]
     _do(["chroot", str(root), "systemctl", "mask", "-q", *timers, "e2scrub_reap.service"], "masking timers")
 

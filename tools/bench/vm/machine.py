@@ -28,6 +28,7 @@ UNUSED = (
     *(f"{unit}.service" for unit in ("serial-getty@ttyS0", "getty@tty1", "systemd-logind", "systemd-binfmt")),
     *(f"{unit}.service" for unit in ("systemd-update-utmp", "systemd-update-utmp-runlevel")),
     *(f"modprobe@{module}.service" for module in ("dm_mod", "efi_pstore", "fuse", "loop")),
+    "systemd-network-generator.service",
     "dev-hugepages.mount",
     "proc-sys-fs-binfmt_misc.automount",
 )

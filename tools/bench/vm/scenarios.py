@@ -16,16 +16,15 @@ from tools.bench.vm import (
     trying_devices,
     trying_photodiode,
     trying_process,
-    trying_removal,
     trying_surroundings,
     trying_system,
 )
 from tools.bench.vm.common import WRITTEN, Scenario
 
 PARTS: Final = (
-    (trying_system, trying_devices),
-    (trying_photodiode,),
-    (trying_process, trying_computer, trying_surroundings, trying_removal),
+    (trying_system, trying_devices, trying_surroundings),
+    (trying_photodiode, trying_process),
+    (trying_computer,),
 )
 SHARES: Final[list[list[Scenario]]] = [
     [one for part in parts for one in WRITTEN if one.__module__ == part.__name__] for parts in PARTS

@@ -11,8 +11,8 @@ import struct
 import time
 from typing import Final
 
-from tools.bench.vm.bench import PLACED, UNIT, Bench
-from tools.bench.vm.common import TRACKING_S, back, begin, come_up, map_id, need, same_process, scenario, start
+from tools.bench.vm.bench import PLACED, Bench
+from tools.bench.vm.common import TRACKING_S, begin, come_up, need, same_process, sampled, scenario, start
 from tools.bench.vm.machine import OUTSIDE
 
 PHOTODIODE: Final = '[photodiode]\nbus = "adapter:bench"\nconverter = "mcp3221@0x4d"\n'
@@ -39,7 +39,7 @@ def reads_the_converter(bench: Bench) -> str:
     """A photodiode on a real /dev/i2c-N: found by its adapter's name, opened by its group, read in blocks."""
     nodes = bench.machine.run("sh", "-c", "stat -c '%n %G %a' /dev/i2c-*").strip()
     need("i2c 660" in nodes, nodes)
-    bench.until("samples", 60.0, lambda: _sampled(bench))
+    bench.until("samples", 60.0, lambda: sampled(bench))
     _sound(bench)
     return f"{nodes}; {_blocks(bench)} blocks"
 
@@ -50,11 +50,6 @@ def _sound(bench: Bench) -> None:
     before = _blocks(bench)
     bench.until("blocks of samples", 20.0, lambda: (_blocks(bench) - before) % 2**32 >= ENOUGH)
     bench.placed(TRACKING_S, PLACED)
-
-
-def _sampled(bench: Bench) -> bool:
-    """Whether there are samples of a photodiode."""
-    return bool(struct.unpack(">H", bench.registers(53, 1))[0] != 0xFFFF)
 
 
 def _blocks(bench: Bench) -> int:
@@ -85,19 +80,3 @@ def is_not_acknowledged(bench: Bench) -> str:
 def hangs(bench: Bench) -> str:
     """SDA is held low for five seconds: every transfer times out in the kernel."""
     return _ordered(bench, "order hang where=adc for=5", STUCK)
-
-
-@scenario("anew")
-def stops_and_starts(bench: Bench) -> str:
-    """`systemctl stop` ends it cleanly; the photodiode is taken from the configuration; `start` finds the map again."""
-    begun = time.monotonic()
-    bench.machine.run("systemctl", "stop", UNIT)
-    seconds = time.monotonic() - begun
-    seen = bench.machine.show(UNIT, "Result", "ExecMainStatus")
-    need(seen == {"Result": "success", "ExecMainStatus": "0"}, lambda: f"{seen}\n{bench.log(20)}")
-    bench.configure()
-    bench.machine.run("systemctl", "start", UNIT, seconds=300)
-    said = back(bench, bench.main_pid(), PLACED)
-    need(map_id(bench) == bench.memory["map"], f"map {map_id(bench):08x}, it was {bench.memory['map']:08x}")
-    need(not _sampled(bench), "there are samples of a photodiode that is not configured any more")
-    return f"stopped in {seconds:.1f} s; {said}"

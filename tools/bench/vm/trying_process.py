@@ -1,26 +1,37 @@
-"""Scenarios: a computer whose robot stands, and a process that does nothing any more."""
+"""Scenarios: what happens to the process while its robot drives."""
 
 from __future__ import annotations
 
+import time
+from typing import Final
+
 from tools.bench.vm.bench import DONE, SAVE_MAP, UNIT, Bench
-from tools.bench.vm.common import begin, come_up, need, restarted, scenario, signal, start
+from tools.bench.vm.common import need, restarted, sampled, scenario, signal
 
-
-@scenario("anew")
-def comes_up_once_more(bench: Bench) -> str:
-    """A third computer: its map begins where it stands."""
-    said = come_up(bench)
-    seconds = start(bench)
-    return f"{said}; READY after {seconds:.1f} s; {1e3 * begin(bench):.0f} mm at most"
+CHANGED: Final = "near = 0.06"
 
 
 @scenario("restarted")
-def hangs_itself(bench: Bench) -> str:
-    """The process stands still (SIGSTOP): the watchdog ends it, and it is started again."""
+def is_killed(bench: Bench) -> str:
+    """Kill -9 while it drives: started again, in the same map; what was configured meanwhile holds."""
     need(bench.command(SAVE_MAP, 60.0) == DONE, lambda: bench.log(10))
     before = bench.main_pid()
-    signal(bench, "STOP", before)
-    said = restarted(bench, before, 60.0)
-    journal = bench.machine.run("journalctl", "-b", "--no-pager", "-u", UNIT)
-    need("Watchdog timeout" in journal, lambda: bench.log(20))
+    need(sampled(bench), "there are no samples of a photodiode that could go with its configuration")
+    bench.configure(f"[lidar.mask]\n{CHANGED}")
+    signal(bench, "KILL", before)
+    said = restarted(bench, before, 20.0)
+    told = bench.machine.run("journalctl", "--no-pager", "-o", "cat", f"_PID={bench.main_pid()}", "-b", "-n", "100")
+    need(CHANGED in told, told)
+    need(not sampled(bench), "there are samples of a photodiode that is not configured any more")
     return said
+
+
+@scenario("gone")
+def is_stopped(bench: Bench) -> str:
+    """`systemctl stop` ends it cleanly, which is the last that happens to this computer."""
+    begun = time.monotonic()
+    bench.machine.run("systemctl", "stop", UNIT)
+    seconds = time.monotonic() - begun
+    seen = bench.machine.show(UNIT, "Result", "ExecMainStatus")
+    need(seen == {"Result": "success", "ExecMainStatus": "0"}, lambda: f"{seen}\n{bench.log(20)}")
+    return f"stopped in {seconds:.1f} s"
