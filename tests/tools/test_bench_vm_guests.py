@@ -288,7 +288,7 @@ def test_the_computer_with_most_to_do_is_the_first_and_who_stands_back_goes_by_i
     (tmp_path / "work").mkdir()
     three = [Guest(k, [like(passes)]) for k in (1, 2, 3)]
     assert run_all(three, kept(tmp_path), tmp_path / "work", tmp_path, lambda text: None)
-    assert begun == [("3", 2), ("1", 0), ("2", 10)]
+    assert begun == [("3", 2), ("1", 0), ("2", 5)]
 
 
 def test_who_waits_for_a_turn_can_be_broken_off_and_holds_up_nobody_then() -> None:

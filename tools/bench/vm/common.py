@@ -35,6 +35,11 @@ USUAL_S: Final = 0.2
 reckoned from that (docs/bench.md)."""
 
 
+BUDGET: Final = "[cycle]\nbudget_ms = 150.0"
+"""Of a scan period of 200 ms, for the drive that is compared, and for a robot that looks for its place on the way: with
+the usual half of it a loaded computer would leave work undone, and the drive would be another one than outside."""
+
+
 def scenario(daemon: Daemon = "same", alone: bool = False) -> Callable[[Scenario], Scenario]:
     """A decorator: it is one of the list, and leaves the daemon so; ``alone``: see :data:`ALONE`."""
 

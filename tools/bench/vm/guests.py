@@ -22,7 +22,7 @@ from tools.bench.vm.machine import Order
 from tools.bench.vm.places import BrokenOff, CannotBench
 
 JOURNAL: Final = ("journalctl", "--no-pager", "-o", "short-monotonic", "-n", "3000")
-BEHIND: Final = {2: 10, 3: 2}
+BEHIND: Final = {2: 5, 3: 2}
 """Which computer stands back (nice(1)): the first one's drive is compared with one outside, to a centimetre; the third
 one has most to do."""
 LONGEST: Final = 3

@@ -9,14 +9,14 @@ from typing import Final
 from tools.bench.vm.bench import DONE, PLACED, SAVE_MAP, UNIT, Bench
 from tools.bench.vm.common import RIGHT_S, begin, come_up, map_id, need, restarted, right, scenario, signal, start
 
-LOADING_S: Final = 12.0
-"""By then the daemon has been started, and has not come to look for its place."""
+LOADING: Final = 0.6
+"""So much of what the boot took later the daemon has been started, and has not come to look for its place."""
 
 
 def _up_again(bench: Bench, states: tuple[str, ...], sets_off: bool = False) -> str:
     boot, begun = bench.machine.wait_until_up(), time.monotonic()
     if sets_off:
-        bench.wait(LOADING_S)
+        bench.wait(LOADING * boot)
         bench.drive()
     bench.placed(240.0, states)
     seconds = time.monotonic() - begun

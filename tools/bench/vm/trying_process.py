@@ -6,7 +6,7 @@ import time
 from typing import Final
 
 from tools.bench.vm.bench import DONE, SAVE_MAP, UNIT, Bench
-from tools.bench.vm.common import need, restarted, sampled, scenario, signal
+from tools.bench.vm.common import BUDGET, need, restarted, sampled, scenario, signal
 
 CHANGED: Final = "near = 0.06"
 
@@ -17,7 +17,7 @@ def is_killed(bench: Bench) -> str:
     need(bench.command(SAVE_MAP, 60.0) == DONE, lambda: bench.log(10))
     before = bench.main_pid()
     need(sampled(bench), "there are no samples of a photodiode that could go with its configuration")
-    bench.configure(f"[lidar.mask]\n{CHANGED}")
+    bench.configure(BUDGET, f"[lidar.mask]\n{CHANGED}")
     signal(bench, "KILL", before)
     said = restarted(bench, before, 20.0)
     told = bench.machine.run("journalctl", "--no-pager", "-o", "cat", f"_PID={bench.main_pid()}", "-b", "-n", "100")

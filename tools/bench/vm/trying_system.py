@@ -15,6 +15,7 @@ from tools.bench.plots import Plot, Series, histogram
 from tools.bench.report import Figure, Seen
 from tools.bench.vm.bench import CONFIG, DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
 from tools.bench.vm.common import (
+    BUDGET,
     TRACKING_S,
     Unmet,
     begin,
@@ -33,9 +34,6 @@ from tools.bench.world.room import LIDAR
 FIFO: Final = 1
 MARKS: Final = "/var/cache/private/lumiloop/kernels-*/warm-*"
 """They say that an earlier start has compiled the kernels."""
-BUDGET: Final = "[cycle]\nbudget_ms = 150.0"
-"""Of a scan period of 200 ms, for the drive that is compared: with the usual half of it a loaded computer would leave
-map work undone, and the drive would be another one than outside. The other computers run with what is usual."""
 AGREE_M: Final = 0.01
 AGREE_WAY_M: Final = 4.0
 """Driven at least: two runs that share no way agree about nothing."""
