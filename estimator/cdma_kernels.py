@@ -16,15 +16,16 @@ I8 = npt.NDArray[np.int64]
 
 @kernel("i8(f8[:], i8, f8)", inner=True)
 def first_from(x: F8, begin: int, limit: float) -> int:
-    """Index of the first of (N,) times, non-decreasing, that is ``limit`` or later, from ``begin`` on; N: none is.
+    """Index of the first of (N,) times, non-decreasing, that is ``limit`` or later, from ``begin`` on (at most N).
 
+    N: none is, or the limit is no number.
     `np.searchsorted` would have every start that finds this kernel compiled load numba's part that asks for scipy's
     BLAS, and scipy with it: half of what loading the decoder takes, and 16 MB.
     """
     low, high = begin, x.shape[0]
     while low < high:
         middle = (low + high) // 2
-        if x[middle] < limit or limit != limit:  # no number: behind all of them, as numpy has it
+        if x[middle] < limit or limit != limit:  # no number: behind all of them
             low = middle + 1
         else:
             high = middle

@@ -46,6 +46,8 @@ def slow_value(chips: np.ndarray, signs: np.ndarray, u: float) -> float:
 def test_the_first_time_from_a_limit_on(times: list[float], begin: int, limit: float) -> None:
     x, begin = np.array(times), min(begin, len(times))
     assert cdma_kernels.first_from(x, begin, limit) == begin + np.searchsorted(x[begin:], limit)
+    x, begin = x[::2], min(begin, len(x[::2]))
+    assert cdma_kernels.first_from(x, begin, limit) == begin + np.searchsorted(x[begin:], limit)
 
 
 def test_columns_follow_the_code_with_its_signs() -> None:

@@ -258,11 +258,17 @@ def test_it_stops_cleanly(machine: Container) -> None:
 
 
 def test_it_is_removed_without_a_trace_but_what_it_has_learned(machine: Container) -> None:
+    machine.run("systemctl", "enable", "--now", UNIT, seconds=READY_S)
+    machine.until(UNIT, READY_S, ActiveState="active", SubState="running")
     machine.run("dpkg", "--remove", "lumiloop")
+    assert machine.show(UNIT, "ActiveState")["ActiveState"] != "active"
+    assert _main(machine) == 0
+    assert list((machine.root / "etc/systemd/system").glob("*.wants/lumiloop*")) == []
     places = [machine.root / place for place in ("opt", "usr/bin", "usr/lib", "usr/share")]
     assert [path for place in places for path in place.rglob("*lumiloop*")] == []
     own = [machine.root / place for place in ("etc/lumiloop/lumiloop.toml", "var/lib/private/lumiloop", CACHE)]
     assert [path for path in own if not path.exists()] == []
+    assert [path.name for path in own[1].rglob("*") if path.is_file()] != [], "what it has learned"
     machine.run("dpkg", "--purge", "lumiloop")
     kept = [machine.root / place for place in ("etc", "var/lib/private", "var/lib", "var/cache/private", "var/cache")]
     assert [path for place in kept for path in place.glob("lumiloop*")] == []

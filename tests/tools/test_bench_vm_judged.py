@@ -15,7 +15,7 @@ import pytest
 
 from tools.bench.report import About, Figure, Result, Seen, write
 from tools.bench.vm import __main__ as command
-from tools.bench.vm import common, trying_system
+from tools.bench.vm import common, trying_process, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.machine import Order
 from tools.bench.world import agreement
@@ -144,6 +144,22 @@ def test_a_place_that_nobody_claims_is_compared_with_nothing() -> None:
     nowhere.memory["drive"] = [Heard(0.2, 0.2, 1, None, 0.0)] * 20
     with pytest.raises(Order, match="no pose of the drive claims a place"):
         trying_system.agrees_with_outside(nowhere)
+
+
+@pytest.mark.parametrize("wrong", ["", "status", "unsaved"])
+def test_a_stop_is_clean_and_saves_the_map(wrong: str) -> None:
+    def run(*words: str, **more: object) -> str:
+        if words[0] == "journalctl":
+            return "map saved: 1\nstopping\n" + ("" if wrong == "unsaved" else "map saved: 2\n")
+        return ""
+
+    bench, status = inside(run), "1" if wrong == "status" else "0"
+    bench.machine.show = lambda *_: {"Result": "success", "ExecMainStatus": status}  # type: ignore[method-assign]
+    if not wrong:
+        assert trying_process.is_stopped(bench).endswith("the map saved")
+    else:
+        with pytest.raises(Order):
+            trying_process.is_stopped(bench)
 
 
 def test_what_is_worse_is_said_last_and_what_cannot_be_compared_first(

@@ -103,8 +103,8 @@ def map_id(bench: Bench) -> int:
     return int(struct.unpack(">I", bench.registers(46, 2))[0])
 
 
-def sampled(bench: Bench) -> bool:
-    """Whether there are samples of a photodiode."""
+def has_photodiode(bench: Bench) -> bool:
+    """Whether the daemon has one in its configuration: then its count of links is a number."""
     return bool(struct.unpack(">H", bench.registers(53, 1))[0] != 0xFFFF)
 
 

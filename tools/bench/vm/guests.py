@@ -30,7 +30,7 @@ LONGEST: Final = 3
 SIDE_BY_SIDE: Final = 2
 """So many computers of three, where the emulation is slow: a third one would starve them of their two processors."""
 SLOW: Final = 2.5
-"""From so many times the usual seconds for the same work. At 2.2 three side by side were all right (docs/bench.md)."""
+"""From so many times the usual seconds for the same work. At 2.3 three side by side were all right."""
 LOOK_S: Final = 0.1
 PATIENCE_S: Final = 300.0
 Say = Callable[[str], None]

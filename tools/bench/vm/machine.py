@@ -359,7 +359,7 @@ def command_line(start: Start, folder: Path, ports: Ports) -> list[str]:
         "-kernel", str(start.image.kernel), "-initrd", str(start.image.initrd), "-append", COMMAND_LINE,
         "-drive", f"file={start.disk},if=none,id=disk,format=qcow2,snapshot={temporary},cache=unsafe",
         "-device", "virtio-blk-pci,drive=disk", "-device", "virtio-rng-pci",
-        "-netdev", f"user,id=net,{forwards},hostfwd=udp:127.0.0.1:{ports.odometry}-:{ODOMETRY}",
+        "-netdev", f"user,id=net,ipv6=off,{forwards},hostfwd=udp:127.0.0.1:{ports.odometry}-:{ODOMETRY}",
         "-device", "virtio-net-pci,netdev=net,romfile=",
         "-device", "virtio-serial-pci",
         "-chardev", f"socket,id=agent,path={folder / 'agent'},server=on,wait=off",

@@ -12,7 +12,7 @@ import time
 from typing import Final
 
 from tools.bench.vm.bench import PLACED, Bench
-from tools.bench.vm.common import TRACKING_S, begin, come_up, need, same_process, sampled, scenario, start
+from tools.bench.vm.common import TRACKING_S, begin, come_up, need, same_process, scenario, start
 from tools.bench.vm.machine import OUTSIDE
 
 PHOTODIODE: Final = '[photodiode]\nbus = "adapter:bench"\nconverter = "mcp3221@0x4d"\n'
@@ -39,7 +39,6 @@ def reads_the_converter(bench: Bench) -> str:
     """A photodiode on a real /dev/i2c-N: found by its adapter's name, opened by its group, read in blocks."""
     nodes = bench.machine.run("sh", "-c", "stat -c '%n %G %a' /dev/i2c-*").strip()
     need("i2c 660" in nodes, nodes)
-    bench.until("samples", 60.0, lambda: sampled(bench))
     _sound(bench)
     return f"{nodes}; {_blocks(bench)} blocks"
 
