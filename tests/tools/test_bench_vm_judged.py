@@ -73,12 +73,13 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
         trying_system.agrees_with_outside(short)
     for name, least, late in (
         ("LATE_S", 0.011, np.full(51, 0.012)), ("SPREAD_MS", 11, np.linspace(0.0, 0.012, 51)),
+        ("EARLY_S", 0.011, np.full(51, -0.012)),
     ):  # fmt: skip
         monkeypatch.setattr(agreement, "lateness", lambda *_, late=late: late)
         trying_system.agrees_with_outside(driven(5.0))
         with monkeypatch.context() as less:
             less.setattr(trying_system, name, least)
-            with pytest.raises(Order, match="late by: 12"):
+            with pytest.raises(Order, match="late by: -?12"):
                 trying_system.agrees_with_outside(driven(5.0))
 
 

@@ -106,7 +106,7 @@ def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, 
     along the way that changes from group to group looks like it: who judges bounds by how much groups may differ.
 
     Args:
-        tried: seconds, ascending.
+        tried: seconds; of several that do equally well the first is taken.
         traced: the trace of some of the stamps, each set back by so much.
         count: of stamps.
         other: the trace to agree with.
