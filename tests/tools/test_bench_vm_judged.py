@@ -79,7 +79,7 @@ def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.Mo
         trying_system.agrees_with_outside(driven(5.0))
         with monkeypatch.context() as less:
             less.setattr(trying_system, name, least)
-            with pytest.raises(Order, match="late by: -?12"):
+            with pytest.raises(Order, match=r"late by: -?12"):
                 trying_system.agrees_with_outside(driven(5.0))
 
 

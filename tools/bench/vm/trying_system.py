@@ -50,8 +50,8 @@ SPREAD_MS: Final = 20
 SLOWEST: Final = 2.5
 """So many times more lateness is allowed at most where the emulation is slower."""
 EARLY_S: Final = 0.02
-"""Two computers' clocks are put together by the datagram that was under way the shortest, which may put them too near: a
-run was 7 to 19 ms early, others on that day 11 to 25 ms late."""
+"""Two computers' clocks are put together by the datagram that was under way the shortest, which may be too near: a run
+was 7 to 19 ms early, others on that day 11 to 25 ms late."""
 LATER: Final = 1e-3 * np.array(sorted(range(-30, round(1e3 * (SLOWEST + 0.5) * LATE_S)), key=abs), np.float64)
 """The nearest to none first, which is what is said where nothing tells."""
 
