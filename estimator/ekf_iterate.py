@@ -4,6 +4,10 @@ What is minimised is the squared deviation from the prediction and from the link
 Gauss and Newton's way down that sum). Beside a row of lamps, or between two of them, strengths hardly change with the
 place across: a full step from there overshoots, and the next one from where it has come to more so. A step is therefore
 halved as long as that helps, and the state never ends where the sum is larger than it is at the prediction.
+
+Nor is one epoch believed more than it can be. Links may be likely one by one and impossible together: what is uncertain
+(gains, the distance from a row) moves all of them alike, and they have moved apart. Then light has changed, as at a
+corner behind which other walls are lit, and the state that explains it best is one that it cannot have.
 """
 
 from __future__ import annotations
@@ -24,45 +28,68 @@ NEAR_M, NEAR_RAD = 0.03, 0.03
 STEPS: Final = 8
 SHORTEST: Final = 1.0 / 64.0
 """Part of a step below which it is not worth going."""
+IMPROBABLE: Final = 3.09
+"""Standard deviations: once in a thousand epochs, links together are farther off if all is as it is taken to be."""
 JITTER: Final = 1e-12
 """Variance that is added to elements which are known for certain, so that a deviation of them has a price."""
 
 
-def take_in(x: Array, P: Array, n: int, links: Array, lamps: Array, view: Array, out: Array) -> float:
+def take_in(x: Array, P: Array, n: int, seen: tuple[Array, Array, Array], out: Array, doubtful: bool = False) -> float:
     """Take links in, linearised anew where the outcome lies far from where they were.
 
     Args:
         x: state, changed in place.
         P: its covariance, changed in place.
         n: elements in use.
-        links: (L, LINK_COLUMNS).
-        lamps: (slots, 7), rows of `optics.pack_lamps`.
-        view: (VIEW_COLUMNS,), see `ekf_links.linearise`.
-        out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise that each link is given (infinite: left out).
+        seen: links (L, LINK_COLUMNS); lamps (slots, 7), rows of `optics.pack_lamps`; view (VIEW_COLUMNS,), see
+            `ekf_links.linearise`.
+        out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise that each link is given (infinite: left out);
+            that is made larger where they are doubted.
+        doubtful: whether links that are improbable together are doubted, and not only the state: where it is known.
 
     Returns:
         ln of the likelihood of these links at the prediction.
     """
-    x0 = x.copy()
-    if not np.any(out[:, WHITE] < math.inf):
+    used = out[:, WHITE] < math.inf
+    if not np.any(used):
         return 0.0
-    P0 = P.copy()
-    likelihood = absorb(x, P, n, x0, links, out)
+    before = x.copy(), P.copy()
+    likelihood, cost = _iterate((x, P), before, n, seen, out)
+    if doubtful and cost > (most := bound(int(np.count_nonzero(used)))):
+        # then the sum is as large at the prediction as it may be, and from there it only ever gets smaller
+        out[used, WHITE] += float(np.sum(out[used, RESIDUAL] ** 2)) / most
+        x[:], P[:] = before
+        likelihood, _ = _iterate((x, P), before, n, seen, out)
+    return likelihood
+
+
+def bound(links: int) -> float:
+    """What the NIS of so many links exceeds once in a thousand: chi-square's quantile by Wilson and Hilferty (1931)."""
+    spread = 2.0 / (9.0 * links)
+    return links * float(1.0 - spread + IMPROBABLE * math.sqrt(spread)) ** 3
+
+
+def _iterate(
+    state: tuple[Array, Array], before: tuple[Array, Array], n: int, seen: tuple[Array, Array, Array], out: Array
+) -> tuple[float, float]:
+    """The update, in place; ln of the likelihood at the prediction ``before``, and the sum that is left."""
+    (x, P), (x0, P0), links = state, before, seen[0]
+    likelihood, nis = absorb(x, P, n, x0, links, out)
     if _near(x, x0):
-        return likelihood
+        return likelihood, nis
     price = _Price(x0, P0, links, out)
     around, cost = x0, price.of(x0, out)
     for _ in range(STEPS):
-        further = _further(price, around, x, cost, (links, lamps, view))
+        further = _further(price, around, x, cost, seen)
         if further is None:
             break
         around, cost, out = further
-        x[:], P[:] = x0, P0
+        x[:], P[:] = before
         absorb(x, P, n, around, links, out)
         if _near(x, around):
-            return likelihood
+            return likelihood, cost
     x[:] = around  # the last step led nowhere better: P is what the links tell there
-    return likelihood
+    return likelihood, cost
 
 
 class _Price:

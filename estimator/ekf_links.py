@@ -118,8 +118,8 @@ def spread_out(P: Array, n: int, K: Array, b: Array, c: Array, out: Array) -> No
             P[j, k] = P[k, j]
 
 
-@kernel("f8(f8[::1], f8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])")
-def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) -> float:
+@kernel("UniTuple(f8, 2)(f8[::1], f8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])")
+def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) -> tuple[float, float]:
     """Take links in one after another: Kalman's gain, the covariance in Joseph's form.
 
     Args:
@@ -131,9 +131,9 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
         out: (L, OUT_COLUMNS) of :func:`linearise`; a link whose WHITE is infinite is left out.
 
     Returns:
-        ln of the likelihood of these links together, each one's surprise capped.
+        ln of the likelihood of these links together, each one's surprise capped; their joint NIS, which is not.
     """
-    likelihood, count = 0.0, links.shape[0]
+    likelihood, nis, count = 0.0, 0.0, links.shape[0]
     at, A = np.empty((count, WIDTH), np.int64), np.zeros((count, n))
     K, b, c = np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, n))
     lin = around.copy()
@@ -157,6 +157,7 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
             nu -= out[i, SLOPES + w] * step
             spread += out[i, SLOPES + w] * A[i, k]
         S = max(spread, 0.0) + noise
+        nis += nu * nu / S
         likelihood -= 0.5 * (min(nu * nu / S, SURPRISE_CAP) + np.log(S) + LOG_2PI)
         for j in range(n):
             K[i, j] = A[i, j] / S
@@ -173,4 +174,4 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
                     A[m, j] += K[i, j] * up - b[i, j] * down
     spread_out(P, n, K, b, c, out)
     x[YAW] = (x[YAW] + np.pi) % (2.0 * np.pi) - np.pi
-    return likelihood
+    return likelihood, nis

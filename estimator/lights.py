@@ -19,7 +19,7 @@ from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch
 from estimator.lamps import Survey
 from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
-from estimator.lights_links import Learned, Sight, distrust, forget, judge, relearn, sights, table, view_of
+from estimator.lights_links import Learned, Sight, distrust, forget, judge, relearn, settled, sights, table, view_of
 from estimator.lights_memory import bend, fresh_gains
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places, rule_out
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
@@ -242,6 +242,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
+        known = len(lights.tracks) == 1 and settled(track)  # a row takes that from it, but not what it knew
         if len(lights.tracks) == 1 and lights.result is not None:
             narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
             if row.several(lights.catalogue, lights.result.accepted):
@@ -249,7 +250,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
             if lights.course.wheels and lights.under.lasts(middle) and middle - lights.t_used < HELD_S:
                 row.loosen(narrow, angle, track.P, lights.under.least(angle))
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
-        likelihood = absorb(lights, track, seen, view_of(lights, back), news)
+        likelihood = absorb(lights, track, seen, (view_of(lights, back), news, known))
         track.weight += likelihood * news
         views.append((track, seen))
     if len(lights.tracks) > 1:
@@ -275,15 +276,23 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
     ekf.fade(track.x, track.P, n, keep, grow)
 
 
-def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, news: float) -> float:
-    """One hypothesis takes the links in; returns the ln of their likelihood under it."""
+def absorb(lights: Lights, track: Track, seen: list[Sight], how: tuple[Array, float, bool]) -> float:
+    """One hypothesis takes the links in; returns the ln of their likelihood under it.
+
+    Args:
+        lights: all of the filter.
+        track: the hypothesis.
+        seen: the links.
+        how: `view_of` the epoch; how much of it is news, see `judge`; whether the place was known before.
+    """
+    view, news, known = how
     kept, links = table(lights, track, seen)
     if not kept:
         return 0.0
     out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
     ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
     likelihood = judge(lights, track, kept, out, news)
-    return likelihood + ekf_iterate.take_in(track.x, track.P, track.n, links, track.lamps, view, out)
+    return likelihood + ekf_iterate.take_in(track.x, track.P, track.n, (links, track.lamps, view), out, known)
 
 
 def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:

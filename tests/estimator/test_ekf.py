@@ -93,7 +93,7 @@ def test_links_are_taken_in_as_by_the_textbook(seed: int) -> None:
     np.testing.assert_allclose(out[:, ekf_links.RESIDUAL], r, atol=1e-9)
     np.testing.assert_allclose(out[:, ekf_links.SPREAD], np.diag(H @ P[:N, :N] @ H.T), rtol=2e-2)
     got_x, got_P = x.copy(), P.copy()
-    likelihood = ekf_links.absorb(got_x, got_P, N, x.copy(), links, out)
+    likelihood, nis = ekf_links.absorb(got_x, got_P, N, x.copy(), links, out)
     for i, link in enumerate(links):  # the twin uses the kernels' derivatives, which leave out d(scale)/d(place)
         H[i] = 0.0
         for w in range(ekf_links.WIDTH):
@@ -105,6 +105,7 @@ def test_links_are_taken_in_as_by_the_textbook(seed: int) -> None:
     np.testing.assert_allclose(got_P[:N, :N], I_KH @ P[:N, :N] @ I_KH.T + K @ R @ K.T, atol=1e-11)
     want = -0.5 * (r @ np.linalg.solve(S, r) + np.linalg.slogdet(2 * np.pi * S)[1])
     assert likelihood == pytest.approx(want, abs=1e-6)
+    assert nis == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-6)
 
 
 def test_slopes_of_a_link_are_its_derivatives() -> None:
@@ -127,7 +128,7 @@ def test_a_link_with_infinite_noise_changes_nothing() -> None:
     ekf_links.linearise(x, P, links, lamp_table(), view(), out)
     out[:, ekf_links.WHITE] = np.inf
     got_x, got_P = x.copy(), P.copy()
-    assert ekf_links.absorb(got_x, got_P, N, x.copy(), links, out) == 0.0
+    assert ekf_links.absorb(got_x, got_P, N, x.copy(), links, out) == (0.0, 0.0)
     np.testing.assert_array_equal(got_P, P)
     np.testing.assert_array_equal(got_x, x)
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from estimator import ekf, ekf_links, se2
-from estimator.ekf_iterate import take_in
+from estimator.ekf_iterate import bound, take_in
 from estimator.records import Array
 from tests.estimator.test_ekf import N, lamp_table, links_of, view
 
@@ -72,7 +73,7 @@ def undamped(x0: Array, P0: Array, links: Array) -> Array:
 def test_the_outcome_fits_as_well_as_anything_near(seed: int) -> None:
     x0, P0, links = beside_a_row(seed)
     x, P = x0.copy(), P0.copy()
-    take_in(x, P, N, links, lamp_table(), view(), seen_from(x, P, links))
+    take_in(x, P, N, (links, lamp_table(), view()), seen_from(x, P, links))
     begun, ended = cost(x0, x0, P0, links), cost(x, x0, P0, links)
     assert ended <= begun
 
@@ -93,7 +94,7 @@ def test_full_steps_would_often_end_where_nothing_fits() -> None:
     for seed in range(20):
         x0, P0, links = beside_a_row(seed)
         x, P = x0.copy(), P0.copy()
-        take_in(x, P, N, links, lamp_table(), view(), seen_from(x, P, links))
+        take_in(x, P, N, (links, lamp_table(), view()), seen_from(x, P, links))
         worse += cost(undamped(x0, P0, links), x0, P0, links) > 4.0 + cost(x, x0, P0, links)
     assert worse >= 3
 
@@ -103,9 +104,9 @@ def test_where_the_equations_are_straight_it_is_one_update() -> None:
     P0[:N, :N] *= 1e-4
     P0[range(ekf.FIRST + ekf.ERROR, N, ekf.OWN), range(ekf.FIRST + ekf.ERROR, N, ekf.OWN)] = 1.0
     x, P = x0.copy(), P0.copy()
-    told = take_in(x, P, N, links, lamp_table(), view(), seen_from(x, P, links))
+    told = take_in(x, P, N, (links, lamp_table(), view()), seen_from(x, P, links))
     once, P_once = x0.copy(), P0.copy()
-    assert told == ekf_links.absorb(once, P_once, N, x0.copy(), links, seen_from(x0, P0, links))
+    assert told == ekf_links.absorb(once, P_once, N, x0.copy(), links, seen_from(x0, P0, links))[0]
     np.testing.assert_array_equal(x, once)
     np.testing.assert_array_equal(P, P_once)
 
@@ -115,6 +116,58 @@ def test_links_that_are_all_left_out_change_nothing() -> None:
     out = seen_from(x0, P0, links)
     out[:, ekf_links.WHITE] = np.inf
     x, P = x0.copy(), P0.copy()
-    assert take_in(x, P, N, links, lamp_table(), view(), out) == 0.0
+    assert take_in(x, P, N, (links, lamp_table(), view()), out) == 0.0
     np.testing.assert_array_equal(x, x0)
     np.testing.assert_array_equal(P, P0)
+
+
+def moved_apart(by: float) -> tuple[Array, Array, Array]:
+    """Two lamps of a row, one ahead and one behind, a gain of both that is hardly known; light has changed by a share.
+
+    Either lamp for itself is as strong as it may be; together they ask for a place along the row that is known not to
+    be, or for anything that goes with it.
+    """
+    x, P, links = beside_a_row(3)
+    lamps = lamp_table()[ROW, :2]
+    x[:2] = lamps.mean(axis=0) + np.array((0.1, 0.05))
+    links = links_of(x, ROW, 3)
+    links[:, ekf_links.LN] += by * np.array((1.0, -1.0))
+    P[ekf.COMMON, ekf.COMMON] = 0.4**2
+    P[range(ekf.FIRST + ekf.ERROR, N, ekf.OWN), range(ekf.FIRST + ekf.ERROR, N, ekf.OWN)] = 1e-3
+    return x, P, links
+
+
+def squared(x: Array, x0: Array, P: Array) -> float:
+    """Mahalanobis distance of a state from the prediction, squared."""
+    return float(np.sum(deviations(x, x0, P, np.zeros((0, ekf_links.LINK_COLUMNS))) ** 2))
+
+
+@pytest.mark.parametrize("by", [0.3, 1.0, 3.0])
+def test_links_that_no_state_explains_lead_it_no_farther_than_it_may_be(by: float) -> None:
+    x0, P0, links = moved_apart(by)
+    ended = {}
+    for doubtful in (False, True):
+        x, P, out = x0.copy(), P0.copy(), seen_from(x0, P0, links)
+        noise = out[:, ekf_links.WHITE].copy()
+        take_in(x, P, N, (links, lamp_table(), view()), out, doubtful)
+        ended[doubtful] = squared(x, x0, P0)
+        assert np.all(out[:, ekf_links.WHITE] > noise) if doubtful else np.all(out[:, ekf_links.WHITE] == noise)
+        assert np.linalg.eigvalsh(P[:N, :N]).min() > 0.0
+    assert ended[False] > bound(2)
+    assert ended[True] <= bound(2)
+
+
+def test_links_that_are_likely_together_are_not_doubted() -> None:
+    """However far each of them is off: they ask for a gain, or a place, that may be."""
+    x0, P0, links = moved_apart(0.0)
+    links[:, ekf_links.LN] += 0.8
+    told = []
+    for doubtful in (False, True):
+        x, P, out = x0.copy(), P0.copy(), seen_from(x0, P0, links)
+        told.append((take_in(x, P, N, (links, lamp_table(), view()), out, doubtful), *x[:N], *P.ravel()))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("links", [1, 2, 3, 8, 24])
+def test_the_bound_is_exceeded_once_in_a_thousand(links: int) -> None:
+    assert bound(links) == pytest.approx(chi2.ppf(0.999, links), rel=0.04)
