@@ -7,13 +7,14 @@ halved as long as that helps, and the state never ends where the sum is larger t
 
 Nor is one epoch believed more than it can be. Links may be likely one by one and impossible together: what is uncertain
 (gains, the distance from a row) moves all of them alike, and they have moved apart. Then light has changed, as at a
-corner behind which other walls are lit, and the state that explains it best is one that it cannot have.
+corner behind which other walls are lit, and the state that explains it best is one that it cannot have. To take such a
+change for what the model is wrong by from now on was worse: it hid that the place was wrong, for good.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -34,50 +35,64 @@ JITTER: Final = 1e-12
 """Variance that is added to elements which are known for certain, so that a deviation of them has a price."""
 
 
-def take_in(x: Array, P: Array, n: int, seen: tuple[Array, Array, Array], out: Array, doubtful: bool = False) -> float:
+class Seen(NamedTuple):
+    """Links and what they are compared by.
+
+    Attributes:
+        links: (L, LINK_COLUMNS). lamps: (slots, 7), rows of `optics.pack_lamps`. view: (VIEW_COLUMNS,), see
+            `ekf_links.linearise`.
+    """
+
+    links: Array
+    lamps: Array
+    view: Array
+
+
+def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, known: bool, news: float) -> tuple[float, bool]:
     """Take links in, linearised anew where the outcome lies far from where they were.
 
     Args:
         x: state, changed in place.
         P: its covariance, changed in place.
         n: elements in use.
-        seen: links (L, LINK_COLUMNS); lamps (slots, 7), rows of `optics.pack_lamps`; view (VIEW_COLUMNS,), see
-            `ekf_links.linearise`.
+        seen: the links.
         out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise that each link is given (infinite: left out);
-            that is made larger where they are doubted.
-        doubtful: whether links that are improbable together are doubted, and not only the state: where it is known.
+            doubted links are given more, each by what it differs.
+        known: whether the place is known well enough for links to be doubted that are improbable together.
+        news: how much of an epoch this is by the way since the one before, 0 to 1: what is doubted at a standstill says
+            the same again and again, and then nothing is believed of it.
 
     Returns:
-        ln of the likelihood of these links at the prediction.
+        ln of the likelihood of these links at the prediction, with that noise; whether they were doubted.
     """
     used = out[:, WHITE] < math.inf
     if not np.any(used):
-        return 0.0
-    before = x.copy(), P.copy()
-    likelihood, cost = _iterate((x, P), before, n, seen, out)
-    if doubtful and cost > (most := bound(int(np.count_nonzero(used)))):
-        # then the sum is as large at the prediction as it may be, and from there it only ever gets smaller
-        out[used, WHITE] += float(np.sum(out[used, RESIDUAL] ** 2)) / most
-        x[:], P[:] = before
-        likelihood, _ = _iterate((x, P), before, n, seen, out)
-    return likelihood
+        return 0.0, False
+    before, count = (x.copy(), P.copy()), int(np.count_nonzero(used))
+    likelihood, left = _iterate((x, P), before, n, seen, out)
+    if not known or left <= (most := nis_bound(count)):
+        return likelihood, False
+    # each link's part of the sum is then its share of the bound at most at the prediction; from there it gets smaller
+    out[used, WHITE] += out[used, RESIDUAL] ** 2 * (count / most / news) if news > 0.0 else math.inf
+    x[:], P[:] = before
+    return _iterate((x, P), before, n, seen, out)[0], True
 
 
-def bound(links: int) -> float:
+def nis_bound(links: int) -> float:
     """What the NIS of so many links exceeds once in a thousand: chi-square's quantile by Wilson and Hilferty (1931)."""
     spread = 2.0 / (9.0 * links)
     return links * float(1.0 - spread + IMPROBABLE * math.sqrt(spread)) ** 3
 
 
 def _iterate(
-    state: tuple[Array, Array], before: tuple[Array, Array], n: int, seen: tuple[Array, Array, Array], out: Array
+    state: tuple[Array, Array], before: tuple[Array, Array], n: int, seen: Seen, out: Array
 ) -> tuple[float, float]:
     """The update, in place; ln of the likelihood at the prediction ``before``, and the sum that is left."""
-    (x, P), (x0, P0), links = state, before, seen[0]
-    likelihood, nis = absorb(x, P, n, x0, links, out)
+    (x, P), (x0, P0) = state, before
+    likelihood, nis = absorb(x, P, n, x0, seen.links, out)
     if _near(x, x0):
         return likelihood, nis
-    price = _Price(x0, P0, links, out)
+    price = _Price(x0, P0, seen.links, out)
     around, cost = x0, price.of(x0, out)
     for _ in range(STEPS):
         further = _further(price, around, x, cost, seen)
@@ -85,7 +100,7 @@ def _iterate(
             break
         around, cost, out = further
         x[:], P[:] = before
-        absorb(x, P, n, around, links, out)
+        absorb(x, P, n, around, seen.links, out)
         if _near(x, around):
             return likelihood, cost
     x[:] = around  # the last step led nowhere better: P is what the links tell there
@@ -116,18 +131,15 @@ class _Price:
         return float(prior + np.sum(r * r / self.white[self.used]))
 
 
-def _further(
-    price: _Price, around: Array, x: Array, cost: float, seen: tuple[Array, Array, Array]
-) -> tuple[Array, float, Array] | None:
+def _further(price: _Price, around: Array, x: Array, cost: float, seen: Seen) -> tuple[Array, float, Array] | None:
     """Where it is cheapest between ``around`` and ``x``, halving the way: there, its cost, the links; None: nowhere."""
-    links, lamps, view = seen
     step = x - around
     step[YAW] = se2.wrap(float(step[YAW]))
     part, best = 1.0, None
     while part >= SHORTEST:
-        there, out = around + part * step, np.zeros((len(links), OUT_COLUMNS))
+        there, out = around + part * step, np.zeros((len(seen.links), OUT_COLUMNS))
         there[YAW] = se2.wrap(float(there[YAW]))
-        linearise(there, price.P0, links, lamps, view, out)
+        linearise(there, price.P0, *seen, out)
         out[:, WHITE] = price.white
         less = price.of(there, out)
         if less < cost:
