@@ -5,10 +5,11 @@ Gauss and Newton's way down that sum). Beside a row of lamps, or between two of 
 place across: a full step from there overshoots, and the next one from where it has come to more so. A step is therefore
 halved as long as that helps, and the state never ends where the sum is larger than it is at the prediction.
 
-Nor is one epoch believed more than it can be. Links may be likely one by one and impossible together: what is uncertain
-(gains, the distance from a row) moves all of them alike, and they have moved apart. Then light has changed, as at a
-corner behind which other walls are lit, and the state that explains it best is one that it cannot have. To take such a
-change for what the model is wrong by from now on was worse: it hid that the place was wrong, for good.
+Nor does one epoch lead it farther than it may be. Links may be likely one by one and impossible together: what is
+uncertain (gains, the distance from a row) moves all of them alike, and they have moved apart. Then light has changed,
+as at a corner behind which other walls are lit, and what explains it best is a state that cannot be. Their noise is
+multiplied then until all of it together is no more improbable than one epoch in a thousand (Chang 2014, Journal of
+Geodesy 88:391, for an update that is not iterated).
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ SHORTEST: Final = 1.0 / 64.0
 """Part of a step below which it is not worth going."""
 IMPROBABLE: Final = 3.09
 """Standard deviations: once in a thousand epochs, links together are farther off if all is as it is taken to be."""
+WIDER: Final = 4.0
+"""By that factor noise is multiplied at a time."""
 JITTER: Final = 1e-12
 """Variance that is added to elements which are known for certain, so that a deviation of them has a price."""
 
@@ -48,7 +51,7 @@ class Seen(NamedTuple):
     view: Array
 
 
-def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, known: bool, news: float) -> tuple[float, bool]:
+def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, bounded: bool) -> float:
     """Take links in, linearised anew where the outcome lies far from where they were.
 
     Args:
@@ -57,25 +60,28 @@ def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, known: bool, 
         n: elements in use.
         seen: the links.
         out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise that each link is given (infinite: left out);
-            doubted links are given more, each by what it differs.
-        known: whether the place is known well enough for links to be doubted that are improbable together.
-        news: how much of an epoch this is by the way since the one before, 0 to 1: what is doubted at a standstill says
-            the same again and again, and then nothing is believed of it.
+            where they are improbable together it is multiplied.
+        bounded: whether that is done. Where hypotheses are compared, what is improbable speaks against one of them.
 
     Returns:
-        ln of the likelihood of these links at the prediction, with that noise; whether they were doubted.
+        ln of the likelihood of these links at the prediction, with the noise that they came with.
     """
     used = out[:, WHITE] < math.inf
     if not np.any(used):
-        return 0.0, False
-    before, count = (x.copy(), P.copy()), int(np.count_nonzero(used))
+        return 0.0
+    before = x.copy(), P.copy()
     likelihood, left = _iterate((x, P), before, n, seen, out)
-    if not known or left <= (most := nis_bound(count)):
-        return likelihood, False
-    # each link's part of the sum is then its share of the bound at most at the prediction; from there it gets smaller
-    out[used, WHITE] += out[used, RESIDUAL] ** 2 * (count / most / news) if news > 0.0 else math.inf
-    x[:], P[:] = before
-    return _iterate((x, P), before, n, seen, out)[0], True
+    most = nis_bound(int(np.count_nonzero(used)))
+    if not bounded or left <= most:
+        return likelihood
+    white = out[used, WHITE]
+    factor, enough = 1.0, float(np.sum(out[used, RESIDUAL] ** 2 / white)) / most  # enough for the prediction itself
+    while left > most and factor < enough:
+        factor = min(WIDER * factor, enough)
+        out[used, WHITE] = factor * white
+        x[:], P[:] = before
+        _, left = _iterate((x, P), before, n, seen, out)
+    return likelihood
 
 
 def nis_bound(links: int) -> float:
@@ -87,7 +93,7 @@ def nis_bound(links: int) -> float:
 def _iterate(
     state: tuple[Array, Array], before: tuple[Array, Array], n: int, seen: Seen, out: Array
 ) -> tuple[float, float]:
-    """The update, in place; ln of the likelihood at the prediction ``before``, and the sum that is left."""
+    """The update, in place; ln of the likelihood at the prediction ``before``, and the sum that is left in the end."""
     (x, P), (x0, P0) = state, before
     likelihood, nis = absorb(x, P, n, x0, seen.links, out)
     if _near(x, x0):
@@ -102,7 +108,7 @@ def _iterate(
         x[:], P[:] = before
         absorb(x, P, n, around, seen.links, out)
         if _near(x, around):
-            return likelihood, cost
+            return likelihood, price.of(x, price.look(x, seen))
     x[:] = around  # the last step led nowhere better: P is what the links tell there
     return likelihood, cost
 
@@ -114,21 +120,28 @@ class _Price:
     """
 
     def __init__(self, x0: Array, P0: Array, links: Array, out: Array) -> None:
-        self.x0, self.P0 = x0, P0
-        self.used = out[:, WHITE] < math.inf
-        self.white = out[:, WHITE].copy()
-        own = FIRST + OWN * links[self.used, SLOT].astype(np.int64)[:, None] + np.arange(OWN)
-        self.at = np.concatenate((np.arange(3), np.arange(COMMON, FIRST), own.ravel()))
-        self.L = P0[np.ix_(self.at, self.at)] + JITTER * np.eye(len(self.at))
-        invert(self.L)
+        self._x0, self._P0 = x0, P0
+        self._used = out[:, WHITE] < math.inf
+        self._white = out[:, WHITE].copy()
+        own = FIRST + OWN * links[self._used, SLOT].astype(np.int64)[:, None] + np.arange(OWN)
+        self._at = np.concatenate((np.arange(3), np.arange(COMMON, FIRST), own.ravel()))
+        self._L = P0[np.ix_(self._at, self._at)] + JITTER * np.eye(len(self._at))
+        invert(self._L)
+
+    def look(self, x: Array, seen: Seen) -> Array:
+        """What `linearise` says of the links at ``x``, with the noise that they were given."""
+        out = np.zeros((len(seen.links), OUT_COLUMNS))
+        linearise(x, self._P0, *seen, out)
+        out[:, WHITE] = self._white
+        return out
 
     def of(self, x: Array, out: Array) -> float:
         """``out``: what `linearise` says of the links at ``x``."""
-        off = x - self.x0
+        off = x - self._x0
         off[YAW] = se2.wrap(float(off[YAW]))
-        off, r = off[self.at], out[self.used, RESIDUAL]
-        prior = np.sum(off[:, None] * self.L * off)  # not by a matrix product, which would wake BLAS threads
-        return float(prior + np.sum(r * r / self.white[self.used]))
+        off, r = off[self._at], out[self._used, RESIDUAL]
+        prior = np.sum(off[:, None] * self._L * off)  # not by a matrix product, which would wake BLAS threads
+        return float(prior + np.sum(r * r / self._white[self._used]))
 
 
 def _further(price: _Price, around: Array, x: Array, cost: float, seen: Seen) -> tuple[Array, float, Array] | None:
@@ -137,10 +150,9 @@ def _further(price: _Price, around: Array, x: Array, cost: float, seen: Seen) ->
     step[YAW] = se2.wrap(float(step[YAW]))
     part, best = 1.0, None
     while part >= SHORTEST:
-        there, out = around + part * step, np.zeros((len(seen.links), OUT_COLUMNS))
+        there = around + part * step
         there[YAW] = se2.wrap(float(there[YAW]))
-        linearise(there, price.P0, *seen, out)
-        out[:, WHITE] = price.white
+        out = price.look(there, seen)
         less = price.of(there, out)
         if less < cost:
             best, cost = (there, less, out), less

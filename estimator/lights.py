@@ -21,7 +21,6 @@ from estimator.lights_absent import absent
 from estimator.lights_catalogue import catalogue_of
 from estimator.lights_links import Learned, Sight, distrust, forget, judge, relearn, sights, table, view_of
 from estimator.lights_memory import bend, fresh_gains
-from estimator.lights_row import HELD_S, in_a_row, known_place
 from estimator.lights_start import Place, begin, decide, headings, mixture, new_track, places, rule_out
 from estimator.lights_state import Corrections, Lights, LightsSettings, Pause, Track
 from estimator.linear3 import invert3, positive_part
@@ -43,6 +42,8 @@ __all__ = [
     "update",
 ]
 
+HELD_S = 1.0
+"""After so long without a usable link the pose is said to be held."""
 LOST_S = 2.0
 LOST_SHARE = 0.5
 """When more than this share of the links contradicts for so long, another place is looked for."""
@@ -102,6 +103,17 @@ def left_alone(lights: Lights) -> None:
     """The laser does not tell any more how the robot moves: from now on its speeds are guessed at."""
     if lights.course.wheels and lights.course.matched:
         lights_motion.release(lights)
+
+
+def in_a_row(lights: Lights, t_mono: float) -> bool:
+    """Whether the lamps in use have been one row for long enough to count as such.
+
+    What a row tells of the distance from it, and of the heading, is the same mistake in every epoch: who also knows the
+    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing. Who turns on the spot knows the
+    place by the lamps before, and needs to be told of the turn.
+    """
+    under = lights.under
+    return under.lasts(t_mono) and under.far >= row.LASTING_M and t_mono - lights.t_used < HELD_S
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:
@@ -230,9 +242,14 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
         if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
             lights_motion.face_forward(lights, track)
         age(lights, track, way, dt)
-        known = len(lights.tracks) == 1 and known_place(lights, track, middle)
+        if len(lights.tracks) == 1 and lights.result is not None:
+            narrow, angle = row.shape(lights.catalogue, lights.result.accepted)
+            if row.several(lights.catalogue, lights.result.accepted):
+                lights.under.take(middle, narrow, lights.course.T[:2], track.P[:3, :3])
+            if lights.course.wheels and lights.under.lasts(middle) and middle - lights.t_used < HELD_S:
+                row.loosen(narrow, angle, track.P, lights.under.least(angle))
         seen = sights(lights, epoch, float(track.x[0]), float(track.x[1]))
-        likelihood = absorb(lights, track, seen, (view_of(lights, back), news, known))
+        likelihood = absorb(lights, track, seen, view_of(lights, back), news)
         track.weight += likelihood * news
         views.append((track, seen))
     if len(lights.tracks) > 1:
@@ -258,28 +275,16 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
     ekf.fade(track.x, track.P, n, keep, grow)
 
 
-def absorb(lights: Lights, track: Track, seen: list[Sight], how: tuple[Array, float, bool]) -> float:
-    """One hypothesis takes the links in; returns the ln of their likelihood under it.
-
-    Args:
-        lights: all of the filter.
-        track: the hypothesis.
-        seen: the links.
-        how: `view_of` the epoch; how much of it is news, see `judge`; whether the place is known, see `known_place`.
-    """
-    view, news, known = how
+def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, news: float) -> float:
+    """One hypothesis takes the links in; returns the ln of their likelihood under it."""
     kept, links = table(lights, track, seen)
     if not kept:
         return 0.0
     out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
     ekf_links.linearise(track.x, track.P, links, track.lamps, view, out)
     likelihood = judge(lights, track, kept, out, news)
-    compared = ekf_iterate.Seen(links, track.lamps, view)
-    news = news if lights.course.wheels else 1.0
-    told, doubted = ekf_iterate.take_in(track.x, track.P, track.n, compared, out, known=known, news=news)
-    for sight in kept:
-        sight.doubted = doubted and sight.state is LinkState.ACCEPTED
-    return likelihood + told
+    compared, alone = ekf_iterate.Seen(links, track.lamps, view), len(lights.tracks) == 1
+    return likelihood + ekf_iterate.take_in(track.x, track.P, track.n, compared, out, bounded=alone)
 
 
 def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:
@@ -296,9 +301,7 @@ def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
     if len(lights.tracks) != 1:
         return
     states = [sight.state for sight in seen]
-    doubtful = [
-        sight.state for sight in seen if sight.doubted or speaks_against(sight.state, sight.residual, sight.sigma)
-    ]
+    doubtful = [sight.state for sight in seen if speaks_against(sight.state, sight.residual, sight.sigma)]
     against, used = len(doubtful), states.count(LinkState.ACCEPTED) - doubtful.count(LinkState.ACCEPTED)
     fitting = used + sum(waits(sight.state, sight.residual, sight.sigma) for sight in seen)
     now = lights.course.t_mono

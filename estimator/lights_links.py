@@ -10,7 +10,6 @@ import numpy as np
 from estimator import ekf, ekf_links
 from estimator.cdma_epoch import LightEpoch, LinkFlag
 from estimator.lamps import Lamp
-from estimator.lights_row import settled
 from estimator.lights_state import Lights, Pause, Track, Watch
 from estimator.optics import pack_receiver
 from estimator.records import Array
@@ -41,10 +40,10 @@ STEADY = 0.12
 """Spread of its ln residual up to which a contradiction is called steady."""
 TOO_STRONG = 3.0
 """Times what a lamp gives at the edge of view, which none near that edge can give."""
-FIRST_ERROR = 5.0
-"""Variance of a model error at first sight: later, gain and lean have taken up what always is the same in it."""
 MOVED_LEANS = 3.0
 """So many sigmas of lean are what a lamp may have; more is a lamp in another place."""
+FIRST_ERROR = 5.0
+"""Variance of a model error at first sight: later, gain and lean have taken up what always is the same in it."""
 STRIKES = 2
 """So often a lamp is learned anew; one that contradicts again stands somewhere else."""
 FADE_M = 100.0
@@ -60,10 +59,7 @@ FORGET_S, DESCRIBED = 3600.0, 1024
 
 @dataclass(slots=True, eq=False)
 class Sight:
-    """One link of an epoch as a hypothesis sees it; the fields are those of `result.Link`.
-
-    ``doubted``: it is used, but together with the others it is improbable (`ekf_iterate.take_in`).
-    """
+    """One link of an epoch as a hypothesis sees it; the fields are those of `result.Link`."""
 
     code: int
     amplitude: float
@@ -74,7 +70,6 @@ class Sight:
     slot: int = -1
     residual: float | None = None
     sigma: float | None = None
-    doubted: bool = False
 
     def link(self, learned: Learned) -> Link:
         """As others are told."""
@@ -294,6 +289,14 @@ def rim_of(lights: Lights, track: Track, sight: Sight) -> float:
         return math.inf
     gain = float(track.x[ekf.COMMON] + track.x[ekf.FIRST + ekf.OWN * sight.slot])
     return lights.catalogue.rims[sight.lamp.lamp_id] * math.exp(gain)
+
+
+def settled(track: Track) -> bool:
+    """Whether the place is known well enough for a link that does not fit to be called wrong.
+
+    What a lamp is received as depends on the place and hardly on the heading, which without wheels is never known well.
+    """
+    return bool(track.P[0, 0] + track.P[1, 1] < 0.2**2)
 
 
 def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:

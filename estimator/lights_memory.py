@@ -8,9 +8,8 @@ import numpy as np
 
 from estimator import ekf
 from estimator.lamps import Lamp
-from estimator.lights_links import Sight
+from estimator.lights_links import Sight, settled
 from estimator.lights_motion import wheel_scales
-from estimator.lights_row import settled
 from estimator.lights_state import Lights, Track
 from estimator.records import Array
 

@@ -13,9 +13,9 @@ import pytest
 
 from estimator import ekf, guide, lights, lights_motion, row, se2
 from estimator.light import Light
+from estimator.lights import HELD_S
 from estimator.lights_memory import sensors_known
 from estimator.lights_motion import prior_scales
-from estimator.lights_row import HELD_S
 from estimator.matching import no_match
 from estimator.pipeline import in_turn
 from estimator.records import Array, Imu, Odometry, Record
