@@ -216,7 +216,7 @@ class Store:
             self.damaged = True
             return None
         by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
-        for _, files in groupby(by_map, key=lambda one: one.map_id):
+        for map_id, files in groupby(by_map, key=lambda one: one.map_id):
             elsewhere, refused = True, False
             for generation in files:
                 if generation.path.name in self.trial.out:
@@ -229,13 +229,20 @@ class Store:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:
                     self._refuse(generation.path, error)
-                    elsewhere, refused = False, True
+                    elsewhere, refused = not generation.number, True  # what somebody has put there is no generation
                 else:
                     if refused:
                         log.warning("%s is used, the newest good generation of this map", generation.path)
                     self._origin = generation.path
                     return start
             if not elsewhere:
+                others = ", ".join(sorted(one.path.name for one in generations if one.map_id != map_id))
+                if others:
+                    log.warning(
+                        "%s: not looked at, being of other maps: %s; to use one, move the others out",
+                        self.folder,
+                        others,
+                    )
                 break
         return None
 

@@ -364,6 +364,25 @@ def test_a_map_that_somebody_has_put_there_is_loaded_where_there_is_no_other_and
     assert start.content == content(seed=7)
 
 
+def test_what_is_no_map_among_what_somebody_has_put_there_hides_no_other(tmp_path: Path) -> None:
+    tmp_path.joinpath("a.lumimap").write_bytes(b"no map")
+    tmp_path.joinpath("z.lumimap").write_bytes(content(seed=3))
+    store = Store(tmp_path)
+    start = store.load()
+    assert start is not None
+    assert start.content == content(seed=3)
+    assert store.damaged, "and it is said"
+
+
+def test_maps_that_are_not_looked_at_because_the_latest_is_broken_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tmp_path.joinpath(name(9, 5)).write_bytes(b"no map")
+    tmp_path.joinpath("good.lumimap").write_bytes(content(seed=3))
+    assert Store(tmp_path).load() is None
+    assert "not looked at, being of other maps: good.lumimap; to use one, move the others out" in caplog.text
+
+
 def test_a_map_to_be_used_as_it_is_is_known_as_such_to_the_estimator(tmp_path: Path) -> None:
     store_with(tmp_path, 1).close()
     for localise in (True, False):
