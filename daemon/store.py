@@ -216,7 +216,9 @@ class Store:
             self.damaged = True
             return None
         by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
+        looked = set[int]()
         for map_id, files in groupby(by_map, key=lambda one: one.map_id):
+            looked.add(map_id)
             elsewhere, refused = True, False
             for generation in files:
                 if generation.path.name in self.trial.out:
@@ -236,7 +238,7 @@ class Store:
                     self._origin = generation.path
                     return start
             if not elsewhere:
-                others = ", ".join(sorted(one.path.name for one in generations if one.map_id != map_id))
+                others = ", ".join(sorted(one.path.name for one in generations if one.map_id not in looked))
                 if others:
                     log.warning(
                         "%s: not looked at, being of other maps: %s; to use one, move the others out",

@@ -383,6 +383,16 @@ def test_maps_that_are_not_looked_at_because_the_latest_is_broken_are_named(
     assert "not looked at, being of other maps: good.lumimap; to use one, move the others out" in caplog.text
 
 
+def test_a_map_of_another_building_was_looked_at(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    elsewhere = tuple(replace(lamp, x=lamp.x + 40.0) for lamp in LAMPS)
+    shape = Shape(lit=True, map_id=7, survey=digest_of(Survey(elsewhere)), lamps=elsewhere)
+    tmp_path.joinpath(name(9, 7)).write_bytes(content(shape))
+    tmp_path.joinpath(name(5, 5)).write_bytes(b"no map")
+    tmp_path.joinpath("good.lumimap").write_bytes(content(seed=3))
+    assert started(MapConfig(folder=str(tmp_path)), Lights(SURVEY, PROFILE_A))[1] is None
+    assert "not looked at, being of other maps: good.lumimap;" in caplog.text
+
+
 def test_a_map_to_be_used_as_it_is_is_known_as_such_to_the_estimator(tmp_path: Path) -> None:
     store_with(tmp_path, 1).close()
     for localise in (True, False):

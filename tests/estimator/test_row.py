@@ -195,7 +195,7 @@ def test_along_a_corridor_light_alone_does_not_become_certain_of_a_wrong_side() 
 @pytest.mark.jit
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_light_that_changes_at_a_corner_does_not_turn_a_robot_round(seed: int) -> None:
-    """The walls of the next arm are lit by other lamps: 13 % more of one, less of the other, within 5 cm of way.
+    """The walls of the next arm are lit by other lamps: 9 % more of one, 13 % less of the other, within 5 cm.
 
     No place that was possible explained that; one 92 deg round, and 0.2 m ahead, did.
     """
