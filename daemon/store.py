@@ -191,7 +191,8 @@ class Store:
         """The newest good map that fits; None where there is none. What cannot be used is said in the log.
 
         Where a generation is damaged the one before it counts. Another map than the latest is taken only if that one
-        belongs to another building: what a person has begun anew does not come back by itself.
+        belongs to another building: what a person has begun anew does not come back by itself. A file under a name
+        of one's own is no generation of anything: where it is damaged the next one counts.
         """
         if self._lock is not None:
             self.trial.read()

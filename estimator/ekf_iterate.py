@@ -71,8 +71,7 @@ def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, bounded: bool
         return 0.0
     before = x.copy(), P.copy()
     likelihood, left = _iterate((x, P), before, n, seen, out)
-    most = nis_bound(int(np.count_nonzero(used)))
-    if not bounded or left <= most:
+    if not bounded or left <= (most := nis_bound(int(np.count_nonzero(used)))):
         return likelihood
     white = out[used, WHITE]
     factor, enough = 1.0, float(np.sum(out[used, RESIDUAL] ** 2 / white)) / most  # enough for the prediction itself
