@@ -37,7 +37,7 @@ $(STAMP): requirements/dev.lock pyproject.toml
 venv: $(STAMP)  ## make .venv with everything at the locked versions
 
 demo: venv  ## the daemon on a simulated robot under coded lamps; each sensor fails once; then a map picture
-	$(RUN) -m tools.demo $(ARGS)
+	$(RUN) -m tools.demo.run $(ARGS)
 
 check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff format --check --quiet .
@@ -46,7 +46,7 @@ check: venv  ## formatting, lint, strict types
 
 QUICK := not slow and not system
 test: venv  ## everything quick (no root, <= 12 minutes)
-	@$(BIN)/python -c "from daemon.warmup import load; load()" & warm=$$!; trap "kill $$warm" INT TERM; \
+	@$(BIN)/python -c "from daemon.runtime.warmup import load; load()" & warm=$$!; trap "kill $$warm" INT TERM; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked  # each keeps one processor busy
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "$(QUICK)" $(ARGS)
 
@@ -57,13 +57,13 @@ cover: venv  ## the floors of coverage, and the estimator without the compiler
 	@mkdir -p out; rm -f .coverage .coverage.* out/plain.coverage
 	@NUMBA_DISABLE_JIT=1 $(COVER) run --data-file=out/plain.coverage -m pytest -q -p no:cacheprovider \
 		-m "not jit and $(QUICK)" tests/estimator > out/plain.txt 2>&1 & plain=$$!; trap "kill $$plain" INT TERM; \
-	$(BIN)/python -c "from daemon.warmup import load; load()" && \
+	$(BIN)/python -c "from daemon.runtime.warmup import load; load()" && \
 	$(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report= -m "$(QUICK) and not no_cover"; tests=$$?; \
 	wait $$plain; plain=$$?; echo "the estimator without the compiler:"; \
 	if [ $$plain = 0 ]; then grep -h " passed" out/plain.txt; else cat out/plain.txt; fi; \
 	exit $$(( tests || plain ))
 	@$(COVER) combine -q --append out/plain.coverage
-	$(BIN)/python -m tools.floors
+	$(BIN)/python -m tools.ci.floors
 
 # What is judged against the wall clock has the machine to itself. ARGS may choose none of one half (5).
 ORDERLY := system and not slow
@@ -96,7 +96,7 @@ soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anyt
 	$(RUN) -m tools.soak $(ARGS)
 
 arm: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (qemu-user-static, mmdebstrap)
-	$(RUN) -m tools.bench.aarch64 $(ARGS)
+	$(RUN) -m tools.bench.system.aarch64 $(ARGS)
 
 experiments: venv  ## every figure and table of the paper and ours into docs/results (recordings: LUMILOOP_DATA)
 	$(RUN) -m tools.experiments $(ARGS)

@@ -11,7 +11,7 @@ def main() -> int:
     raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is ignored, and stays so
     if raises:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from daemon.cli import main as command
+    from daemon.cli.parser import main as command
 
     if raises:
         signal.signal(signal.SIGINT, signal.default_int_handler)

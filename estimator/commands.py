@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator import adrift, se2
-from estimator.hypotheses import Suspicion
-from estimator.mapframe import move_map, shift_map
-from estimator.mapping import NOTHING
-from estimator.records import Array, Command, Order
+from estimator.mapping.keyframe_selection import NOTHING
+from estimator.mapping.map_frame import move_map, shift_map
+from estimator.measurements import Array, Command, Order
+from estimator.numerics import se2
+from estimator.relocalisation import relocalisation
+from estimator.relocalisation.hypothesis_tracking import Suspicion
 from estimator.state import State
 
 
@@ -29,7 +30,7 @@ def obey(state: State, command: Command) -> None:
         remember(state, T_map_base)
         return
     if command.order is Order.RELOCALISE:
-        if adrift.begin(state):
+        if relocalisation.begin(state):
             look_at_once(state)
         return
     if command.order is Order.RESET:
@@ -37,10 +38,10 @@ def obey(state: State, command: Command) -> None:
         T_map_base = se2.identity() if T_map_base is None else T_map_base
     if T_map_base is not None:
         if state.atlas.kept and state.atlas.adrift is None:
-            adrift.begin(state)
+            relocalisation.begin(state)
         place(state, T_map_base)
         if state.atlas.adrift is not None:
-            adrift.hinted(state)
+            relocalisation.hinted(state)
             look_at_once(state)
 
 

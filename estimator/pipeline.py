@@ -7,31 +7,15 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from estimator import (
-    absolute,
-    adrift,
-    aside,
-    closing,
-    lateness,
-    livemap,
-    matchers,
-    matching,
-    motion,
-    protection,
-    se2,
-    suspicion,
-    timelag,
-)
 from estimator.commands import obey
-from estimator.fusion import alike_of, covariance, fuse, learn_alike, noise_of
-from estimator.grid import Grid
-from estimator.guide import guide
-from estimator.keyframe import hanging, unturned
-from estimator.linear3 import invert3
-from estimator.mapping import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
-from estimator.matchers import First, Matcher, first_of
-from estimator.matching import Asked, Prior, View
-from estimator.records import (
+from estimator.fusion import map_odom_filter, motion_model, out_of_sequence, protection_level, time_offset
+from estimator.fusion.laser_odometry import guide
+from estimator.fusion.pose_update import alike_of, covariance, fuse, learn_alike, noise_of
+from estimator.mapping import live_grid, loop_closure
+from estimator.mapping.keyframe import hanging, unturned
+from estimator.mapping.keyframe_selection import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
+from estimator.mapping.occupancy_grid import Grid
+from estimator.measurements import (
     UNLIMITED,
     Answer,
     Array,
@@ -47,9 +31,15 @@ from estimator.records import (
     Scan,
     no_lap,
 )
-from estimator.refusal import in_time, nothing_of, refused
+from estimator.numerics import se2
+from estimator.numerics.symmetric3 import invert3
+from estimator.relocalisation import kidnap_detection, relocalisation, unaligned_map
 from estimator.result import MatchResult, Reason, StepResult
-from estimator.scanpoints import ScanPoints, oriented, points_of
+from estimator.scan_matching import matcher_choice, scan_matcher
+from estimator.scan_matching.deskew import ScanPoints, oriented, points_of
+from estimator.scan_matching.matcher_choice import First, Matcher, first_of
+from estimator.scan_matching.scan_matcher import Asked, Prior, View
+from estimator.scan_matching.scan_validation import in_time, nothing_of, refused
 from estimator.state import Settings, State, new_state
 
 __all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_map", "step"]
@@ -79,18 +69,18 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
             lap("map")
         if isinstance(record, Scan):
             why = why or passed_over(state, record, limits)
-            if why is not None or not lateness.late(state, record):
+            if why is not None or not out_of_sequence.late(state, record):
                 match, laid = see(state, record, limits, why, lap)
             else:
-                ahead = lateness.go_back(state, record)
+                ahead = out_of_sequence.go_back(state, record)
                 match, laid = see(state, record, limits, why, lap)
-                lateness.come_again(state, ahead)
+                out_of_sequence.come_again(state, ahead)
             keyframe = max(keyframe, laid)
     lap("step")
     look_for_lamps(state, limits)
     lap("search")
-    adrift.step_done(state)
-    aside.step_done(state)
+    relocalisation.step_done(state)
+    unaligned_map.step_done(state)
     return report(state, match, keyframe, limits)
 
 
@@ -99,14 +89,14 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
     points = nothing_of(scan) if why else virtual_frame(state, scan)
     walk(state)
     match = match_scan(state, scan, points, limits, why)
-    carried = suspicion.raised(state, scan, points, match)
+    carried = kidnap_detection.raised(state, scan, points, match)
     fuse(state, match)
     guide(state, match)
-    timelag.on_match(state.lag, scan, match)
+    time_offset.on_match(state.lag, scan, match)
     if carried:
-        suspicion.look(state, scan, points, match)
+        kidnap_detection.look(state, scan, points, match)
     lap("match")
-    if match.ok and suspicion.waits(state):
+    if match.ok and kidnap_detection.waits(state):
         return match, -1
     if not (limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match)):
         return match, -1
@@ -122,7 +112,7 @@ def passed_over(state: State, scan: Scan, limits: Limits) -> Reason | None:
     """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose, or it is too old."""
     if limits.rung >= Rung.CARRIED:
         return Reason.PASSED_OVER
-    return Reason.LATE if lateness.too_old(state, scan) else None
+    return Reason.LATE if out_of_sequence.too_old(state, scan) else None
 
 
 def order(record: Record) -> tuple[float, bool]:
@@ -170,18 +160,18 @@ def predict(state: State, record: Record) -> None:
         state.light.predict(record)
     match record:
         case Odometry():
-            motion.on_odometry(state.fused, record, noise)
-            timelag.on_odometry(state.lag, record)
-            suspicion.on_odometry(state, record)
+            motion_model.on_odometry(state.fused, record, noise)
+            time_offset.on_odometry(state.lag, record)
+            kidnap_detection.on_odometry(state, record)
         case Imu():
-            motion.on_imu(state.fused, record, noise)
+            motion_model.on_imu(state.fused, record, noise)
         case Scan() | SampleBlock() | LightEpoch():
-            motion.carry_to(state.fused, record.t_end, noise)
+            motion_model.carry_to(state.fused, record.t_end, noise)
         case Command():
             obey(state, record)
-            absolute.on_order(state, record)
+            map_odom_filter.on_order(state, record)
             return  # RESET sets the odometry's covariance back: that is no motion
-    absolute.on_motion(state, *before)
+    map_odom_filter.on_motion(state, *before)
 
 
 def see_lights(state: State, record: SampleBlock | LightEpoch) -> None:
@@ -190,7 +180,7 @@ def see_lights(state: State, record: SampleBlock | LightEpoch) -> None:
     Without a photodiode in the setup the record is passed over.
     """
     if state.light is not None:
-        absolute.on_lights(state, state.light.take(record))
+        map_odom_filter.on_lights(state, state.light.take(record))
 
 
 def look_for_lamps(state: State, limits: Limits) -> None:
@@ -213,20 +203,20 @@ def match_scan(
     T_pred, count = state.fused.T_odom_base, len(points.xy)
     asked: Asked | None = None
     if refusal is not None:
-        result = matching.no_match(T_pred, count, refusal)
+        result = scan_matcher.no_match(T_pred, count, refusal)
     elif state.local is None:
-        result = matching.no_match(T_pred, count, Reason.NO_MAP)
+        result = scan_matcher.no_match(T_pred, count, Reason.NO_MAP)
     elif count < state.settings.matching.min_points:
-        result = matching.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
+        result = scan_matcher.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
     else:
         beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
         view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan), alike_of(state))
         prior = Prior(T_pred, invert3(state.fused.P))
         asked = (view, state.local, prior, limits.icp_iterations, state.settings.matching)
         if state.settings.matcher is Matcher.LINE:
-            result = matching.match(*asked)
+            result = scan_matcher.match(*asked)
         else:
-            result, asked = matchers.match(asked, light_first(state, prior), state.settings), None
+            result, asked = matcher_choice.match(asked, light_first(state, prior), state.settings), None
     if state.journal is not None:
         state.journal(scan, points, asked, result)
     return result
@@ -234,14 +224,14 @@ def match_scan(
 
 def close_loops(state: State, answer: Answer) -> None:
     """Sect. 4.3: take in what a job has found, a loop or a corrected map; `T_odom_base` never hears of it."""
-    closing.take_answer(state, answer)
+    loop_closure.take_answer(state, answer)
 
 
 def light_first(state: State, prior: Prior) -> First:
     """T1 of Eq. 14 for the paper's matcher: from light, or the prediction where light tells nothing good."""
     assert state.local is not None
     lights = None if state.light is None else state.light.result
-    return first_of(prior, state.local.newest, absolute.virtual(state), lights)
+    return first_of(prior, state.local.newest, map_odom_filter.virtual(state), lights)
 
 
 def report(state: State, match: MatchResult | None, keyframe: int, limits: Limits = UNLIMITED) -> StepResult:
@@ -263,7 +253,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         lights=None if state.light is None else state.light.result,
         placed=state.absolute is not None and state.absolute.placed,
         gap=None if state.absolute is None else state.absolute.gap,
-        places=adrift.places(state),
+        places=relocalisation.places(state),
         apart=state.absolute is not None and state.absolute.apart,
         misplaced=misplaced(state),
         aside=state.atlas.aside is not None,
@@ -271,17 +261,17 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         lag=state.lag.told,
         jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
         anew=state.anew,
-        protection=protection.bound(state, P),
+        protection=protection_level.bound(state, P),
     )
 
 
 def misplaced(state: State) -> bool:
-    """Whether light receives what it cannot receive at the pose; see :func:`estimator.relocate_light.misplaced`."""
+    """Whether light receives what it cannot receive at the pose; see `light_evidence.misplaced`."""
     if state.light is None or state.absolute is None or not state.absolute.placed:
         return False
-    from estimator import relocate_light  # costs nothing where there is no photodiode
+    from estimator.relocalisation import light_evidence  # costs nothing where there is no photodiode
 
-    return relocate_light.misplaced(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
+    return light_evidence.misplaced(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
 
 
 def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
@@ -290,11 +280,11 @@ def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
     A corridor along x of the odom frame may run along y of the map.
     """
     if state.absolute is not None and state.absolute.placed:
-        return np.asarray(P.diagonal() < absolute.KNOWN, dtype=np.float64)
+        return np.asarray(P.diagonal() < map_odom_filter.KNOWN, dtype=np.float64)
     if match is None or not match.ok:
         return np.ones(3) if match is None else match.known_axes
     R = se2.rotation(state.T_map_odom[2])
-    return matching.known_axes(R @ match.information @ R.T)
+    return scan_matcher.known_axes(R @ match.information @ R.T)
 
 
 def keyframe_poses(state: State) -> dict[int, Array]:
@@ -307,4 +297,4 @@ def keyframe_poses(state: State) -> dict[int, Array]:
 
 def render_map(state: State, resolution: float) -> Grid:
     """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (`livemap.at_once`)."""
-    return livemap.at_once(hanging(state.keyframes.values()), resolution)
+    return live_grid.at_once(hanging(state.keyframes.values()), resolution)

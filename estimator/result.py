@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma_epoch import BlockFlag
-from estimator.records import Array, Job
+from estimator.cdma.epoch import BlockFlag
+from estimator.measurements import Array, Job
 
 SURPRISE: Final = 16.3
 """Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) beyond which the pose and the lights' do not agree."""
@@ -222,7 +222,7 @@ class LightsResult:
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """Bound on the error of T_map_base at the stated risk, if the place is not in doubt (`estimator/protection.py`).
+    """Bound on the error of T_map_base at the stated risk, if the place is not in doubt (`protection_level`).
 
     Attributes:
         horizontal_m, yaw_rad: the bounds. laser, light, wheels: what they rest on; the wheels are shared by both.
@@ -237,7 +237,7 @@ class Protection:
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """By how much scans are stamped later than the wheels' readings (`estimator/timelag.py`); one sigma. Both in s.
+    """By how much scans are stamped later than the wheels' readings (`time_offset`); one sigma. Both in s.
 
     Negative: the wheels are late.
     """

@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator import se2
-from estimator.atlas import Atlas
-from estimator.frozen import Frozen
-from estimator.hypotheses import Suspicion
-from estimator.keyframe import Keyframe, Submap
-from estimator.livemap import LiveMap
-from estimator.localmap import LocalMap, MapSettings
-from estimator.loop import LoopSettings
-from estimator.matchers import Matcher, Weight, load
-from estimator.matching import Asked, MatchSettings
-from estimator.motion import Motion, MotionNoise
-from estimator.records import Array, Scan
+from estimator.fusion.map_odom_history import Frozen
+from estimator.fusion.motion_model import Motion, MotionNoise
+from estimator.fusion.time_offset import TimeLag
+from estimator.mapping.keyframe import Keyframe, Submap
+from estimator.mapping.live_grid import LiveMap
+from estimator.mapping.loop_verification import LoopSettings
+from estimator.mapping.submap_graph import Atlas
+from estimator.measurements import Array, Scan
+from estimator.numerics import se2
+from estimator.relocalisation.hypothesis_tracking import Suspicion
 from estimator.result import MatchResult
-from estimator.scanpoints import ScanPoints
-from estimator.timelag import TimeLag
+from estimator.scan_matching.deskew import ScanPoints
+from estimator.scan_matching.local_map import LocalMap, MapSettings
+from estimator.scan_matching.matcher_choice import Matcher, Weight, load
+from estimator.scan_matching.scan_matcher import Asked, MatchSettings
 
 if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
-    from estimator.absolute import Absolute
-    from estimator.light import Light, LightsSetup
+    from estimator.fusion.map_odom_filter import Absolute
+    from estimator.light_filter.light_channel import Light, LightsSetup
 
 Place = tuple[int, int, int]
 
@@ -87,13 +87,13 @@ class State:
         anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, covariance of its place in the map.
         next_key: ID of the next keyframe. since_keyframe: scans since the newest. failures: scans in a row that did
             not match. jumps: see `StepResult`. noise_m: range noise learned from residuals, 0 before the first.
-        kinship: sums over neighbouring residuals, product and squares, that fade (`estimator.alike`).
-        guessed_s: how long the pose has been carried on by a guess, along a direction that nothing held.
-        frozen: ties of a while ago, that light is held against.
-        way: metres driven, and turned as keyframes count turns, by the prediction; paces: of them, in keyframes.
-        t_scan, T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched.
-        t_newest_scan: end of the latest scan's sweep. bearing_rad: the latest bearings found in order.
-        anew: how often the local map was begun anew because nothing fitted the old one. let_go: how many stored maps
+        kinship: sums over neighbouring residuals, product and squares, that fade
+        (`estimator.scan_matching.residual_correlation`). guessed_s: how long the pose has been carried on by a guess,
+        along a direction that nothing held. frozen: ties of a while ago, that light is held against. way: metres
+        driven, and turned as keyframes count turns, by the prediction; paces: of them, in keyframes. t_scan,
+        T_odom_scan: instant and pose of the latest scan. t_match: of the latest that matched. t_newest_scan: end of the
+        latest scan's sweep. bearing_rad: the latest bearings found in order. anew: how often the local map was begun
+        anew because nothing fitted the old one. let_go: how many stored maps
             were let go of because the robot is nowhere in them.
         lag: between the stamps of scans and wheels. suspicion: whether the robot was carried off.
         journal: is told of every match before it is fused, None: nobody asks.
@@ -152,8 +152,8 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
     if state.settings.live_m > 0.0:
         state.live = LiveMap(state.settings.live_m)
     if lights is not None:
-        from estimator.absolute import Absolute
-        from estimator.light import Light
+        from estimator.fusion.map_odom_filter import Absolute
+        from estimator.light_filter.light_channel import Light
 
         state.light, state.absolute = Light(lights), Absolute()
     return state

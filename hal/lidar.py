@@ -1,6 +1,7 @@
 """What a 2D lidar yields, in device units: the contract between any lidar driver and the daemon.
 
-Units are the device's own (steps, range units, device ticks). Only ``daemon/bridge.py`` turns them into SI and frames.
+Units are the device's own (steps, range units, device ticks). Only ``daemon/devices/conversion.py`` turns them into SI
+and frames.
 """
 
 from __future__ import annotations

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from hal.errors import DeviceMissing, HalError
 from hal.hokuyo import discover
-from hal.hokuyo.line import Line
 from hal.hokuyo.scip import BAUD_RATES
+from hal.hokuyo.scip_line import Line
 from hal.hokuyo.session import Session
 from hal.lidar import LidarGeometry
-from hal.port import PortOpener
+from hal.port.port import PortOpener
 
 _USB_BAUD = 115200
 
@@ -52,7 +52,7 @@ async def probe(opener: PortOpener, devices: Sequence[str] = ()) -> list[Finding
     """Identify what is at each device; a sensor that streams is stopped, and left idle.
 
     Args:
-        opener: opens ports (:func:`hal.opening.open_port`).
+        opener: opens ports (:func:`hal.port.opening.open_port`).
         devices: paths and ``tcp://`` names; none: every port at which a HOKUYO may be.
     """
     return [await identify_at(opener, device) for device in devices or discover.candidates()]

@@ -16,7 +16,7 @@ from typing import Final, Protocol, cast
 from hal.clock import Clock
 from hal.errors import DeviceRefused
 from hal.lidar import Lidar
-from hal.port import PortOpener
+from hal.port.port import PortOpener
 
 DEFAULT: Final = "hokuyo"
 GROUP: Final = "lumiloop.lidar"

@@ -13,14 +13,14 @@ from typing import Final
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
-from daemon import cli
-from daemon.endpoints import in_url, parse_endpoint
-from hal.serving import work_until_told
-from taps import rostypes
-from taps.follow import follow
-from taps.frames import NotTheStream
-from taps.ros import TOPICS, Out
-from taps.stream import Stream
+from daemon.cli import parser
+from daemon.config.endpoints import in_url, parse_endpoint
+from hal.run_server import work_until_told
+from taps.ros import types
+from taps.ros.messages import TOPICS, Out
+from taps.stream.client import Stream
+from taps.stream.messages import NotTheStream
+from taps.stream.ros_follower import follow
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -31,18 +31,18 @@ def main(args: argparse.Namespace) -> int:
         host, port = parse_endpoint(args.listen)
         bridge = Bridge(host, port, args.settings.name)
     except ValueError as error:
-        return cli.fail(f"--listen: {error}", cli.USAGE)
+        return parser.fail(f"--listen: {error}", parser.USAGE)
     except (OSError, RuntimeError) as error:
-        return cli.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
-    cli.say(f"ws://{in_url(host)}:{bridge.port}")
+        return parser.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
+    parser.say(f"ws://{in_url(host)}:{bridge.port}")
     try:
         stream = Stream(args.stream or args.settings.name, WANTED)
         asyncio.run(work_until_told(follow(stream, args.settings, bridge)))
     except NotTheStream as error:
-        return cli.fail(str(error))
+        return parser.fail(str(error))
     finally:
         bridge.close()
-    return cli.OK
+    return parser.OK
 
 
 class Bridge(ServerListener):
@@ -57,9 +57,7 @@ class Bridge(ServerListener):
         self._channels = {
             topic: foxglove.Channel(
                 topic,
-                schema=foxglove.Schema(
-                    name=about.kind, encoding="ros2msg", data=rostypes.definition(about.kind).encode()
-                ),
+                schema=foxglove.Schema(name=about.kind, encoding="ros2msg", data=types.definition(about.kind).encode()),
                 message_encoding="cdr",
                 context=self._context,
             )

@@ -21,7 +21,8 @@ settings.load_profile("shared machine")  # how long an example takes there says 
 ROOT = Path(__file__).parents[1]
 UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")
 """Folders of storms and drives: they go over the same lines a million times, for which tracing takes two to five times
-as long, and reach hardly one that the other tests do not (`tools.floors` tells). The estimator's are traced in the row
+as long, and reach hardly one that the other tests do not (`tools.ci.floors` tells). The estimator's are traced in the
+row
 without the compiler."""
 
 FIRST = (
@@ -94,7 +95,7 @@ def warm_kernels(request: pytest.FixtureRequest) -> None:
 
 def compile_kernels(config: pytest.Config) -> None:
     """Compile the kernels of this tree where they are missing; that is said, and no test's time is taken for it."""
-    from daemon.warmup import is_warm
+    from daemon.runtime.warmup import is_warm
 
     plugins = config.pluginmanager
     terminal, capture = plugins.get_plugin("terminalreporter"), plugins.get_plugin("capturemanager")
@@ -102,7 +103,7 @@ def compile_kernels(config: pytest.Config) -> None:
         with contextlib.nullcontext() if capture is None else capture.global_and_fixture_disabled():
             terminal.ensure_newline()
             terminal.write_line("the kernels of this tree are compiled first, once: that takes a minute or two")
-    command = [sys.executable, "-c", "from daemon.warmup import load; load()"]
+    command = [sys.executable, "-c", "from daemon.runtime.warmup import load; load()"]
     with untimed(config):
         subprocess.run(command, cwd=ROOT, check=True, timeout=COMPILING_S)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import main
+from daemon.cli.parser import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -75,7 +75,7 @@ def programs() -> dict[str, list[tuple[str, list[str]]]]:
     return found
 
 
-MADE = {"experiments": "tools.experiments", "bench": "tools.bench", "demo": "tools.demo", "soak": "tools.soak",
+MADE = {"experiments": "tools.experiments", "bench": "tools.bench", "demo": "tools.demo.run", "soak": "tools.soak",
         "fuzz": "tests.fuzz"}  # fmt: skip
 
 

@@ -22,7 +22,7 @@ ESTIMATOR_NEVER = {
     *("os", "pathlib", "io", "subprocess", "logging"),
     *("asyncio", "threading", "time", "socket", "serial", "random"),
 }
-ESTIMATOR_EXCEPTION = "kernel_folder.py"  # finds the kernel cache once, at import
+ESTIMATOR_EXCEPTION = "jit_cache.py"  # finds the kernel cache once, at import
 
 
 def imports_of(path: Path) -> set[str]:
@@ -71,7 +71,7 @@ def test_fake_and_driver_share_no_codec() -> None:
 @pytest.mark.parametrize("words", [["--help"], ["status", "--help"], ["check", "--help"]])
 def test_commands_without_numbers_do_not_load_numba(words: list[str]) -> None:
     code = (
-        f"import sys\nfrom daemon.cli import main\ntry:\n    main({words!r})\nexcept SystemExit:\n    pass\n"
+        f"import sys\nfrom daemon.cli.parser import main\ntry:\n    main({words!r})\nexcept SystemExit:\n    pass\n"
         "assert 'numba' not in sys.modules and 'numpy' not in sys.modules"
     )
     command = [sys.executable, "-W", "error", "-c", code]

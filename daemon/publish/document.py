@@ -7,16 +7,25 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.faults import FAULTS
-from daemon.publish import holding, integrity, lights, modbus, parts, pulse, registers, requests
-from daemon.publish.block import Block
+from daemon.health.faults import FAULTS
+from daemon.health.reasons import REASONS
+from daemon.publish.document_tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, table
 from daemon.publish.document_udp import udp_page
-from daemon.publish.holding import CommandCode
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
-from daemon.publish.rtu import PATIENCE_S, SILENCE_S
-from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
-from daemon.publish.tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, table
-from daemon.reasons import REASONS
+from daemon.publish.modbus import (
+    holding,
+    integrity_block,
+    lights_block,
+    parts_block,
+    registers,
+    requests,
+    server,
+    timing_block,
+)
+from daemon.publish.modbus.block import Block
+from daemon.publish.modbus.holding import CommandCode
+from daemon.publish.modbus.rtu import PATIENCE_S, SILENCE_S
+from daemon.snapshot import LightFix, LinkUse, LoopReason, State
 
 
 def _state_rows() -> list[tuple[str, ...]]:
@@ -151,12 +160,12 @@ A reference client is `tools/clients/read_rtu.py`. Try it with
 
 
 def _lights() -> str:
-    first, last = _span(block := lights.BLOCK)
+    first, last = _span(block := lights_block.BLOCK)
     every = layout_rows(block, block.body, 1)
     head = [row for row in every if not row[1].startswith("`link_")]
     one = [row for row in every if row[1].startswith("`link_1_")]
-    start, width = block.body + block.offsets[len(head)], lights.ROW_WORDS
-    words, links = block.registers, lights.ROWS
+    start, width = block.body + block.offsets[len(head)], lights_block.ROW_WORDS
+    words, links = block.registers, lights_block.ROWS
     return f"""## Lights: input registers {first} to {last}
 
 The lamps in view, strongest first, and the position from lights alone, which the laser never touches. Read
@@ -172,7 +181,7 @@ begins at {start} + {width} (k - 1), and the table shows the first.
 
 
 def _integrity() -> str:
-    first, last = _span(block := integrity.BLOCK)
+    first, last = _span(block := integrity_block.BLOCK)
     return f"""## Integrity: input registers {first} to {last}
 
 How far the pose can be trusted; what a protection level is, and at which risk it holds, says
@@ -180,14 +189,14 @@ How far the pose can be trusted; what a protection level is, and at which risk i
 
 {_whole(block)}
 
-{table(("bit of `witnesses`", "name", "set when"), bit_rows(integrity.WITNESSES))}
+{table(("bit of `witnesses`", "name", "set when"), bit_rows(integrity_block.WITNESSES))}
 
 {table(("`loop_reason`", "name", "meaning"), [(str(why.value), why.name, LOOPS[why]) for why in LoopReason])}
 """
 
 
 def _pulse() -> str:
-    first, last = _span(block := pulse.BLOCK)
+    first, last = _span(block := timing_block.BLOCK)
     return f"""## The cycle: input registers {first} to {last}
 
 What the daemon leaves out where the computer is too slow, how long the stages of a cycle take, and when it stood still.
@@ -199,7 +208,7 @@ Medians and the like are those of the last half minute to minute. Read **{block.
 
 
 def _parts() -> str:
-    first, last = _span(block := parts.BLOCK)
+    first, last = _span(block := parts_block.BLOCK)
     return f"""## The parts: input registers {first} to {last}
 
 Every fault that is present, not the gravest alone, what had to be restarted since the start, and for how long the
@@ -213,7 +222,7 @@ in one request**. Faults are looked for once a second.
 
 
 def _thread_rows() -> list[tuple[str, ...]]:
-    return [(str(thread.value), thread.name, f"{text}.") for thread, text in parts.THREADS.items()]
+    return [(str(thread.value), thread.name, f"{text}.") for thread, text in parts_block.THREADS.items()]
 
 
 def _capital(text: str) -> str:
@@ -266,11 +275,11 @@ def _limits() -> str:
         ("address outside the tables", "", "exception 2"),
         ("any other function", "", "exception 1"),
         ("an error of the daemon's own, which its log tells", "", "exception 4"),
-        ("TCP connections", str(modbus.MAX_CONNECTIONS),
-         f"the longest idle is dropped if idle for {modbus.EVICT_S:g} s, else the new one"),
-        ("TCP without a request", f"{modbus.IDLE_S:g} s", "closed"),
-        ("TCP request not completed", f"{modbus.PARTIAL_S:g} s", "closed"),
-        ("TCP answers not read", f"{modbus.STUCK_S:g} s", "closed"),
+        ("TCP connections", str(server.MAX_CONNECTIONS),
+         f"the longest idle is dropped if idle for {server.EVICT_S:g} s, else the new one"),
+        ("TCP without a request", f"{server.IDLE_S:g} s", "closed"),
+        ("TCP request not completed", f"{server.PARTIAL_S:g} s", "closed"),
+        ("TCP answers not read", f"{server.STUCK_S:g} s", "closed"),
         ("what is not Modbus", "", "UDP: ignored; TCP: closed; the log names who sends it, once a minute"),
     ]  # fmt: skip
     return table(("what", "limit", "beyond it"), rows)

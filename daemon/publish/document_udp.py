@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from daemon.publish import integrity, lights, registers, subscribe
-from daemon.publish.tables import NOT_KNOWN, NOTICE, layout_rows, table
-from daemon.watch import LATE_S
-from hal import input_codec, inputs
-from hal.arrival import MAX_AGE_S
+from daemon.integrity.input_monitor import LATE_S
+from daemon.publish import udp_subscriptions
+from daemon.publish.document_tables import NOT_KNOWN, NOTICE, layout_rows, table
+from daemon.publish.modbus import integrity_block, lights_block, registers
+from hal.net import input_codec, inputs
+from hal.net.rx_timestamp import MAX_AGE_S
 
 
 def udp_page() -> str:
@@ -21,8 +22,8 @@ def udp_page() -> str:
          f"{registers.SMALLEST_DATAGRAM} from programs that knew no lights, which sent no more than `devices`; "
          f"{registers.TRUST_OFFSET + 4} from those that sent no more than `light_age`."),
         *layout_rows(registers.BODY, registers.BODY_OFFSET, 2),
-        *layout_rows(lights.TAIL, registers.TAIL_OFFSET, 2),
-        *layout_rows(integrity.TAIL, registers.TRUST_OFFSET, 2),
+        *layout_rows(lights_block.TAIL, registers.TAIL_OFFSET, 2),
+        *layout_rows(integrity_block.TAIL, registers.TRUST_OFFSET, 2),
         ("length - 4", "`crc`", "uint32", "", "", f"CRC-32 of all bytes before it (at {crc} in this version)."),
     ]  # fmt: skip
     return f"""{NOTICE}
@@ -71,15 +72,15 @@ CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
 def _subscribing() -> str:
     return f"""## Subscribing
 
-With `*:PORT` among `pose.receivers`, a program gets pose datagrams by asking for them on that port: {subscribe.SIZE}
-bytes, little-endian, both ways. A reference client is `tools/clients/subscribe_pose.py`.
+With `*:PORT` among `pose.receivers`, a program gets pose datagrams by asking for them on that port:
+{udp_subscriptions.SIZE} bytes, little-endian, both ways. A reference client is `tools/clients/subscribe_pose.py`.
 
 {table(("byte", "type", "meaning"), _subscription_rows())}
 
-1. Send ASK with the lease that is wanted and cookie 0. The answer is COOKIE.
-2. Send ASK again with that cookie. The answer is GRANTED with the lease in seconds, {subscribe.LONGEST_LEASE_S} at
-   most, or FULL: there are never more than {subscribe.SUBSCRIBERS} subscribers. Pose datagrams come to the socket that
-   asked, from the port that was asked.
+1. Send ASK with the lease that is wanted and cookie 0. The answer is COOKIE. 2. Send ASK again with that cookie. The
+answer is GRANTED with the lease in seconds, {udp_subscriptions.LONGEST_LEASE_S} at
+   most, or FULL: there are never more than {udp_subscriptions.SUBSCRIBERS} subscribers. Pose datagrams come to the
+   socket that asked, from the port that was asked.
 3. Ask again with the cookie of the last answer before the lease is over, best after a third of it; if the answer is
    COOKIE, repeat with the new one. A lease of 0 ends it.
 
@@ -90,24 +91,24 @@ than what asked for it. Addresses that are not in `allow` get none.
 """
 
 
-_STATUSES: Final[dict[subscribe.Status, str]] = {
-    subscribe.Status.ASK: "client: send me pose datagrams for `lease` seconds; 0: no more",
-    subscribe.Status.COOKIE: "daemon: ask again with this cookie",
-    subscribe.Status.GRANTED: "daemon: for `lease` seconds from now",
-    subscribe.Status.FULL: "daemon: there are as many subscribers as can be; try later",
-    subscribe.Status.ENDED: "daemon: no more are sent",
+_STATUSES: Final[dict[udp_subscriptions.Status, str]] = {
+    udp_subscriptions.Status.ASK: "client: send me pose datagrams for `lease` seconds; 0: no more",
+    udp_subscriptions.Status.COOKIE: "daemon: ask again with this cookie",
+    udp_subscriptions.Status.GRANTED: "daemon: for `lease` seconds from now",
+    udp_subscriptions.Status.FULL: "daemon: there are as many subscribers as can be; try later",
+    udp_subscriptions.Status.ENDED: "daemon: no more are sent",
 }
 
 
 def _status_rows() -> list[tuple[str, ...]]:
-    return [(str(status.value), status.name, _STATUSES[status]) for status in subscribe.Status]
+    return [(str(status.value), status.name, _STATUSES[status]) for status in udp_subscriptions.Status]
 
 
 def _subscription_rows() -> list[tuple[str, ...]]:
     return [
-        ("0", "4 bytes", f'`magic`: "{subscribe.MAGIC.decode()}".'),
-        ("4", "uint16", f"`version`: {subscribe.VERSION}."),
-        ("6", "uint16", f"`length` of the whole datagram: {subscribe.SIZE}."),
+        ("0", "4 bytes", f'`magic`: "{udp_subscriptions.MAGIC.decode()}".'),
+        ("4", "uint16", f"`version`: {udp_subscriptions.VERSION}."),
+        ("6", "uint16", f"`length` of the whole datagram: {udp_subscriptions.SIZE}."),
         ("8", "uint16", "`status`."),
         ("10", "uint16", "`lease` in seconds."),
         ("12", "uint64", "`cookie`: 0 before the first is known."),

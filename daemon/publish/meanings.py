@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from daemon.publish.holding import CommandCode
-from daemon.publish.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.publish.modbus.holding import CommandCode
+from daemon.snapshot import LightFix, LinkUse, LoopReason, State
 
 STATES: Final[dict[State, str]] = {
     State.STARTING: "warming up, nothing to say yet",

@@ -14,8 +14,8 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
-from daemon.maptiles import NOTHING_SHOWN
-from hal.share import Share
+from daemon.maps.tiles import NOTHING_SHOWN
+from hal.net.fair_share import Share
 
 log = logging.getLogger(__name__)
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from daemon.publish.snapshot import LightPicture, Snapshot
+from daemon.snapshot import LightPicture, Snapshot
 
 Fields = Mapping[str, str]
 
 _SAID: Final = {"state_name": "str", "meaning": "str", "remedy": "str"}
 RECORDS: Final[Mapping[str, type]] = {"pose": Snapshot, "lights": LightPicture}
-"""Topics that tell a record of `daemon.publish.snapshot` with all its fields."""
+"""Topics that tell a record of `daemon.snapshot` with all its fields."""
 FIELDS: Final[Mapping[str, Fields]] = {
     "hello": {"schema": "int", "name": "str", "pid": "int", "topics": "map of str"},
     "error": {"text": "str"},

@@ -16,14 +16,14 @@ from pathlib import Path
 from hal.errors import HalError
 from hal.fake.control import Control, serve_control
 from hal.fake.faults import FaultError
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import MODELS, LidarModel, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import MODELS, LidarModel, Unit
+from hal.fake.lidar.scan import ScanSource
+from hal.fake.lidar.scan_world import RecordedRanges, Room
 from hal.fake.pty_server import PtyServer
-from hal.fake.scan import ScanSource
 from hal.fake.schedule import FaultSchedule
 from hal.fake.tcp_server import TcpServer
-from hal.fake.world import RecordedRanges, Room
-from hal.serving import say, until_told
+from hal.run_server import say, until_told
 
 
 @dataclass(slots=True)

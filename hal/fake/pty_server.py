@@ -1,7 +1,7 @@
 """The fake device as a serial port of this computer.
 
 Everything runs on the event loop without threads. A host that does not read makes the queue of the pty full; the
-sensor then loses whole replies and they are counted (:attr:`hal.fake.outlet.OutletCounts.refused_by_host`).
+sensor then loses whole replies and they are counted (:attr:`hal.fake.lidar.output_line.OutletCounts.refused_by_host`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import tty
 from pathlib import Path
 
 from hal.errors import DeviceRefused
-from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.lidar.device import FakeHokuyo
 
 PTY_POLL_S = 0.02
 """How often a pty looks whether a host has opened it; Linux gives no event for that."""
@@ -54,18 +54,18 @@ class PtyServer:
         return str(self._link) if self._link is not None else self._path
 
     def take(self, data: bytes) -> bool:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self._rest:
             return False
         return self._write(data)
 
     def baud(self) -> int:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         raw = fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size))
         return int(TERMIOS2.unpack(raw)[-1])
 
     def hang_up(self) -> None:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         self._device.detach()
         self._shut()
 

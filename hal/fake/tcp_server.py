@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.lidar.device import FakeHokuyo
 
 TCP_QUEUE = 128 * 1024
 """Bytes that may wait for a host that does not read before replies are lost."""
@@ -55,18 +55,18 @@ class TcpServer:
         self._device.detach()
 
     def take(self, data: bytes) -> bool:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self._transport is None or self._transport.get_write_buffer_size() > TCP_QUEUE:
             return False
         self._transport.write(data)
         return True
 
     def baud(self) -> int:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         return 0
 
     def hang_up(self) -> None:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self._transport is not None:
             self._transport.abort()
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from hal.clock import Clock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
-from hal.fake.hokuyo import FakeHokuyo
-from hal.port import MemoryPort, Port, memory_pair
+from hal.fake.lidar.device import FakeHokuyo
+from hal.port.port import MemoryPort, Port, memory_pair
 
 
 class MemoryHost:
@@ -18,7 +18,7 @@ class MemoryHost:
         port.start(lambda data, _t: device.receive(data), self._lost)
 
     def take(self, data: bytes) -> bool:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         try:
             self._port.write(data)
         except DeviceMissing:  # the host has just closed; `_lost` comes in the next turn of the loop
@@ -26,11 +26,11 @@ class MemoryHost:
         return True
 
     def baud(self) -> int:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         return self._port.peer_baud
 
     def hang_up(self) -> None:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self.open:
             self.open = False
             self._device.detach()
@@ -43,7 +43,7 @@ class MemoryHost:
 
 
 class FakeOpener:
-    """A :class:`hal.port.PortOpener` under which fake devices are plugged in by name.
+    """A :class:`hal.port.port.PortOpener` under which fake devices are plugged in by name.
 
     Args:
         clock: gives arrival times; a :class:`hal.clock.LoopClock` in virtual time.

@@ -18,16 +18,16 @@ from typing import Final
 from hal.clock import Clock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.hokuyo import discover
-from hal.hokuyo.follow import Follower
-from hal.hokuyo.line import Line
 from hal.hokuyo.models import Identity, line_speed, stream_request
 from hal.hokuyo.payload import ScanRequest
 from hal.hokuyo.scip import BAUD_RATES
+from hal.hokuyo.scip_line import Line
 from hal.hokuyo.session import AbnormalState, Session
 from hal.hokuyo.stream import ScanStream
+from hal.hokuyo.stream_watch import Follower
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
-from hal.port import PortOpener
-from hal.recovery import stay_connected
+from hal.port.port import PortOpener
+from hal.port.recovery import stay_connected
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class HokuyoDriver:
     Args:
         device: path, ``tcp://host:port``, or ``auto``: the first port at which a HOKUYO answers.
         clock: gives the times of arrival; the same as the ports'.
-        opener: opens ports (:func:`hal.opening.open_port`).
+        opener: opens ports (:func:`hal.port.opening.open_port`).
         serial: the sensor's own number (``VV SERI``); with ``auto`` it is found wherever it is plugged in.
         baud: RS-232 rate to use; 0: the lowest that carries every revolution. No meaning on USB and Ethernet; a port
             that is not known to be either is taken for an RS-232 line where it is given.

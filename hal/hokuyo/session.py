@@ -23,10 +23,10 @@ from typing import Final
 
 from hal.errors import DataInvalid, DeviceFault, DeviceRefused, HalError
 from hal.hokuyo import scip
-from hal.hokuyo.line import Line, OnFrame, legible, printable, reply_or_none
 from hal.hokuyo.models import BEFORE_KNOWN, Identity, ModelFacts, identify
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import BadFrame, Reply, parse_reply, parse_text
+from hal.hokuyo.scip_line import Line, OnFrame, legible, printable, reply_or_none
 
 QUIET_S: Final = 0.1
 FIRST_SCAN_S: Final = 6.0  # the motor takes 2 to 5 s to spin up after power-on

@@ -5,7 +5,8 @@ Three stages, each a class:
 1. :class:`Unwrapper` decides what a stamp is: the next revolution, a wrap, a repeat, a damaged or restarted clock.
 2. :class:`Revolutions` finds the fraction of the millisecond that the stamp cut off: the motor turns evenly, so a run
    of whole milliseconds around an uneven period pins it down like a vernier.
-3. :class:`hal.hokuyo.envelope.Envelope` maps sensor seconds to host seconds by the lower edge of (arrival - stamp).
+3. :class:`hal.hokuyo.clock_envelope.Envelope` maps sensor seconds to host seconds by the lower edge of (arrival -
+stamp).
 
 A stamp names the moment the beam passes step 0 (SCIP 2.0, C-42-03320B); because the map is made from the same stamps,
 a constant error of a firmware's stamps cancels, and only the constant way from step 0 to arrival must be known.
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from hal.hokuyo.envelope import LAG_S, SLOPE_LIMIT, Envelope
+from hal.hokuyo.clock_envelope import LAG_S, SLOPE_LIMIT, Envelope
 from hal.hokuyo.scip import TICK_MODULUS
 
 _LEARN_TURNS: Final = 300  # over fewer, the one millisecond of a stamp shows in the period

@@ -18,20 +18,20 @@ from functools import partial
 from typing import Final
 
 from hal.adc import AdcStatus, Blemish, BusStuck, RawSamples, WrongChip
+from hal.bus.i2c import AsyncBus, BusOpener, read, write
 from hal.clock import Clock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
-from hal.i2c import AsyncBus, BusOpener, read, write
 from hal.lidar import Link
-from hal.photodiode.capability import Capability, measure
+from hal.photodiode.adapter_limits import Capability, measure
+from hal.photodiode.bus_watchdog import HANG_S, WatchedBus
 from hal.photodiode.chips import BlockChip, chip_named
-from hal.photodiode.follow import Followed, Follower
-from hal.photodiode.judge import Judge
-from hal.photodiode.level import PERIOD_S, LevelInput, LevelMeter, ask
+from hal.photodiode.dc_channel import PERIOD_S, LevelInput, LevelMeter, ask
+from hal.photodiode.diagnosis import Judge
+from hal.photodiode.io_errors import explain, policy_for
 from hal.photodiode.sampler import Sampler, describe
-from hal.photodiode.silence import HANG_S, WatchedBus
+from hal.photodiode.stream_watch import Followed, Follower
 from hal.photodiode.timebase import SLOWER
-from hal.photodiode.trouble import explain, policy_for
-from hal.recovery import stay_connected
+from hal.port.recovery import stay_connected
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class PhotodiodeAdc:
     Args:
         bus: name of the bus, as the opener takes it. address: 7-bit address of the converter.
         chip: MCP3221, ADC121C021 or ADC121C027, in any case of letters.
-        clock: the loop's. opener: opens buses (:func:`hal.opening.open_bus`).
+        clock: the loop's. opener: opens buses (:func:`hal.port.opening.open_bus`).
         sampling: length of blocks, DC channel.
 
     Raises:

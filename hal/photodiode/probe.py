@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from hal.bus.i2c import NACKS, AsyncBus, BusOpener, read
 from hal.errors import HalError
-from hal.i2c import NACKS, AsyncBus, BusOpener, read
 from hal.photodiode import adc121c021, ads1x15, mcp3221
 from hal.photodiode.chips import Query
-from hal.photodiode.level import ask
-from hal.photodiode.trouble import explain
+from hal.photodiode.dc_channel import ask
+from hal.photodiode.io_errors import explain
 
 ADDRESSES: Final = tuple(sorted(mcp3221.ADDRESSES | ads1x15.ADDRESSES | adc121c021.ADC121C021.addresses))
 _ELSE: Final = "something that is none of the converters known here"
@@ -72,8 +72,8 @@ async def probe_buses(opener: BusOpener, buses: Sequence[str]) -> list[BusFindin
     """Look at each bus; never raises for anything a bus does.
 
     Args:
-        opener: opens buses (:func:`hal.opening.open_bus`).
-        buses: their names; those of this computer are :func:`hal.i2c_linux.buses`.
+        opener: opens buses (:func:`hal.port.opening.open_bus`).
+        buses: their names; those of this computer are :func:`hal.bus.i2c_linux.buses`.
     """
     return [await probe_bus(opener, bus) for bus in buses]
 

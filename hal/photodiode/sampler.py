@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 from hal.adc import Blemish, RawSamples
-from hal.i2c import Transferred
-from hal.photodiode.blocks import Census, inspect
-from hal.photodiode.capability import Capability
+from hal.bus.i2c import Transferred
+from hal.photodiode.adapter_limits import Capability
+from hal.photodiode.block_check import Census, inspect
 from hal.photodiode.chips import CLOCKS_PER_WORD, BlockChip
 from hal.photodiode.timebase import SclClock
 

@@ -21,10 +21,10 @@ from hal.lidar import LidarGeometry, RawScan
 from hal.odometry import RawOdometry
 from hal.replay.carmen_lines import LaserLine, LineProblem, OdometryLine, ParameterLine, parse
 from hal.replay.carmen_scans import CarmenScan, convert
-from hal.replay.laser import beam_rule
+from hal.replay.geometry_guess import beam_rule
+from hal.replay.monotone_stamps import Monotone, monotone
 from hal.replay.mount import log_mount
 from hal.replay.report import LogReport
-from hal.replay.stamps import Monotone, monotone
 from hal.replay.text import Torn, lines
 
 Array = npt.NDArray[np.float64]

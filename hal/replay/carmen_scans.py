@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hal.lidar import VALID, LidarGeometry
 from hal.replay.carmen_lines import LaserLine, LaserSetup
-from hal.replay.laser import beam_rule, no_return, whole_step
+from hal.replay.geometry_guess import beam_rule, no_return, whole_step
 from hal.replay.report import LogReport
 
 Array = npt.NDArray[np.float64]

@@ -13,9 +13,9 @@ from typing import Final
 
 import zenoh
 
-from daemon import cli
+from daemon.cli import parser
 from taps.fleet import messages
-from taps.zenohlink import BEAT_S, Say, listed, withdraw
+from taps.zenoh_session import BEAT_S, Say, listed, withdraw
 
 ALONE_S: Final = 5.0
 """A name is taken from nobody before its speaker has been gone for so long, with the router there: after a router's
@@ -36,7 +36,7 @@ class Claim:
     """
 
     def __init__(
-        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = cli.say
+        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = parser.say
     ) -> None:
         self.mine = False
         self._session, self._robot, self._host, self._on_change, self._say = session, robot, host, on_change, say

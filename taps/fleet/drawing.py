@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from taps.fleet.messages import Cells, printable
 from taps.fleet.roster import Chart, Member, number
-from taps.tiles import FREE, UNSEEN, WALL
+from taps.stream.tiles import FREE, UNSEEN, WALL
 
 LABELS: Final = "123456789abcdefghijklmnopqrstuvwxyz"
 TALL: Final = 2.0

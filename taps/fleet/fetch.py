@@ -12,16 +12,16 @@ from typing import Final
 
 import zenoh
 
-from daemon import cli
-from daemon.publish.client import NoAnswer, address_of
-from daemon.wholefile import reason_of
-from hal.serving import work_until_told
+from daemon.cli import parser
+from daemon.cli.status import NoAnswer, address_of
+from daemon.system.atomic_file import reason_of
+from hal.run_server import work_until_told
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, Unreadable, printable
 from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, Taken, chosen, home, place, sha256_of
 from taps.fleet.share import key_of
 from taps.view.orders import OrderRefused, switch_map
-from taps.zenohlink import BadEndpoint, answers, joined, watched
+from taps.zenoh_session import BadEndpoint, answers, joined, watched
 
 CONTENT_S: Final = 60.0
 """A map may take so long to come."""
@@ -39,10 +39,10 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(work_until_told(fetcher.run()) if args.follow else fetcher.run())
     except BadEndpoint as error:
-        return cli.fail(str(error), cli.USAGE)
+        return parser.fail(str(error), parser.USAGE)
     except NoAnswer as error:
-        return cli.fail(f"--switch: {error}", cli.USAGE)
-    return cli.FAILED if fetcher.failed else cli.OK
+        return parser.fail(f"--switch: {error}", parser.USAGE)
+    return parser.FAILED if fetcher.failed else parser.OK
 
 
 class Fetcher:
@@ -97,7 +97,7 @@ class Fetcher:
                 said, self.failed = str(error), True
             if said != self._said.get(kind):
                 self._said[kind] = said
-                cli.say(printable(said))  # who shares has chosen some of the words
+                parser.say(printable(said))  # who shares has chosen some of the words
 
     async def _fetch(self, session: zenoh.Session, kind: str, modbus: tuple[str, int] | None) -> str:
         """What came of it.
@@ -149,7 +149,7 @@ class Fetcher:
                 try:
                     offers.append(messages.read(content, Offer))
                 except Unreadable as error:
-                    cli.say(printable(f"what is offered as {kind} is not one: {error}"))
+                    parser.say(printable(f"what is offered as {kind} is not one: {error}"))
             if offers or not left:
                 break
             await asyncio.sleep(PAUSE_S)

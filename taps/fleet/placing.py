@@ -16,16 +16,16 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from daemon.config import Config
-from daemon.folders import maps_folder, state_folder
-from daemon.mapstore import keep
-from daemon.store import Store
-from daemon.store_file import BadMap
-from daemon.store_tables import read
-from daemon.surveyfile import SurveyError, dump, read_survey
-from daemon.wholefile import reason_of, write_whole
-from estimator.cdma_profile import PROFILES, Profile
-from estimator.lamps import Survey
+from daemon.config.paths import maps_folder, state_folder
+from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError, dump, read_survey
+from daemon.maps.container import BadMap
+from daemon.maps.edit import keep
+from daemon.maps.schema import read
+from daemon.maps.store import Store
+from daemon.system.atomic_file import reason_of, write_whole
+from estimator.cdma.air_interface import PROFILES, Profile
+from estimator.light_filter.survey import Survey
 from taps.fleet.messages import SCHEMA, Held, printable
 
 SURVEY, MAP = "survey", "map"

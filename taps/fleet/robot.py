@@ -17,21 +17,21 @@ from typing import Final
 import msgspec
 import zenoh
 
-from daemon import cli
-from daemon.folders import maps_folder
-from daemon.store import Store
-from daemon.store_file import BadMap
-from daemon.store_tables import read
-from hal.serving import work_until_told
+from daemon.cli import parser
+from daemon.config.paths import maps_folder
+from daemon.maps.container import BadMap
+from daemon.maps.schema import read
+from daemon.maps.store import Store
+from hal.run_server import work_until_told
 from taps.fleet import messages
 from taps.fleet.claim import Claim
 from taps.fleet.messages import MapHead, PoseTold, StateTold
 from taps.fleet.placing import Records
-from taps.frames import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
-from taps.stream import Lost, Stream
-from taps.tiles import Tiles, trinary
-from taps.vda5050 import position_v2
-from taps.zenohlink import BadEndpoint, joined, watched, withdraw
+from taps.metrics.vda5050 import position_v2
+from taps.stream.client import Lost, Stream
+from taps.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
+from taps.stream.tiles import Tiles, trinary
+from taps.zenoh_session import BadEndpoint, joined, watched, withdraw
 
 WANTED: Final = ("pose", "loop", "faults", "map")
 STATE_S: Final = 5.0
@@ -50,10 +50,10 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(work_until_told(tell(args, stream)))
     except BadEndpoint as error:
-        return cli.fail(str(error), cli.USAGE)
+        return parser.fail(str(error), parser.USAGE)
     except NotTheStream as error:
-        return cli.fail(str(error))
-    return cli.OK
+        return parser.fail(str(error))
+    return parser.OK
 
 
 async def tell(args: argparse.Namespace, stream: Stream) -> None:
@@ -243,5 +243,5 @@ async def follow(stream: Stream, robot: Robot) -> None:
     async with contextlib.aclosing(stream.frames()) as frames:
         async for frame in frames:
             if isinstance(frame, Lost):
-                cli.say(f"{frame.text}; waiting")
+                parser.say(f"{frame.text}; waiting")
             robot.take(frame)

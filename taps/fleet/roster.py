@@ -12,7 +12,7 @@ from typing import Final
 
 from taps.fleet import messages
 from taps.fleet.messages import Cells, LoopTold, MapHead, PoseTold, StateTold, Unreadable, printable
-from taps.tiles import UNSEEN
+from taps.stream.tiles import UNSEEN
 
 FARTHEST: Final = 1e6
 """No number that is shown is larger, in m or rad."""

@@ -8,27 +8,27 @@ import socket
 
 import zenoh
 
-from daemon import cli
-from hal.serving import until_told, work_until_told
+from daemon.cli import parser
+from hal.run_server import until_told, work_until_told
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, encode
 from taps.fleet.placing import MAP, SURVEY, Offer, Refused, offer_of
-from taps.zenohlink import BadEndpoint, config, joined, watched, withdraw, words
+from taps.zenoh_session import BadEndpoint, config, joined, watched, withdraw, words
 
 
 def main(args: argparse.Namespace) -> int:
     """Share until stopped; returns the exit code."""
     asked = [(kind, path) for kind, path in ((SURVEY, args.survey), (MAP, args.map)) if path is not None]
     if not asked:
-        return cli.fail("say what to share: --survey FILE, --map FILE", cli.USAGE)
+        return parser.fail("say what to share: --survey FILE, --map FILE", parser.USAGE)
     try:
         offers = [offer_of(kind, path, args.version) for kind, path in asked]
         asyncio.run(work_until_told(share(args, offers)))
     except Refused as error:
-        return cli.fail(str(error))
+        return parser.fail(str(error))
     except BadEndpoint as error:
-        return cli.fail(str(error), cli.USAGE)
-    return cli.OK
+        return parser.fail(str(error), parser.USAGE)
+    return parser.OK
 
 
 async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> None:
@@ -54,7 +54,7 @@ async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> 
         token = session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots ask when they see it
         try:
             for offer, _ in offers:
-                cli.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
+                parser.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
             await watched(session, args.router, lambda there: None)
         finally:
             withdraw(token)  # one to which no name leads any more is withdrawn by the library, unasked
@@ -69,10 +69,10 @@ def router(args: argparse.Namespace) -> int:
     """Be a router until stopped; returns the exit code."""
     try:
         with zenoh.open(config("router", args.listen, args.zenoh)):
-            cli.say(f"router at {args.listen}")
+            parser.say(f"router at {args.listen}")
             asyncio.run(until_told())
     except BadEndpoint as error:
-        return cli.fail(str(error), cli.USAGE)
+        return parser.fail(str(error), parser.USAGE)
     except zenoh.ZError as error:
-        return cli.fail(f"cannot listen on {args.listen}: {words(error)}; free it, or name another with --listen")
-    return cli.OK
+        return parser.fail(f"cannot listen on {args.listen}: {words(error)}; free it, or name another with --listen")
+    return parser.OK

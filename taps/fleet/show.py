@@ -14,13 +14,13 @@ from typing import Final
 import msgspec
 import zenoh
 
-from daemon import cli
-from daemon.png import encode_png
-from daemon.wholefile import reason_of, write_whole
-from hal.serving import work_until_told
+from daemon.cli import parser
+from daemon.maps.png import encode_png
+from daemon.system.atomic_file import reason_of, write_whole
+from hal.run_server import work_until_told
 from taps.fleet import drawing, messages
 from taps.fleet.roster import MOST_MAPS, MOST_ROBOTS, Roster
-from taps.zenohlink import BadEndpoint, answers, joined, parts, watched
+from taps.zenoh_session import BadEndpoint, answers, joined, parts, watched
 
 ROUTER_S: Final = 10.0
 """For so long who asks once waits for the router."""
@@ -48,12 +48,12 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(work_until_told(show(args, roster), seconds=0.0) if args.watch else show(args, roster))
     except BadEndpoint as error:
-        return cli.fail(str(error), cli.USAGE)
+        return parser.fail(str(error), parser.USAGE)
     except NoRouter as error:
-        return cli.fail(str(error))
+        return parser.fail(str(error))
     except OSError as error:
-        return cli.fail(f"{args.picture}: {reason_of(error)}; name another file")
-    return cli.OK if roster.members else cli.fail(f"no robot tells anything by way of {args.router}")
+        return parser.fail(f"{args.picture}: {reason_of(error)}; name another file")
+    return parser.OK if roster.members else parser.fail(f"no robot tells anything by way of {args.router}")
 
 
 async def show(args: argparse.Namespace, roster: Roster) -> None:

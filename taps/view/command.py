@@ -20,18 +20,19 @@ from typing import Final
 
 from aiohttp import web
 
-from daemon import cli, configfile
-from daemon.config import Config
-from daemon.endpoints import in_url
-from daemon.lights import SurveyError
-from daemon.logs import to_journal
-from daemon.publish.client import NoAnswer, address_of
-from hal.serving import stopping
-from taps.stream import Stream
-from taps.view.film import Film
-from taps.view.guard import Guard, TokenRefused, token_for
+from daemon.cli import parser
+from daemon.cli.status import NoAnswer, address_of
+from daemon.config import loader
+from daemon.config.endpoints import in_url
+from daemon.config.schema import Config
+from daemon.runtime.light_setup import SurveyError
+from daemon.system.logging import to_journal
+from hal.run_server import stopping
+from taps.stream.client import Stream
+from taps.view.access_guard import Guard, TokenRefused, token_for
+from taps.view.page_hello import CannotLook, Scene, scene_of
+from taps.view.replay_file import Film
 from taps.view.server import TOPICS, View
-from taps.view.words import CannotLook, Scene, scene_of
 
 PORT: Final = 8090
 NICENESS: Final = 5
@@ -48,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
             raise CannotServe("nobody could read a fresh token but in the log: name a file with one, --token FILE")
         return _show(args, Guard(args.bind, token, args.write))
     except (TokenRefused, SurveyError, NoAnswer, CannotServe) as error:
-        return cli.fail(str(error))
+        return parser.fail(str(error))
 
 
 class CannotServe(Exception):
@@ -65,9 +66,9 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
         )
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:
-        return cli.fail("a recording takes no orders: leave --write out", cli.USAGE)
+        return parser.fail("a recording takes no orders: leave --write out", parser.USAGE)
     if not args.log.exists():
-        return cli.fail(f"{args.log}: there is no such recording")
+        return parser.fail(f"{args.log}: there is no such recording")
     with _film(args) as film:
         return _serve(View(guard, Scene(settings.name), film=film), guard, args.port, f"recording {args.log}")
 
@@ -79,8 +80,8 @@ def _scene(file: Path | None, words: tuple[str, ...]) -> Scene:
         CannotLook: one of them cannot be read.
     """
     try:
-        return scene_of(configfile.load(file, list(words)))
-    except (configfile.ConfigError, SurveyError) as error:
+        return scene_of(loader.load(file, list(words)))
+    except (loader.ConfigError, SurveyError) as error:
         raise CannotLook(str(error)) from None
 
 
@@ -112,22 +113,22 @@ def _film(args: argparse.Namespace) -> Iterator[Film]:
 
 def _shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
     """The other process: it alone loads the estimator, which may have to be compiled."""
-    from daemon import warmup
+    from daemon.runtime import warmup
 
     try:
-        warmup.load_aloud(cli.say, "warm", warmup.load, "taps.view.camera")
+        warmup.load_aloud(parser.say, "warm", warmup.load, "taps.view.replay_recorder")
     except warmup.CannotLoad as error:
-        cli.fail(str(error))
+        parser.fail(str(error))
         return
     try:
-        import_module("taps.view.camera").shoot(log, settings, given, out)
+        import_module("taps.view.replay_recorder").shoot(log, settings, given, out)
     except OSError as error:
-        cli.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
+        parser.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
 
 
 def _wait(film: Film) -> None:
     """Until the recording is known to be one."""
-    cli.say("replaying the recording; it can be watched meanwhile")
+    parser.say("replaying the recording; it can be watched meanwhile")
     while film.scene is None and not film.done:
         time.sleep(0.05)
         film.look()
@@ -144,7 +145,7 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
         taken = error.errno == errno.EADDRINUSE
         remedy = "name another with --port" if taken else "name an address of this computer with --bind"
         raise CannotServe(f"{guard.bind} port {port}: {error.strerror or error}; {remedy}") from None
-    return cli.OK
+    return parser.OK
 
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
@@ -154,7 +155,7 @@ async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
     try:
         site = web.TCPSite(runner, guard.bind, port)
         await site.start()
-        cli.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
+        parser.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
         await stop.wait()
     finally:
         await runner.cleanup()

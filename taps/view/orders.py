@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, cast
 
-from daemon.publish.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
-from daemon.publish.whose import whose
-from hal.beside import beside
-from taps.stream import Stream
+from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
+from daemon.publish.port_owner import whose
+from hal.blocking_calls import beside
+from taps.stream.client import Stream
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
 TRIES: Final = 4

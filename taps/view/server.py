@@ -19,14 +19,14 @@ from typing import Any, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from taps.frames import Hello, NotTheStream, Refused
-from taps.stream import Lost, Stream
-from taps.view.film import Film
-from taps.view.guard import HEADERS, Guard
+from taps.stream.client import Lost, Stream
+from taps.stream.messages import Hello, NotTheStream, Refused
+from taps.view.access_guard import HEADERS, Guard
 from taps.view.orders import OrderRefused, Orders
-from taps.view.player import Player
+from taps.view.page_hello import CannotLook, Scene, welcome
+from taps.view.replay_file import Film
+from taps.view.replay_player import Player
 from taps.view.viewers import Hub, Viewer, frame
-from taps.view.words import CannotLook, Scene, welcome
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable
 
-from daemon.main import Daemon
+from daemon.app import Daemon
 
 
 async def during(daemon: Daemon, scenario: Awaitable[None]) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from daemon.publish.snapshot import State
-from daemon.reasons import Reason
-from daemon.state import judge
-from daemon.state_evidence import Evidence, Light, Match
-from daemon.state_memory import Memory
+from daemon.health.reasons import Reason
+from daemon.integrity.evidence import Evidence, Light, Match
+from daemon.integrity.state_machine import judge
+from daemon.integrity.state_memory import Memory
+from daemon.snapshot import State
 
 PERIOD = 0.1
 ALL = (True, True, True)

@@ -6,9 +6,9 @@ import asyncio
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.store import Start, Store
-from daemon.store_keeper import About, Keeper
-from estimator.mapimage import restored
+from daemon.maps.autosave import About, Keeper
+from daemon.maps.store import Start, Store
+from estimator.mapping.map_snapshot import restored
 from estimator.state import State
 from tests.daemon.mapmaker import Shape, image
 

@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 from typing import Final
 
-from daemon.store import Store
-from daemon.store_file import pack, unpack
-from daemon.store_tables import Meta, read
+from daemon.maps.container import pack, unpack
+from daemon.maps.schema import Meta, read
+from daemon.maps.store import Store
 from tests.daemon.mapmaker import Shape, content
 
 MAP: Final = 0x51

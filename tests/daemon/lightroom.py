@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma_profile import PROFILE_A
-from estimator.lamps import Lamp, Survey
+from estimator.cdma.air_interface import PROFILE_A
+from estimator.light_filter.survey import Lamp, Survey
 from hal.adc import Blemish, RawSamples
 from hal.clock import Clock
-from hal.fake.adc import FakeAdc, FakeBuses
-from tools.sim import light_transmitter
-from tools.sim.light_waveform import Ambient, Ceiling
+from hal.fake.adc.converter import FakeAdc, FakeBuses
+from tools.sim.light import transmitter
+from tools.sim.light.waveform import Ambient, Ceiling
 
 BUS = "/dev/i2c-7"
 Floats = npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ class Lit:
     def under(self, codes: Sequence[int], currents_a: Sequence[float] = CURRENTS_A) -> None:
         """Other lamps from now on."""
         lamps = [
-            light_transmitter.Lamp(
+            transmitter.Lamp(
                 code=code, current_a=current, ppm=7.0 * n - 10.0, phase_chips=31.7 * n, lamp_id=code + 100,
                 position_m=(1.5 * n, 2.0 - n, 2.6), data=True,
             )

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daemon.store_image import meta_of, packed
-from estimator import se2
-from estimator.atlas import Constraints
-from estimator.keyframe import Keyframe, Submap, Virtual
-from estimator.lamps import Lamp, Survey
-from estimator.mapimage import Identity, MapImage, Piece
-from estimator.records import Array
-from estimator.submap import Settled
+from daemon.maps.image import meta_of, packed
+from estimator.light_filter.survey import Lamp, Survey
+from estimator.mapping.keyframe import Keyframe, Submap, Virtual
+from estimator.mapping.map_snapshot import Identity, MapImage, Piece
+from estimator.mapping.submap import Settled
+from estimator.mapping.submap_graph import Constraints
+from estimator.measurements import Array
+from estimator.numerics import se2
 
 LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(6))
 SURVEY = Survey(LAMPS)

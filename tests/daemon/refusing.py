@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.configfile import ConfigError, load
+from daemon.config.loader import ConfigError, load
 
 
 def refused(tmp_path: Path, text: str, *overrides: str) -> str:

@@ -6,21 +6,21 @@ import asyncio
 from dataclasses import replace
 from pathlib import Path
 
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
-from daemon.main import Daemon
-from daemon.record import Recorder
+from daemon.app import Daemon
+from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.recording.recorder import Recorder
 from hal.clock import LoopClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import Unit
 from hal.fake.transport import FakeOpener
-from hal.inputs import InputPort
-from tools.sim.buildings import building
+from hal.net.inputs import InputPort
+from tools.sim.building.buildings import building
 from tools.sim.feed import feed_odometry
 from tools.sim.harness import DEVICE, world
-from tools.sim.harness_light import BUS, light_up
-from tools.sim.lightrun import ROOM_BODY, ROOM_ROUTE
+from tools.sim.light.harness import BUS, light_up
+from tools.sim.light.link_drive import ROOM_BODY, ROOM_ROUTE
+from tools.sim.light.scene import Lights
 from tools.sim.scene import Scenario, SimulatedScene
-from tools.sim.scene_light import Lights
 
 
 def scene() -> SimulatedScene:

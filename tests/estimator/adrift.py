@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimator import se2
-from estimator.atlas import Atlas
-from estimator.keyframe import Submap, keep
+from estimator.mapping.keyframe import Submap, keep
+from estimator.mapping.submap import SIZE, Settled, settle
+from estimator.mapping.submap_graph import Atlas
+from estimator.measurements import UNLIMITED, Answer, Array, Beam, Command, Job, Odometry, Record
+from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state, step
-from estimator.records import UNLIMITED, Answer, Array, Beam, Command, Job, Odometry, Record
 from estimator.result import StepResult
 from estimator.state import State
-from estimator.submap import SIZE, Settled, settle
 from tests.estimator.world import scan_in
-from tools.bench._scenes import Scene, bearings, box
+from tools.bench.support.scenes import Scene, bearings, box
 
 BEAMS = bearings(181, 270.0)
 Corners = Sequence[tuple[float, float]]

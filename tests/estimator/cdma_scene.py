@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma import Decoder, decode, new_decoder, search
-from estimator.cdma_epoch import LightEpoch, SampleBlock
-from estimator.cdma_profile import PROFILE_A, Profile
-from tools.sim.light_transmitter import Lamp
-from tools.sim.light_waveform import Ambient, Block, Bus, Ceiling, Receiver
+from estimator.cdma.air_interface import PROFILE_A, Profile
+from estimator.cdma.decoder import Decoder, decode, new_decoder, search
+from estimator.cdma.epoch import LightEpoch, SampleBlock
+from tools.sim.light.transmitter import Lamp
+from tools.sim.light.waveform import Ambient, Block, Bus, Ceiling, Receiver
 
 Array = npt.NDArray[np.float64]
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator import se2
-from estimator.closing import keyframe_laid, take_answer
-from estimator.keyframe import keep
-from estimator.loop import LoopSettings
-from estimator.records import Answer, Array, Job
+from estimator.mapping.keyframe import keep
+from estimator.mapping.loop_closure import keyframe_laid, take_answer
+from estimator.mapping.loop_verification import LoopSettings
+from estimator.measurements import Answer, Array, Job
+from estimator.numerics import se2
 from estimator.result import Loop
 from estimator.state import State, new_state
 from tests.estimator.world import scan_in
-from tools.bench._scenes import bearings, paper_room
+from tools.bench.support.scenes import bearings, paper_room
 
 HALF = bearings(181, 180.0)
 SMALL = np.diag((0.004**2, 0.004**2, 0.002**2))

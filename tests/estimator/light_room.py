@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimator import se2
-from estimator.cdma_epoch import BlockFlag, LightEpoch, LinkFlag
-from estimator.cdma_frame import LampFrame
-from estimator.lamps import Lamp, Receiver, Survey
-from estimator.optics import expected
-from estimator.records import Array, Odometry
+from estimator.cdma.data_frame import LampFrame
+from estimator.cdma.epoch import BlockFlag, LightEpoch, LinkFlag
+from estimator.light_filter.lambertian import expected
+from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator.measurements import Array, Odometry
+from estimator.numerics import se2
 
 RECEIVER = Receiver(x=-0.1, y=0.03, z=0.3)
 LAMPS = tuple(Lamp(k + 1, k, 1.25 + 2.5 * (k % 4), 1.25 + 2.5 * (k // 4), 2.9, sigma_ln=0.05) for k in range(16))

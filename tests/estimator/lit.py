@@ -8,13 +8,13 @@ from heapq import merge
 
 import numpy as np
 
-from estimator import se2
-from estimator.light import LightsSetup
+from estimator.light_filter.light_channel import LightsSetup
+from estimator.measurements import UNLIMITED, Array, Beam, LightEpoch, Record, Scan
+from estimator.numerics import se2
 from estimator.pipeline import Settings, State, new_state, step
-from estimator.records import UNLIMITED, Array, Beam, LightEpoch, Record, Scan
 from estimator.result import Fix, LightsResult, StepResult
-from tools.sim.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.lightrun import LightRun
+from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
+from tools.sim.light.link_drive import LightRun
 
 Truth = Callable[[Array], Array]
 """(n, 3) poses at (n,) times."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from estimator.kernel import kernel
-from estimator.records import Array
+from estimator.measurements import Array
+from estimator.numerics.jit import kernel
 
 
 @kernel("f8(f8[::1], i8)")

@@ -11,15 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator import kernel
-from estimator.lines import lines_of
-from estimator.matchers import Matcher
+from estimator.numerics import jit
 from estimator.pipeline import Settings, new_state, render_map
+from estimator.scan_matching.line_features import lines_of
+from estimator.scan_matching.matcher_choice import Matcher
 from tests.estimator.cdma_scene import Run, ceiling
 from tests.estimator.lit import lit_state, play, scans, together
 from tests.estimator.test_pipeline import drive, scan_at
 from tests.estimator.world import points_in
-from tools.sim.lightrun import room_run
+from tools.sim.light.link_drive import room_run
 
 
 def figures() -> dict[str, list[float]]:
@@ -43,4 +43,4 @@ def figures() -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    json.dump({"directory": kernel.CACHE_DIR.name, "figures": figures()}, sys.stdout)
+    json.dump({"directory": jit.CACHE_DIR.name, "figures": figures()}, sys.stdout)

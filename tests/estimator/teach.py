@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.calibrate_rows import Rows, joined, model
-from estimator.lamps import Lamp, Survey
-from estimator.optics import pack_lamps, pack_receiver
-from estimator.records import Array
+from estimator.calibration.observations import Rows, joined, model
+from estimator.light_filter.lambertian import pack_lamps, pack_receiver
+from estimator.light_filter.survey import Lamp, Survey
+from estimator.measurements import Array
 
 
 def nominal(side: int = 3) -> Survey:

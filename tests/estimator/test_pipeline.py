@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from estimator import se2
+from estimator.measurements import UNLIMITED, Array, Beam, Command, Odometry, Order, Record, Scan
+from estimator.numerics import se2
 from estimator.pipeline import Settings, State, keyframe_poses, new_state, render_map, step
-from estimator.records import UNLIMITED, Array, Beam, Command, Odometry, Order, Record, Scan
 from estimator.result import Reason, StepResult
 
 BEARING = np.radians(np.linspace(-135.0, 135.0, 541))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator import localmap, se2
-from estimator.keyframe import keep
-from estimator.lines import lines_of
-from estimator.localmap import LocalMap, MapSettings
-from estimator.matching import Prior, View
-from estimator.records import Array, Beam, Scan
-from estimator.scanpoints import ScanPoints, oriented, points_of
-from tools.bench._scenes import Scene
+from estimator.mapping.keyframe import keep
+from estimator.measurements import Array, Beam, Scan
+from estimator.numerics import se2
+from estimator.scan_matching import local_map
+from estimator.scan_matching.deskew import ScanPoints, oriented, points_of
+from estimator.scan_matching.line_features import lines_of
+from estimator.scan_matching.local_map import LocalMap, MapSettings
+from estimator.scan_matching.scan_matcher import Prior, View
+from tools.bench.support.scenes import Scene
 
 STILL = np.zeros(3)
 
@@ -34,10 +35,10 @@ def points_in(scan: Scan) -> ScanPoints:
 
 def map_of(scans: list[tuple[Array, Scan]], settings: MapSettings | None = None) -> LocalMap:
     """Local map of scans seen from known poses."""
-    local = localmap.empty(scans[0][0][:2])
+    local = local_map.empty(scans[0][0][:2])
     for key, (T, scan) in enumerate(scans):
         frame = keep(key, T, T, scan, 0.0)
-        local = localmap.update(local, frame, lines_of(points_in(scan)), settings or MapSettings(), scan.sigma_m)
+        local = local_map.update(local, frame, lines_of(points_in(scan)), settings or MapSettings(), scan.sigma_m)
     return local
 
 

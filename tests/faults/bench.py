@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hal.clock import LoopClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import LidarModel, Unit
-from hal.fake.scan import FakeScan
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import LidarModel, Unit
+from hal.fake.lidar.scan import FakeScan
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.hokuyo.driver import HokuyoDriver

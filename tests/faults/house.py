@@ -16,29 +16,29 @@ from typing import Final
 
 import numpy as np
 
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
-from daemon.faults import Fault
-from daemon.main import Daemon
-from daemon.publish.snapshot import Snapshot, State
-from daemon.store import Start
-from daemon.store_image import meta_of, packed
-from daemon.store_tables import digest_of, read
-from estimator.mapimage import Identity, image_of
+from daemon.app import Daemon
+from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.health.faults import Fault
+from daemon.maps.image import meta_of, packed
+from daemon.maps.schema import digest_of, read
+from daemon.maps.store import Start
+from daemon.snapshot import Snapshot, State
+from estimator.mapping.map_snapshot import Identity, image_of
 from hal.clock import LoopClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
 from hal.fake.odometry import FakeOdometry
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
-from hal.inputs import InputPort
-from tools.sim.ceiling import Effects
-from tools.sim.ceiling_effects import IDEAL
+from hal.net.inputs import InputPort
+from tools.sim.ceiling.ceiling import Effects
+from tools.sim.ceiling.effects import IDEAL
 from tools.sim.harness import DEVICE, world
-from tools.sim.harness_light import BUS, light_up, lights_of
+from tools.sim.light.harness import BUS, light_up, lights_of
+from tools.sim.light.scene import Lights
 from tools.sim.odometry import Wheels
 from tools.sim.robot import Body
 from tools.sim.scene import Scenario, SimulatedScene
-from tools.sim.scene_light import Lights
 
 LIDAR: Final[LidarModel] = replace(UTM_30LX, ares=480, amin=0, amax=360, afrt=180, rpm=600, true_period_s=0.1002)
 """A UTM-30LX that turns at 10 Hz and measures 361 beams: all of its dialect at an eighth of the work."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.faults import Fault
-from daemon.heartbeat import OVER_S
-from daemon.publish.snapshot import State
+from daemon.health.faults import Fault
+from daemon.runtime.heartbeat import OVER_S
+from daemon.snapshot import State
 from tests.faults.house import ROBOT, House, Line, Sight, live, surveyed, tracking
 from tools.sim.scene import Scenario
 

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.faults import FAULTS
+from daemon.health.faults import FAULTS
 from tests.faults.matrix import DEVICES, FAULT_S, TIMES, WORDS, Cell, Outcome, cells
 
 ROOT: Final = Path(__file__).parents[2]

@@ -16,9 +16,9 @@ import pytest
 
 from hal.adc import AdcStatus, Blemish
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, HalError
-from hal.fake.adc_faults import ADC, ERRORS, number_of
+from hal.fake.adc.faults import ADC, ERRORS, number_of
 from hal.lidar import Link
-from hal.photodiode.trouble import POLICIES
+from hal.photodiode.io_errors import POLICIES
 from tests.hal.photodiode.bench import Bench, falsehoods, on_fake
 from tests.rotation import share
 

@@ -19,14 +19,14 @@ from pathlib import Path
 
 import pytest
 
-from daemon.faults import Fault
-from daemon.heartbeat import BEAT_S, OVER_S
-from daemon.publish.client import NoAnswer, Reader
-from daemon.publish.holding import CommandCode, Outcome
-from daemon.publish.parts import FAULTS
-from daemon.publish.snapshot import State
-from tests.daemon.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
-from tests.daemon.test_store_process import ask
+from daemon.cli.status import NoAnswer, Reader
+from daemon.health.faults import Fault
+from daemon.publish.modbus.holding import CommandCode, Outcome
+from daemon.publish.modbus.parts_block import FAULTS
+from daemon.runtime.heartbeat import BEAT_S, OVER_S
+from daemon.snapshot import State
+from tests.daemon.scenarios.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
+from tests.daemon.scenarios.test_store_process import ask
 
 pytestmark = [pytest.mark.realtime, pytest.mark.system, pytest.mark.timeout(600)]
 
@@ -231,7 +231,7 @@ def test_killed_it_comes_back_with_its_map(tmp_path: Path) -> None:
 def test_a_map_that_is_damaged_is_named_and_left_aside(tmp_path: Path, harm: str) -> None:
     link, maps = tmp_path / "lidar", tmp_path / "maps"
     maps.mkdir()
-    whole = (ROOT / "tests" / "daemon" / "data" / "version-1.lumimap").read_bytes()
+    whole = (ROOT / "tests" / "daemon" / "maps" / "data" / "version-1.lumimap").read_bytes()
     bad = {"truncated": whole[: len(whole) // 2], "garbage": os.urandom(len(whole)), "empty": b""}[harm]
     (maps / "map-00001234-00000001.lumimap").write_bytes(bad)
     with fake_lidar(link), running(link, "--set", f"map.folder={maps}") as daemon:

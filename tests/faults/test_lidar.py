@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from hal.fake.lidar_faults import LIDAR
-from hal.fake.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.faults import LIDAR
+from hal.fake.lidar.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.lidar import VALID, Link
 from tests.faults.bench import Run, Story, falsehoods, play
 from tests.rotation import share

@@ -6,9 +6,9 @@ from random import Random
 
 import pytest
 
-from hal.fake.answers import State
-from hal.fake.lidar_faults import LIDAR
-from hal.fake.models import UST_10LX, UTM_30LX, LidarModel
+from hal.fake.lidar.dialect_grid import State
+from hal.fake.lidar.faults import LIDAR
+from hal.fake.lidar.models import UST_10LX, UTM_30LX, LidarModel
 from tests.faults.bench import Run, falsehoods, play
 from tests.hal.fake.bench import Talk, virtual
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from hal.clock import SystemClock
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UTM_30LX
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import UTM_30LX
 from hal.fake.pty_server import PtyServer
 from hal.fake.schedule import FaultSchedule
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import VALID, Link, RawScan
-from hal.opening import open_port
+from hal.port.opening import open_port
 from tests.faults.bench import World
 
 PATIENCE = 4.0

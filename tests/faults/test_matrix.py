@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.fake.hokuyo import FakeHokuyo
+from hal.fake.lidar.device import FakeHokuyo
 from tests.faults.house import House
 from tests.faults.matrix import DEVICES, TIMES, WORDS, Cell, cells, objections, play
 from tests.rotation import share
@@ -65,7 +65,7 @@ def test_a_cell_that_is_not_survived_is_told(monkeypatch: pytest.MonkeyPatch) ->
     stop = House.stop
 
     async def grudging(house: House) -> float:
-        logging.getLogger("daemon.main").warning("lidar does not stop")
+        logging.getLogger("daemon.app").warning("lidar does not stop")
         return await stop(house)
 
     cell = next(cell for cell in CELLS if (cell.device, cell.word, cell.time) == ("odometry", "off", "run"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from daemon.faults import Fault
+from daemon.health.faults import Fault
 from tests.faults.matrix import cells
 from tests.faults.report import PAGE, kept, page
 

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal import i2c_frames as frames
 from hal.adc import Blemish
-from hal.fake.adc_faults import ADC
-from hal.fake.i2c_adapters import BCM2835, DESIGNWARE
-from hal.i2c import MAX_LENGTH, Message
+from hal.bus import i2c_frames as frames
+from hal.bus.i2c import MAX_LENGTH, Message
+from hal.fake.adc.faults import ADC
+from hal.fake.adc.i2c_adapters import BCM2835, DESIGNWARE
 from hal.lidar import Link
 from hal.photodiode import adc121c021, ads1x15, mcp3221
-from hal.photodiode.blocks import inspect
+from hal.photodiode.block_check import inspect
 from hal.photodiode.timebase import SclClock
 from tests.hal.photodiode.bench import Bench, falsehoods, on_fake
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from estimator.cdma import decode, new_decoder, search
-from estimator.cdma_epoch import UNUSABLE, BlockFlag, LightEpoch, LinkFlag, SampleBlock
-from estimator.cdma_profile import PROFILE_A
+from estimator.cdma.air_interface import PROFILE_A
+from estimator.cdma.decoder import decode, new_decoder, search
+from estimator.cdma.epoch import UNUSABLE, BlockFlag, LightEpoch, LinkFlag, SampleBlock
 from tests.estimator.cdma_scene import Run, ceiling, currents, sampled
 
 pytestmark = pytest.mark.jit

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.publish import registers
+from daemon.publish.modbus import registers
 from hal.clock import SystemClock
 from hal.errors import DataInvalid
 from hal.imu import RawImu
-from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, decode, encode
-from hal.inputs import InputPort
+from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, decode, encode
+from hal.net.inputs import InputPort
 from hal.odometry import RawOdometry
-from tests.daemon.publish.test_registers import snapshot, snapshots
+from tests.daemon.publish.modbus.test_registers import snapshot, snapshots
 
 MUTATIONS = 20_000
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-import hal.i2c_linux
+import hal.bus.i2c_linux
+from hal.bus.i2c import Message, Transferred
 from hal.clock import SystemClock
-from hal.fake.adc import FakeAdc
-from hal.i2c import Message, Transferred
+from hal.fake.adc.converter import FakeAdc
 
 I2C_FUNC_I2C = 1
 I2C_FUNC_SMBUS = 0x00020000

@@ -9,12 +9,12 @@ import pytest
 
 from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceFault, DeviceMissing
-from hal.fake.answers import State
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import URG_04LX, UTM_30LX, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.dialect_grid import State
+from hal.fake.lidar.models import URG_04LX, UTM_30LX, Unit
 from hal.fake.transport import FakeOpener
 from hal.hokuyo import discover
-from hal.port import Port, memory_pair
+from hal.port.port import Port, memory_pair
 from hal.probe import Finding, identify_at, probe
 from tests.hal.hokuyo.bench import Scene
 

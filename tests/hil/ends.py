@@ -18,24 +18,24 @@ from typing import Final, Generic, Protocol, TypeVar
 
 import pytest
 
-from daemon.endpoints import LidarPlace, parse_lidar
+from daemon.config.endpoints import LidarPlace, parse_lidar
 from hal.adc import RawSamples
+from hal.bus.i2c import BusOpener
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
-from hal.fake.adc import FakeAdc, FakeBuses
-from hal.fake.adc_light import OrdinaryLamps
+from hal.fake.adc.converter import FakeAdc, FakeBuses
+from hal.fake.adc.light import OrdinaryLamps
 from hal.fake.control import Control
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UTM_30LX, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import UTM_30LX, Unit
+from hal.fake.lidar.scan_world import Room
 from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.transport import FakeOpener
-from hal.fake.world import Room
 from hal.hokuyo.driver import HokuyoDriver
-from hal.i2c import BusOpener
 from hal.lidar import RawScan
-from hal.opening import open_bus, open_port
 from hal.photodiode.chips import chip_named
 from hal.photodiode.driver import PhotodiodeAdc
-from hal.port import PortOpener
+from hal.port.opening import open_bus, open_port
+from hal.port.port import PortOpener
 from hal.probe import Finding, identify_at
 
 FAKE: Final = "fake"

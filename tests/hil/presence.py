@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from hal.bus.i2c import NACKS, AsyncBus, BusOpener, read
 from hal.errors import DeviceMissing, HalError
-from hal.i2c import NACKS, AsyncBus, BusOpener, read
-from hal.opening import open_bus
+from hal.photodiode.io_errors import explain, policy_for
 from hal.photodiode.probe import probe_bus
-from hal.photodiode.trouble import explain, policy_for
+from hal.port.opening import open_bus
 from tests.hil.ends import AdcEnd, LidarEnd
 
 

@@ -107,7 +107,7 @@ def served_lidar(folder: Path, *where: str) -> Generator[Served]:
 def served_receiver(folder: Path) -> Generator[str]:
     """A converter on a bus of its own; what ``--adc`` has to be."""
     bus = f"unix:{folder / 'bus'}"
-    command = [sys.executable, "-m", "hal.fake.receiver", bus, "--control", str(folder / "adc.control")]
+    command = [sys.executable, "-m", "hal.fake.adc.receiver", bus, "--control", str(folder / "adc.control")]
     with process(command, lambda said: "fault orders on" in said):
         yield f"{bus}@0x4d"
 

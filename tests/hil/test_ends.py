@@ -20,8 +20,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from hal.bus.i2c import AsyncBus, Message, Transferred
 from hal.errors import DeviceMissing, HalError
-from hal.i2c import AsyncBus, Message, Transferred
 from tests.hil import presence
 from tests.hil.conftest import result_name
 from tests.hil.ends import AdcEnd, operator_for, where_on_a_bus

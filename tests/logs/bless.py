@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from tests.logs.entries import BY_NAME, NO_DATA, Entry, asked
 
 if TYPE_CHECKING:
-    from daemon.results import Trajectory
+    from daemon.replay.results import Trajectory
     from estimator.result import Loop
     from tests.logs import golden
 

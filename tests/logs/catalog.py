@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from daemon.config import Config
-from daemon.ledger import Ledger
-from daemon.replay import Outcome, replay
+from daemon.cli.replay import Outcome, replay
+from daemon.config.schema import Config
+from daemon.replay.trajectories import Ledger
 from tests.daemon.replay.room import carmen, drive
 from tests.logs import made
 from tests.logs.entries import Entry

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.replay import Outcome
+from daemon.cli.replay import Outcome
 from tests.logs.catalog import replayed
 from tests.logs.entries import BY_NAME
 

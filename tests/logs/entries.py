@@ -96,7 +96,8 @@ def asked(parser: argparse.ArgumentParser, names: list[str]) -> tuple[list[Entry
     except NotThere as error:
         parser.error(str(error))
     if data is not None or not all(entry.source for entry in entries):
-        from daemon import cli, warmup
+        from daemon.cli import parser as cli_parser
+        from daemon.runtime import warmup
 
-        warmup.load_aloud(cli.say, "warm", warmup.load)
+        warmup.load_aloud(cli_parser.say, "warm", warmup.load)
     return entries, data

@@ -21,9 +21,9 @@ import llvmlite.binding
 import numpy as np
 import numpy.typing as npt
 
-from daemon.ledger import Ledger
-from daemon.results import Trajectory, tum
-from daemon.versions import versions
+from daemon.replay.results import Trajectory, tum
+from daemon.replay.trajectories import Ledger
+from daemon.system.versions import versions
 from estimator.result import Loop
 
 Array = npt.NDArray[np.float64]

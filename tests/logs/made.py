@@ -17,17 +17,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
-from daemon.endpoints import NO_DEVICE
-from daemon.lights import Lights
-from daemon.main import Daemon
-from daemon.record import Recorder
-from estimator.cdma_profile import PROFILE_A
+from daemon.app import Daemon
+from daemon.config.endpoints import NO_DEVICE
+from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.recording.recorder import Recorder
+from daemon.runtime.light_setup import Lights
+from estimator.cdma.air_interface import PROFILE_A
 from hal.clock import LoopClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import Unit
 from hal.fake.transport import FakeOpener
-from hal.inputs import InputPort
+from hal.net.inputs import InputPort
 from tests.daemon.lightroom import SURVEY, Lit, plugged
 from tools.bench.world.room import LIDAR, room
 from tools.sim.feed import feed_odometry

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.results import Trajectory
+from daemon.replay.results import Trajectory
 from estimator.result import Loop
 from tests.logs import __main__ as command
 from tests.logs import bless, golden, made

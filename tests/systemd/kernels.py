@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from daemon.warmup import LIGHT, OFFLINE
+from daemon.runtime.warmup import LIGHT, OFFLINE
 from tools.bench.vm.image import cache_name
 
 INSTALLED = Path("/opt/lumiloop/lib")
@@ -22,7 +22,7 @@ def plant(compiled: Path, sources: Path, cache: Path, root: Path) -> list[Path]:
     """Copy the kernels of ``sources`` for the installation below ``root``; returns what was left out of what it loads.
 
     Args:
-        compiled: this version's directory of compiled kernels, as for `estimator.kernel_folder.CACHE_DIR`.
+        compiled: this version's directory of compiled kernels, as for `estimator.numerics.jit_cache.CACHE_DIR`.
         sources: folder that they were compiled from.
         cache: CacheDirectory of the service, below ``root``.
         root: the machine's files.

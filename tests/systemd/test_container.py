@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon import logs
+from daemon.system import logging
 from tests.systemd import container, kernels
 from tests.systemd.container import Container
 from tests.systemd.pages import dead_links
@@ -107,7 +107,7 @@ def machine(folder: Path, package: Path, lidar: Path) -> Iterator[Container]:
 @pytest.fixture(scope="module")
 def left_out(machine: Container, warm_kernels: None) -> list[Path]:
     """Kernels that the machine has to compile itself; it has all others."""
-    from estimator.kernel_folder import CACHE_DIR
+    from estimator.numerics.jit_cache import CACHE_DIR
 
     return kernels.plant(CACHE_DIR, ROOT / "estimator", machine.root / CACHE, machine.root)
 
@@ -210,7 +210,7 @@ def test_what_listens_to_the_daemon_reaches_it_by_its_group_and_others_do_not(ma
 def test_the_journal_has_fields(machine: Container) -> None:
     text = machine.run("journalctl", "--no-pager", "-o", "json", "-u", UNIT)
     entries = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
-    told = [entry for entry in entries if entry.get("MESSAGE_ID") == logs.STATE_ID]
+    told = [entry for entry in entries if entry.get("MESSAGE_ID") == logging.STATE_ID]
     assert told
     assert all(entry["LUMILOOP_STATE"] and entry["_SYSTEMD_UNIT"] == UNIT for entry in told)
     assert "What can be done" in machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT)

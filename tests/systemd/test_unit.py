@@ -13,8 +13,8 @@ from typing import Final
 
 import pytest
 
-from daemon import cli
-from daemon.cli import USAGE
+from daemon.cli import parser
+from daemon.cli.parser import USAGE
 from tests.systemd import pages
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
@@ -119,7 +119,7 @@ def test_what_listens_to_the_daemon_is_started_again_but_not_with_what_cannot_be
     given = [word for word in words[1].split() if word != "$OPTIONS"]
     assert " ".join(given).startswith(command)
     if name != "record":  # whose words are the shell's
-        assert cli.parser().parse_args(given).config == Path("/etc/lumiloop/lumiloop.toml")
+        assert parser.parser().parse_args(given).config == Path("/etc/lumiloop/lumiloop.toml")
     assert program.rstrip("'").endswith("--config /etc/lumiloop/lumiloop.toml $OPTIONS")
     assert (told["Restart"], told["RestartPreventExitStatus"]) == ("always", str(USAGE))
 
@@ -236,8 +236,10 @@ def test_links_of_the_installed_pages_lead_somewhere(tmp_path: Path) -> None:
     """Pages lie beside other things there than in the tree; the environment is stood for by the code they name."""
     code = tmp_path / "opt/lumiloop/lib/python3.11/site-packages/estimator"
     code.mkdir(parents=True)
-    for path in (SYSTEMD.parent / "estimator").glob("*.py"):
-        (code / path.name).touch()
+    for path in (SYSTEMD.parent / "estimator").rglob("*.py"):
+        copy = code / path.relative_to(SYSTEMD.parent / "estimator")
+        copy.parent.mkdir(exist_ok=True)
+        copy.touch()
     environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
     for _ in range(2):  # an installation over an older one
         subprocess.run([SYSTEMD / "install.sh", "files"], env=environment, check=True, capture_output=True)
@@ -248,7 +250,7 @@ def test_links_of_the_installed_pages_lead_somewhere(tmp_path: Path) -> None:
     shutil.rmtree(code)
     dead = pages.dead_links(tmp_path)
     assert "README.md: LICENSE" in dead
-    assert "docs/theory.md: ../estimator/optics.py" in dead
+    assert "docs/theory.md: ../estimator/light_filter/lambertian.py" in dead
 
 
 def test_a_purge_leaves_nothing_that_a_unit_has_written(tmp_path: Path) -> None:

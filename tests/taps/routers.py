@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from daemon.config import Config
-from taps.zenohlink import config
+from daemon.config.schema import Config
+from taps.zenoh_session import config
 
 
 def free_port() -> int:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.maptiles import MapTiles
-from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
-from daemon.publish.stream import SIDE, StreamServer
-from tests.daemon.publish.test_stream import raw_scan
+from daemon.maps.tiles import MapTiles
+from daemon.publish.stream_server import SIDE, StreamServer
+from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
+from tests.daemon.publish.test_stream_server import raw_scan
 
 LINKS = (
     LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01),

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon import cli
-from taps.doctor.host import Host
-from tests.daemon.planning.test_planning import room, write_pgm
-from tests.taps.test_doctor import Computer
+from daemon.cli import parser as cli_parser
+from daemon.diagnosis.host import Host
+from tests.daemon.commissioning.test_planning import room, write_pgm
+from tests.daemon.diagnosis.test_doctor import Computer
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -34,7 +34,7 @@ def commands(page: Path) -> list[list[str]]:
 def test_every_command_in_the_documents_is_understood(page: Path) -> None:
     for words in commands(page):
         if words != ["--help"]:
-            assert cli.parser().parse_args(words).body is not None, f"{page.name}: {words}"
+            assert cli_parser.parser().parse_args(words).body is not None, f"{page.name}: {words}"
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -47,7 +47,7 @@ def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 
 def test_every_command_and_verb_has_help() -> None:
-    every = list(parsers(cli.parser()))
+    every = list(parsers(cli_parser.parser()))
     assert len(every) > 30
     for parser in every:
         assert parser.format_help().startswith("usage: ")
@@ -58,8 +58,11 @@ def test_the_doctor_of_the_documents(
 ) -> None:
     (words,) = (words for words in commands(ROOT / "docs" / "installation.md") if words[0] == "doctor")
     (tmp_path / "lumiloop.toml").write_text("")
-    monkeypatch.setattr("taps.doctor.report.Host", Computer)
-    assert cli.main([str(tmp_path / Path(word).name) if word.startswith("/") else word for word in words]) == cli.OK
+    monkeypatch.setattr("daemon.cli.doctor.Host", Computer)
+    assert (
+        cli_parser.main([str(tmp_path / Path(word).name) if word.startswith("/") else word for word in words])
+        == cli_parser.OK
+    )
     assert "nothing has to be fixed" in capsys.readouterr().out
     assert issubclass(Computer, Host)
 
@@ -71,7 +74,7 @@ def test_the_plans_of_the_documents(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ran = 0
     for words in commands(ROOT / "docs" / "planning.md"):
         if words[0] == "plan":
-            assert cli.main(words) == cli.OK, words
+            assert cli_parser.main(words) == cli_parser.OK, words
             ran += 1
     assert ran == 3
     assert (tmp_path / "plan" / "lights.toml").exists()
@@ -85,7 +88,7 @@ def test_the_exports_of_the_documents(recording: Path, tmp_path: Path, monkeypat
     ran = 0
     for words in commands(ROOT / "docs" / "formats.md"):
         if words[0] == "export":
-            assert cli.main(words) == cli.OK, words
+            assert cli_parser.main(words) == cli_parser.OK, words
             (tmp_path / "torn.mcap").write_bytes((tmp_path / "drive.mcap").read_bytes()[:-500])
             ran += 1
     assert ran == 2
@@ -101,7 +104,7 @@ def test_the_program_of_the_documents_reads_what_was_exported(
         r"^```python\n(.*?)^```", (ROOT / "docs" / "formats.md").read_text(), re.MULTILINE | re.DOTALL
     )
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["export", str(recording), "--mcap", "drive.mcap"]) == cli.OK
+    assert cli_parser.main(["export", str(recording), "--mcap", "drive.mcap"]) == cli_parser.OK
     capsys.readouterr()
     exec(compile(program, "formats.md", "exec"), {})
     said = capsys.readouterr().out.splitlines()

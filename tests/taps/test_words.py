@@ -7,13 +7,14 @@ import sys
 
 import pytest
 
-from daemon import cli_taps, extras
+from daemon.cli import tap_parsers
+from daemon.system import extras
 
 ARGS = argparse.Namespace(config=None, set=[], print_config=False)
 
 
 def test_a_missing_extra_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli_taps.needing("view", "tests.taps.wanting", "main")(ARGS) == 1
+    assert tap_parsers.needing("view", "tests.taps.wanting", "main")(ARGS) == 1
     said = capsys.readouterr().err
     assert "needs a_library_that_nobody_has" in said
     assert "pip install 'lumiloop[view]'" in said
@@ -26,4 +27,4 @@ def test_where_there_is_no_pip_the_systems_is_named(monkeypatch: pytest.MonkeyPa
 
 def test_what_is_missing_of_our_own_is_a_defect() -> None:
     with pytest.raises(ModuleNotFoundError):
-        cli_taps.needing("view", "taps.of_tomorrow", "main")(ARGS)
+        tap_parsers.needing("view", "taps.of_tomorrow", "main")(ARGS)

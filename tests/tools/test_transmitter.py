@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from estimator.cdma_frame import FRAME_BITS, LampFrame, encode
-from estimator.codes import gold_codes
+from estimator.cdma.data_frame import FRAME_BITS, LampFrame, encode
+from estimator.cdma.gold_codes import gold_codes
 from tests.estimator.cdma_scene import Run, ceiling
-from tools.sim.light_transmitter import Lamp
+from tools.sim.light.transmitter import Lamp
 
 SOURCE = Path(__file__).parents[2] / "tools" / "transmitter" / "transmitter.c"
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")

@@ -13,15 +13,20 @@ import signal
 import sys
 from pathlib import Path
 
-import tools.bench
-from tools.figures import save, table
+import tools.bench.system
+from tools.ci.figures import save, table
+
+
+def modules() -> dict[str, str]:
+    """Benchmarks that exist: name to module."""
+    folders = {"tools.bench.": tools.bench.__path__, "tools.bench.system.": tools.bench.system.__path__}
+    found = [m for prefix, path in folders.items() for m in pkgutil.iter_modules(path, prefix) if not m.ispkg]
+    return {m.name.rpartition(".")[2]: m.name for m in found if not m.name.endswith("__main__")}
 
 
 def names() -> list[str]:
-    """Benchmarks that exist, sorted."""
-    return sorted(
-        m.name for m in pkgutil.iter_modules(tools.bench.__path__) if not m.name.startswith("_") and not m.ispkg
-    )
+    """Names of benchmarks, sorted."""
+    return sorted(modules())
 
 
 def reason(error: Exception) -> str:
@@ -45,7 +50,7 @@ def main() -> int:
     for name in options.name or names():
         print(f"\n== {name}", flush=True)
         try:
-            figures = importlib.import_module(f"tools.bench.{name}").run()
+            figures = importlib.import_module(modules()[name]).run()
         except Exception as error:  # noqa: BLE001  one broken benchmark must not hide the others' figures
             print(f"{name} could not run: {reason(error)}")
             failed = True

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from tools.bench._scenes import Array, Scene, box, office, paper_room, round_room
-from tools.bench._trials import CHI2_2, Case, Trials
-from tools.bench._trials import run as trial
-from tools.figures import Figure
-from tools.figures import bounded as _bounded
+from tools.bench.support.scenes import Array, Scene, box, office, paper_room, round_room
+from tools.bench.support.trials import CHI2_2, Case, Trials
+from tools.bench.support.trials import run as trial
+from tools.ci.figures import Figure
+from tools.ci.figures import bounded as _bounded
 
 FULL: Final = os.environ.get("LUMILOOP_BENCH") == "full"
 COMMAND: Final = "python -m tools.bench accuracy"

@@ -15,13 +15,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma import Decoder, decode, new_decoder, search
-from estimator.cdma_epoch import BlockFlag, LightEpoch, LinkFlag, SampleBlock
-from estimator.cdma_profile import PROFILE_A, PROFILES, Profile
-from tools.figures import Figure, bounded, table
-from tools.sim.light_flicker import worst as worst_line
-from tools.sim.light_transmitter import Lamp
-from tools.sim.light_waveform import Ambient, Block, Bus, Ceiling, Receiver
+from estimator.cdma.air_interface import PROFILE_A, PROFILES, Profile
+from estimator.cdma.decoder import Decoder, decode, new_decoder, search
+from estimator.cdma.epoch import BlockFlag, LightEpoch, LinkFlag, SampleBlock
+from tools.ci.figures import Figure, bounded, table
+from tools.sim.light.flicker import worst as worst_line
+from tools.sim.light.transmitter import Lamp
+from tools.sim.light.waveform import Ambient, Block, Bus, Ceiling, Receiver
 
 Array = npt.NDArray[np.float64]
 

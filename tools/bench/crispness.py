@@ -23,18 +23,18 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from daemon.bridge import ScanBridge
-from daemon.config import Config
-from daemon.replay import Outcome, replay
-from daemon.sources import open_log
-from estimator import se2
-from estimator.records import Array, Scan
-from estimator.scanpoints import points_of
+from daemon.cli.replay import Outcome, replay
+from daemon.config.schema import Config
+from daemon.devices.conversion import ScanBridge
+from daemon.replay.sources import open_log
+from estimator.measurements import Array, Scan
+from estimator.numerics import se2
+from estimator.scan_matching.deskew import points_of
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 from tools import convert
-from tools.bench._peers import MANY, NEIGHBOURS, Match, kdtree
-from tools.figures import Figure, bounded
+from tools.bench.support.peers import MANY, NEIGHBOURS, Match, kdtree
+from tools.ci.figures import Figure, bounded
 
 COMMAND: Final = "LUMILOOP_DATA=... python -m tools.bench crispness"
 LOGS: Final = {"exp1": "urg04lx/exp1.dat.gz", "exp2": "urg04lx/exp2.dat.gz", "utm": "utm30lx/scans.npz"}

@@ -25,30 +25,25 @@ from typing import Final
 
 import numpy as np
 
-from daemon.config import (
-    Config,
-    LidarConfig,
-    ModbusConfig,
-    Mount,
-    OdometryConfig,
-    PhotodiodeConfig,
-    PoseConfig,
-)
-from daemon.lights import Lights
-from daemon.main import Daemon, World
-from daemon.picture import Painter
-from daemon.warmup import load
-from estimator import absolute, cdma, lights, pipeline
-from estimator.cdma_profile import PROFILE_A
+from daemon.app import Daemon, World
+from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
+from daemon.runtime.light_setup import Lights
+from daemon.runtime.snapshot_builder import Painter
+from daemon.runtime.warmup import load
+from estimator import pipeline
+from estimator.cdma import decoder
+from estimator.cdma.air_interface import PROFILE_A
+from estimator.fusion import map_odom_filter
+from estimator.light_filter import light_filter
 from estimator.result import Fix
 from hal.adc import AdcStatus, RawSamples
+from hal.bus.i2c import BusOpener
 from hal.clock import Clock
-from hal.i2c import BusOpener
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
-from hal.port import PortOpener
-from tools.bench._drive import EndlessDrive
-from tools.bench._stages import CPU, WALL, Array, Stages, quantiles
-from tools.figures import Figure, bounded, save, table
+from hal.port.port import PortOpener
+from tools.bench.support.drive import EndlessDrive
+from tools.bench.support.stages import CPU, WALL, Array, Stages, quantiles
+from tools.ci.figures import Figure, bounded, save, table
 
 COMMAND: Final = "python -m tools.bench.cycle"
 STAGES: Final = ("bridge", "decode", "search", "lights", "match", "fuse", "map", "step", "judge", "publish")
@@ -195,13 +190,12 @@ def instrument(stages: Stages, daemon: Daemon) -> None:
     """Wrap what the stages are made of."""
     cycle = daemon.cycle
     for owner, attribute, stage in (
-        (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"),
-        (cycle, "_publish", "publish"), (Painter, "paint", "judge"),
-        (cdma, "decode", "decode"), (cdma, "search", "search"),
-        (lights, "update", "lights"), (lights, "predict", "lights"), (absolute, "on_lights", "lights"),
-        (pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match"), (pipeline, "fuse", "fuse"),
-        (pipeline, "predict", "fuse"), (pipeline, "keyframe_due", "map"), (pipeline, "lay_keyframe", "map"),
-        (pipeline, "lay_anchor", "map"), (pipeline, "update_map", "map"),
+        (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"), (cycle, "_publish",
+        "publish"), (Painter, "paint", "judge"), (decoder, "decode", "decode"), (decoder, "search", "search"),
+        (light_filter, "update", "lights"), (light_filter, "predict", "lights"), (map_odom_filter, "on_lights",
+        "lights"), (pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match"), (pipeline, "fuse", "fuse"),
+        (pipeline, "predict", "fuse"), (pipeline, "keyframe_due", "map"), (pipeline, "lay_keyframe", "map"), (pipeline,
+        "lay_anchor", "map"), (pipeline, "update_map", "map"),
     ):  # fmt: skip
         stages.wrap(owner, attribute, stage)
 

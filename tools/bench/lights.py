@@ -9,14 +9,15 @@ from typing import Final
 
 import numpy as np
 
-from estimator import ekf_links, lights, se2
-from estimator.cdma_epoch import BlockFlag, LightEpoch
-from estimator.lamps import Lamp, Receiver, Survey
-from estimator.lights_links import sights, table, view_of
-from estimator.optics import expected
-from estimator.records import Array, Odometry
+from estimator.cdma.epoch import BlockFlag, LightEpoch
+from estimator.light_filter import light_filter, measurement_update
+from estimator.light_filter.lambertian import expected
+from estimator.light_filter.link_gating import sights, table, view_of
+from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator.measurements import Array, Odometry
+from estimator.numerics import se2
 from estimator.result import Fix
-from tools.figures import Figure, bounded
+from tools.ci.figures import Figure, bounded
 
 COMMAND: Final = "python -m tools.bench lights"
 LAMPS: Final = tuple(Lamp(k + 1, k, 3.0 + 1.2 * (k % 4), 3.0 + 1.2 * (k // 4), 2.9) for k in range(16))
@@ -52,16 +53,16 @@ def run() -> list[Figure]:
     Raises:
         RuntimeError: the filter has not found its place; its figures would mean nothing.
     """
-    filter_ = lights.new_lights(SURVEY)
+    filter_ = light_filter.new_lights(SURVEY)
     whole, kernels, used = [], [], []
     for k, (odometry, epoch) in enumerate(drive(60.0)):
-        lights.predict(filter_, odometry)
+        light_filter.predict(filter_, odometry)
         if k * EPOCH_S > 30.0:
             count, seconds = _kernels(filter_, epoch)
             used.append(count)
             kernels.append(seconds)
         begin = time.perf_counter()
-        result = lights.update(filter_, epoch)
+        result = light_filter.update(filter_, epoch)
         if k * EPOCH_S > 30.0:
             whole.append(time.perf_counter() - begin)
     if result.fix is not Fix.GOOD:
@@ -77,18 +78,18 @@ def run() -> list[Figure]:
     ]  # fmt: skip
 
 
-def _kernels(filter_: lights.Lights, epoch: LightEpoch) -> tuple[int, float]:
+def _kernels(filter_: light_filter.Lights, epoch: LightEpoch) -> tuple[int, float]:
     """Links, and seconds to compare them with the state and to take them in, on copies."""
     track = filter_.tracks[0]
     kept, rows = table(filter_, track, sights(filter_, epoch, float(track.x[0]), float(track.x[1])))
-    out = np.zeros((len(kept), ekf_links.OUT_COLUMNS))
+    out = np.zeros((len(kept), measurement_update.OUT_COLUMNS))
     view = view_of(filter_, np.zeros(3))
 
     times = []
     for _ in range(5):
         x, around, P = track.x.copy(), track.x.copy(), track.P.copy()
         begin = time.perf_counter()
-        ekf_links.linearise(x, P, rows, track.lamps, view, out)
-        ekf_links.absorb(x, P, track.n, around, rows, out)
+        measurement_update.linearise(x, P, rows, track.lamps, view, out)
+        measurement_update.absorb(x, P, track.n, around, rows, out)
         times.append(time.perf_counter() - begin)
     return len(kept), min(times)

@@ -29,14 +29,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from daemon.bridge import ScanBridge
-from daemon.config import LidarConfig
-from daemon.png import encode_png
-from daemon.sources import open_log
-from estimator import se2
-from estimator.scanpoints import oriented, points_of
+from daemon.config.schema import LidarConfig
+from daemon.devices.conversion import ScanBridge
+from daemon.maps.png import encode_png
+from daemon.replay.sources import open_log
+from estimator.numerics import se2
+from estimator.scan_matching.deskew import oriented, points_of
 from hal.lidar import RawScan
-from tools.figures import Figure, bounded
+from tools.ci.figures import Figure, bounded
 from tools.relations import SPLIT_S, evaluate, read_relations, read_tum
 
 Array = npt.NDArray[np.float64]
@@ -89,7 +89,7 @@ def run() -> list[Figure]:
 
 def replayed(log: Path, out: Path) -> Used:
     """Replay in a process of its own; kernels are loaded once before, so that none is compiled in it."""
-    warm = "from daemon import warmup; warmup.load()"
+    warm = "from daemon.runtime import warmup; warmup.load()"
     waited([sys.executable, "-c", warm])
     return waited([sys.executable, "-m", "daemon", "replay", str(log), "--out", str(out)])
 

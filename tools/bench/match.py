@@ -16,18 +16,19 @@ from typing import Final
 
 import numpy as np
 
-from estimator import localmap, se2
-from estimator.keyframe import keep
-from estimator.lines import lines_of
-from estimator.localmap import LocalMap
-from estimator.matching import MatchSettings, Prior, View, match
-from estimator.records import Array, Beam, Scan
-from estimator.scanpoints import oriented, points_of
-from tools.bench._bound import bound
-from tools.bench._intel import consecutive, front_end
-from tools.bench._peers import Match, peers
-from tools.bench._scenes import Scene, bearings, office, paper_room
-from tools.figures import Figure, bounded
+from estimator.mapping.keyframe import keep
+from estimator.measurements import Array, Beam, Scan
+from estimator.numerics import se2
+from estimator.scan_matching import local_map
+from estimator.scan_matching.deskew import oriented, points_of
+from estimator.scan_matching.line_features import lines_of
+from estimator.scan_matching.local_map import LocalMap
+from estimator.scan_matching.scan_matcher import MatchSettings, Prior, View, match
+from tools.bench.support.bound import bound
+from tools.bench.support.intel import consecutive, front_end
+from tools.bench.support.peers import Match, peers
+from tools.bench.support.scenes import Scene, bearings, office, paper_room
+from tools.ci.figures import Figure, bounded
 
 COMMAND: Final = "python -m tools.bench match"
 SIGMA: Final = 0.01
@@ -76,9 +77,9 @@ def scan(scene: Scene, T: Array, bearing: Array, rng: np.random.Generator) -> Sc
 def map_of(reference: Scan) -> LocalMap:
     """Line elements of one scan on their axis: our index."""
     lines = lines_of(points_of(reference, STILL, 80.0, 0.0))
-    elements = np.zeros((len(lines), localmap.WIDTH))
-    elements[:, : localmap.SLOPE + 1], elements[:, localmap.WEIGHT] = lines[:, :5], 1.0
-    return localmap.index(elements, STILL[:2], 1, keep(0, STILL, STILL, reference, 0.0))
+    elements = np.zeros((len(lines), local_map.WIDTH))
+    elements[:, : local_map.SLOPE + 1], elements[:, local_map.WEIGHT] = lines[:, :5], 1.0
+    return local_map.index(elements, STILL[:2], 1, keep(0, STILL, STILL, reference, 0.0))
 
 
 def ours(off: tuple[float, float]) -> Callable[[Pair], Array]:

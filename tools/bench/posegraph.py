@@ -19,11 +19,11 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from estimator import se2
-from estimator.closing import MOST, PHI, SETTLED
-from estimator.posegraph import Graph, optimise
-from estimator.records import Array
-from tools.figures import Figure, bounded
+from estimator.mapping.loop_closure import MOST, PHI, SETTLED
+from estimator.mapping.pose_graph import Graph, optimise
+from estimator.measurements import Array
+from estimator.numerics import se2
+from tools.ci.figures import Figure, bounded
 
 COMMAND: Final = "LUMILOOP_DATA=... python -m tools.bench posegraph"
 RUNS: Final = 5

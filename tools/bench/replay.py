@@ -11,10 +11,10 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from daemon.config import Config
-from daemon.replay import Outcome, replay
+from daemon.cli.replay import Outcome, replay
+from daemon.config.schema import Config
 from tools import convert
-from tools.figures import Figure, bounded
+from tools.ci.figures import Figure, bounded
 from tools.relations import SPLIT_S, Errors, evaluate, read_relations
 
 COMMAND: Final = "LUMILOOP_DATA=... python -m tools.bench replay"

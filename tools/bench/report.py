@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Final, Literal
 from xml.etree import ElementTree
 
-from daemon.folders import can_be_made
-from daemon.versions import versions
+from daemon.config.paths import can_be_made
+from daemon.system.versions import versions
 from tools.bench.against import Before, Compared, Old, compare
 from tools.bench.plots import Plot, svg
 

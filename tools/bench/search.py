@@ -17,12 +17,12 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from estimator import distance_region
-from estimator.distance_axis import FEWEST, Axis, Ints, build_axis, sector_count
-from estimator.records import Array
-from tools.bench._scenes import Scene, corridor, office, paper_room, round_room
+from estimator.measurements import Array
+from estimator.scan_matching import distance_region
+from estimator.scan_matching.distance_axis import FEWEST, Axis, Ints, build_axis, sector_count
 from tools.bench.match import FAR, STILL, pairs, points
-from tools.figures import Figure, bounded
+from tools.bench.support.scenes import Scene, corridor, office, paper_room, round_room
+from tools.ci.figures import Figure, bounded
 
 COMMAND: Final = "python -m tools.bench search"
 CLOSE: Final = (0.001, 0.01)

@@ -13,14 +13,16 @@ import argparse
 import importlib
 import json
 import os
+import pkgutil
 import sys
 import time
 from pathlib import Path
 from typing import Any, Final
 
+import tools.experiments
+from tools.ci.figures import table
 from tools.experiments import pages
 from tools.experiments.report import COMMAND, Report, Skipped, Work, code, save
-from tools.figures import table
 
 EXPERIMENTS: Final = {
     "table1": "Table 1", "fig4": "Fig. 4", "fig5": "Fig. 5", "fig5_loops": "Fig. 5, loops closed", "fig6": "Fig. 6",
@@ -29,9 +31,21 @@ EXPERIMENTS: Final = {
     "relocate": "", "relocate_real": "", "integrity": "",
 }  # fmt: skip
 """Of what in the paper each is; nothing: ours alone."""
+MODULES: Final = {
+    found.name.rpartition(".")[2]: found.name
+    for found in pkgutil.walk_packages(tools.experiments.__path__, "tools.experiments.")
+    if not found.ispkg
+} | {"integrity": "tools.experiments.integrity.campaign"}
+"""Module of each experiment."""
 RESULTS: Final = Path("docs/results")
 QUICK: Final = Path("out/experiments/quick")
-SOURCES: Final = ("estimator/*.py", "hal/**/*.py", "daemon/**/*.py", "tools/sim/*.py", "tools/experiments/*.py")
+SOURCES: Final = (
+    "estimator/**/*.py",
+    "hal/**/*.py",
+    "daemon/**/*.py",
+    "tools/sim/**/*.py",
+    "tools/experiments/**/*.py",
+)
 
 
 def show(report: Report) -> None:
@@ -63,7 +77,7 @@ def run_one(name: str, options: argparse.Namespace) -> bool:
         return True
     begun = time.monotonic()
     try:
-        module = importlib.import_module(f"tools.experiments.{name}")
+        module = importlib.import_module(MODULES[name])
         report = module.run(options.quick, Work(options.jobs, sys.stderr.isatty(), options.trials))
     except Skipped as reason:
         print(f"skipped: {reason}")

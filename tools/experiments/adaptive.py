@@ -14,13 +14,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator.links import Doubt, Method, Prior, Solver
+from estimator.paper.lateration import Doubt, Method, Prior, Solver
+from tools.ci.figures import Figure
 from tools.experiments.places import CENTRED, Array, error, sheet_of, spots
 from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
-from tools.figures import Figure
-from tools.sim.buildings import building
-from tools.sim.ceiling import Ceiling, Effects
-from tools.sim.ceiling_lamps import fixtures
+from tools.sim.building.buildings import building
+from tools.sim.ceiling.ceiling import Ceiling, Effects
+from tools.sim.ceiling.lamps import fixtures
 
 FIXED: Final = (3, 4, 5, 6, 7, 8, None)
 SOLVERS: Final = (Solver.LS, Solver.LIN, Solver.ML)

@@ -13,15 +13,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator import beams, localmap, se2
-from estimator.beams import BeamModel
-from estimator.matching import Attempt, MatchSettings, Prior, attempt
-from estimator.records import Beam, Scan
-from tools.bench._scenes import Array, Scene, bearings, office, paper_room
-from tools.bench._trials import scan_at, view_of
+from estimator.measurements import Beam, Scan
+from estimator.numerics import se2
+from estimator.paper import beam_model
+from estimator.paper.beam_model import BeamModel
+from estimator.scan_matching import local_map
+from estimator.scan_matching.scan_matcher import Attempt, MatchSettings, Prior, attempt
 from tools.bench.match import map_of
+from tools.bench.support.scenes import Array, Scene, bearings, office, paper_room
+from tools.bench.support.trials import scan_at, view_of
+from tools.ci.figures import Figure
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.figures import Figure
 
 SIGMA: Final = 0.01
 SEED: Final = 12
@@ -65,11 +67,11 @@ def scores(scene: Scene, stopped: float, trials: int) -> Scores:
         if not scene.clear(T_new, 0.15):
             continue
         reference, view = scan(scene, T, stopped, rng), view_of(scan(scene, T_new, stopped, rng))
-        local, segments, true = map_of(reference), beams.segments_of(points(reference)), se2.between(T, T_new)
+        local, segments, true = map_of(reference), beam_model.segments_of(points(reference)), se2.between(T, T_new)
 
         def judged(found: Attempt) -> tuple[float, ...]:
-            against = localmap.contradicted(local, found.T, view.beams, SIGMA)  # noqa: B023  called at once
-            good = beams.quality(segments, found.T, view.beams, model)  # noqa: B023  called at once
+            against = local_map.contradicted(local, found.T, view.beams, SIGMA)  # noqa: B023  called at once
+            good = beam_model.quality(segments, found.T, view.beams, model)  # noqa: B023  called at once
             return good, found.share, 1.0 - against
 
         for far, metres, degrees in ((0, (0.0, 0.1), (0.0, 3.0)), (1, (0.4, 1.5), (10.0, 60.0))):
@@ -98,11 +100,11 @@ def cost_ms() -> float:
     """Least time of one judgement with 1081 beams."""
     bearing = bearings(1081, 270.0)
     reference = scan_at(paper_room(), np.zeros(3), bearing, np.random.default_rng(SEED), SIGMA)
-    segments, seen = beams.segments_of(points(reference)), (bearing, reference.range_m, reference.beam)
+    segments, seen = beam_model.segments_of(points(reference)), (bearing, reference.range_m, reference.beam)
     best = np.inf
     for _ in range(200):
         begin = time.perf_counter()
-        beams.quality(segments, np.zeros(3), seen, BeamModel())
+        beam_model.quality(segments, np.zeros(3), seen, BeamModel())
         best = min(best, time.perf_counter() - begin)
     return 1e3 * float(best)
 

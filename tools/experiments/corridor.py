@@ -18,19 +18,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator import se2
-from estimator.light import LightsSetup
+from estimator.light_filter.light_channel import LightsSetup
+from estimator.numerics import se2
 from estimator.pipeline import State, new_state
 from estimator.result import StepResult
+from tools.ci.figures import Figure, bounded
 from tools.experiments.corridor_bound import Sizes, bound, seen
 from tools.experiments.loop_drives import BODY, half, play, scans
 from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
-from tools.figures import Figure, bounded
-from tools.sim.buildings import building
-from tools.sim.ceiling_movers import lean_of
-from tools.sim.lightrun import LightRun, tour_run
+from tools.sim.building.buildings import building
+from tools.sim.building.world import Array
+from tools.sim.ceiling.movers import lean_of
+from tools.sim.light.link_drive import LightRun, tour_run
 from tools.sim.robot import Drive, Route
-from tools.sim.world import Array
 
 SEEDS: Final = (1, 2, 3)
 FROM_S: Final = 10.0

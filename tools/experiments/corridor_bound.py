@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 
-from estimator.lamps import Survey
-from estimator.optics import Wrt, expected
-from estimator.records import LightEpoch
-from tools.sim.world import Array
+from estimator.light_filter.lambertian import Wrt, expected
+from estimator.light_filter.survey import Survey
+from estimator.measurements import LightEpoch
+from tools.sim.building.world import Array
 
 RIM_RAD: Final = np.radians(8.0)
 """Links so near to the edge of the receiver's view are not used."""

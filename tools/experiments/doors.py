@@ -1,8 +1,8 @@
 """Long corridors of equal doors by the laser alone: how many loops are wrong, and how far off poses are that are near.
 
-Drives of 0.95 km through `tools.sim.doors`, by wheels that are off by 1 to 2 %. Scored are pairs of keyframes as they
-lie at the end, at most 2 m apart in truth and more than 15 m of way apart (what the relations of recorded logs are
-about), and loops that became constraints.
+Drives of 0.95 km through `tools.sim.building.doors`, by wheels that are off by 1 to 2 %. Scored are pairs of keyframes
+as they lie at the end, at most 2 m apart in truth and more than 15 m of way apart (what the relations of recorded logs
+are about), and loops that became constraints.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator import se2
-from estimator.lamps import Survey
+from estimator.light_filter.survey import Survey
+from estimator.numerics import se2
 from estimator.pipeline import Settings, keyframe_poses, new_state
-from tools.experiments.fig6_curves import right
-from tools.experiments.fig6_trial import Watcher
+from tools.ci.figures import bounded
 from tools.experiments.loop_drives import play, scans
+from tools.experiments.paper_figures.fig6_curves import right
+from tools.experiments.paper_figures.fig6_trial import Watcher
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.figures import bounded
-from tools.sim.buildings import building
-from tools.sim.ceiling import ceiling_of
-from tools.sim.ceiling_links import Reception
-from tools.sim.doors import Kind, doors
-from tools.sim.lightrun import LightRun
+from tools.sim.building.buildings import building
+from tools.sim.building.doors import Kind, doors
+from tools.sim.building.world import Array
+from tools.sim.ceiling.ceiling import ceiling_of
+from tools.sim.ceiling.links import Reception
+from tools.sim.light.link_drive import LightRun
 from tools.sim.odometry import Wheels
 from tools.sim.robot import Body, Drive
-from tools.sim.world import Array
 
 CASES: Final = {
     "one door in 4 open, 2.6 m wide": Kind(2.6, 4),

@@ -16,28 +16,28 @@ from typing import Any, Final
 
 import numpy as np
 
-from daemon.evidence import Observer
-from estimator.light import LightsSetup
+from daemon.integrity.observer import Observer
+from estimator.light_filter.light_channel import LightsSetup
+from estimator.measurements import Job, Record, Scan
 from estimator.pipeline import Settings, State, keyframe_poses, new_state
-from estimator.records import Job, Record, Scan
 from estimator.result import StepResult
-from tools.experiments.fig6_curves import Point, counted
-from tools.experiments.fig6_trial import FROM_S, Watcher
+from tools.ci.figures import Figure, bounded
 from tools.experiments.loop_drives import BODY, RATE_HZ, half, scans
-from tools.experiments.relocate_trial import Moment, Robot, Said, longest
+from tools.experiments.paper_figures.fig6_curves import Point, counted
+from tools.experiments.paper_figures.fig6_trial import FROM_S, Watcher
+from tools.experiments.relocation.trial import Moment, Robot, Said, longest
 from tools.experiments.report import COMMAND, Report, Table, Work
 from tools.experiments.trajectory import Errors, Track, errors, started
-from tools.figures import Figure, bounded
-from tools.sim.buildings import building
-from tools.sim.ceiling import Ceiling, Effects
-from tools.sim.ceiling_lamps import Fixture, fixtures, with_codes
-from tools.sim.ceiling_links import Reception
-from tools.sim.ceiling_movers import lean_of
-from tools.sim.ceiling_records import survey
-from tools.sim.lightrun import LightRun
+from tools.sim.building.buildings import building
+from tools.sim.building.world import Array
+from tools.sim.ceiling.ceiling import Ceiling, Effects
+from tools.sim.ceiling.lamps import Fixture, fixtures, with_codes
+from tools.sim.ceiling.links import Reception
+from tools.sim.ceiling.movers import lean_of
+from tools.sim.ceiling.records import survey
+from tools.sim.light.link_drive import LightRun
 from tools.sim.odometry import Wheels
 from tools.sim.robot import Drive
-from tools.sim.world import Array
 
 SEEDS: Final = (1, 2, 3)
 LAPS: Final = 2

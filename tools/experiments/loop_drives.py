@@ -13,13 +13,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from estimator.measurements import UNLIMITED, Answer, Beam, LightEpoch, Record, Scan
 from estimator.pipeline import State, step
-from estimator.records import UNLIMITED, Answer, Beam, LightEpoch, Record, Scan
 from estimator.result import StepResult
-from tools.sim.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.ceiling_movers import lean_of
-from tools.sim.lightrun import LightRun, room_run
-from tools.sim.people import Crowd, Walker
+from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
+from tools.sim.building.people import Crowd, Walker
+from tools.sim.ceiling.movers import lean_of
+from tools.sim.light.link_drive import LightRun, room_run
 from tools.sim.robot import Body, Drive, Route
 from tools.sim.scene import compose
 

@@ -14,20 +14,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator import se2
-from estimator.light import LightsSetup
+from estimator.light_filter.light_channel import LightsSetup
+from estimator.measurements import UNLIMITED, LightEpoch, Odometry, Record, Scan
+from estimator.numerics import se2
 from estimator.pipeline import Settings, State, keyframe_poses, new_state, step
-from estimator.records import UNLIMITED, LightEpoch, Odometry, Record, Scan
 from estimator.result import Fix, StepResult
 from tools.experiments.trajectory import Array, Track, moved
-from tools.sim.buildings import building
-from tools.sim.ceiling import Ceiling
-from tools.sim.ceiling_movers import lean_of, walkers_of
-from tools.sim.ceiling_records import epochs
-from tools.sim.laserrun import Laser
-from tools.sim.lightrun import ROOM_ROUTE, ROOM_WALKERS, LightRun, room_run, tour_run
-from tools.sim.people import Walker
+from tools.sim.building.buildings import building
+from tools.sim.building.people import Walker
+from tools.sim.ceiling.ceiling import Ceiling
+from tools.sim.ceiling.movers import lean_of, walkers_of
+from tools.sim.ceiling.records import epochs
+from tools.sim.light.link_drive import ROOM_ROUTE, ROOM_WALKERS, LightRun, room_run, tour_run
 from tools.sim.robot import Drive
+from tools.sim.scan_drive import Laser
 
 AT_ONCE_S: Final = 1e-6
 THIN: Final = 4

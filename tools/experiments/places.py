@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.lamps import Survey
-from estimator.links import Method, Prior, Received, locate
-from tools.sim.ceiling import Ceiling, Photodiode
-from tools.sim.ceiling_links import EPOCH_S, Reception
-from tools.sim.ceiling_records import survey
+from estimator.light_filter.survey import Survey
+from estimator.paper.lateration import Method, Prior, Received, locate
+from tools.sim.ceiling.ceiling import Ceiling, Photodiode
+from tools.sim.ceiling.links import EPOCH_S, Reception
+from tools.sim.ceiling.records import survey
 
 Array = npt.NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from tools.figures import Figure
+from tools.ci.figures import Figure
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -14,19 +14,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator import lights
-from estimator.calibrate import calibrate
-from estimator.calibrate_problem import Priors
-from estimator.calibrate_residual import learn
-from estimator.calibrate_rows import Rows
-from estimator.lights_residual import Learned
-from estimator.lights_state import LightsSettings
-from estimator.records import LightEpoch, Odometry
+from estimator.calibration.calibrate import calibrate
+from estimator.calibration.observations import Rows
+from estimator.calibration.parameters import Priors
+from estimator.calibration.residual_map_fit import learn
+from estimator.light_filter import light_filter
+from estimator.light_filter.filter_state import LightsSettings
+from estimator.light_filter.residual_setting import Learned
+from estimator.measurements import LightEpoch, Odometry
 from estimator.result import Fix
+from tools.ci.figures import Figure, bounded
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.figures import Figure, bounded
-from tools.sim.ceiling import Effects
-from tools.sim.lightrun import ROOM_BODY, LightRun, room_run
+from tools.sim.ceiling.ceiling import Effects
+from tools.sim.light.link_drive import ROOM_BODY, LightRun, room_run
 from tools.sim.robot import Drive, Route
 
 Array = npt.NDArray[np.float64]
@@ -93,16 +93,16 @@ def trace(run: LightRun, case: Case, settings: LightsSettings, seconds: float) -
     survey, corrections = run.survey, None
     if case.taught:
         survey, corrections = taught(run)
-    filter_ = lights.new_lights(survey, settings, corrections)
+    filter_ = light_filter.new_lights(survey, settings, corrections)
     rows = []
     for record in run.records():
         if record.t_end > seconds:
             break
         if isinstance(record, Odometry):
             if case.odometry:
-                lights.predict(filter_, record)
+                light_filter.predict(filter_, record)
             continue
-        result = lights.update(filter_, replace(record, lamps=(None,) * len(record.ids)))
+        result = light_filter.update(filter_, replace(record, lamps=(None,) * len(record.ids)))
         true = run.truth(np.array([result.t_pose]))[0]
         off = result.T_map_base - true
         off[2] = (off[2] + np.pi) % (2.0 * np.pi) - np.pi

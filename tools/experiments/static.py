@@ -16,17 +16,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.calibrate import calibrate
-from estimator.calibrate_problem import Priors
-from estimator.calibrate_residual import learn
-from estimator.calibrate_rows import Rows, model
-from estimator.lamps import Lamp, Receiver, Survey
-from estimator.optics import pack_lamps, pack_receiver
-from estimator.residual import ResidualMap
-from estimator.residual_look import look_up
+from estimator.calibration.calibrate import calibrate
+from estimator.calibration.observations import Rows, model
+from estimator.calibration.parameters import Priors
+from estimator.calibration.residual_map_fit import learn
+from estimator.light_filter.lambertian import pack_lamps, pack_receiver
+from estimator.light_filter.residual_lookup import look_up
+from estimator.light_filter.residual_map import ResidualMap
+from estimator.light_filter.survey import Lamp, Receiver, Survey
+from tools.ci.figures import Figure, bounded
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
 from tools.experiments.vlp import Campaign, campaign
-from tools.figures import Figure, bounded
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

@@ -12,12 +12,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.calibrate_rows import Rows
-from estimator.survey import Heard, Surveyed
-from estimator.survey import survey as survey_by_drive
+from estimator.calibration.lamp_mapping import Heard, Surveyed
+from estimator.calibration.lamp_mapping import survey as survey_by_drive
+from estimator.calibration.observations import Rows
+from tools.ci.figures import bounded
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.figures import bounded
-from tools.sim.lightrun import LightRun, room_run
+from tools.sim.light.link_drive import LightRun, room_run
 
 Array = npt.NDArray[np.float64]
 

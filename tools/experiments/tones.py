@@ -15,15 +15,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator.cdma_block import Sampled
-from estimator.cdma_kernels import invert
-from estimator.cdma_mains import basis, orthonormal
-from estimator.cdma_newton import reduce_rows
-from estimator.cdma_pieces import stacked
+from estimator.cdma.correlation_kernels import invert
+from estimator.cdma.data_bits import stacked
+from estimator.cdma.joint_fit_kernels import reduce_rows
+from estimator.cdma.mains_rejection import basis, orthonormal
+from estimator.cdma.sample_block import Sampled
+from tools.ci.figures import Figure
 from tools.experiments import vlp
 from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
 from tools.experiments.vlp import Array, Raw
-from tools.figures import Figure
 
 HARMONICS: Final = (1, 2, *range(3, 42, 2))
 """Lamps switched with equal on and off times have odd harmonics; the second shows how equal these are."""

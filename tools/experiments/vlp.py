@@ -76,7 +76,7 @@ class Inertial:
         return np.interp(t, self.t, np.cumsum(self.angle[:, 2]))
 
     def lean(self, t: Array, window: float = 1.0) -> Array:
-        """(n, 2) slopes of the receiver's axis (see `estimator.lamps.Receiver`) by mean specific force around ``t``.
+        """(n, 2) slopes of the receiver's axis (`survey.Receiver`) by mean specific force around ``t``.
 
         At rest they are true; while moving they contain the robot's own acceleration over 9.81 m/s2.
         """

@@ -15,19 +15,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator import lights
-from estimator.calibrate import calibrate
-from estimator.calibrate_problem import Priors
-from estimator.calibrate_rows import Rows, model
-from estimator.cdma_epoch import BlockFlag, LightEpoch
-from estimator.lamps import Lamp, Receiver, Survey
-from estimator.lights_state import LightsSettings, ModelErrors, MotionErrors
-from estimator.optics import pack_lamps, pack_receiver
-from estimator.records import Imu
+from estimator.calibration.calibrate import calibrate
+from estimator.calibration.observations import Rows, model
+from estimator.calibration.parameters import Priors
+from estimator.cdma.epoch import BlockFlag, LightEpoch
+from estimator.light_filter import light_filter
+from estimator.light_filter.filter_state import LightsSettings, ModelErrors, MotionErrors
+from estimator.light_filter.lambertian import pack_lamps, pack_receiver
+from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator.measurements import Imu
 from estimator.result import Fix
+from tools.ci.figures import Figure, bounded
 from tools.experiments.report import COMMAND, Picture, Report, Table, Work
 from tools.experiments.vlp import Walk, walk
-from tools.figures import Figure, bounded
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -115,7 +115,7 @@ def moving(data: Walk, t: Array) -> Mask:
 
 def follow(data: Walk, what: Known, which: Mask, with_lean: bool = True) -> Array:
     """(n, 8) rows: t, estimated x, y, true x, y, sigma (m), GOOD or not, heading known or not."""
-    filter_ = lights.new_lights(what.survey, SETTINGS)
+    filter_ = light_filter.new_lights(what.survey, SETTINGS)
     times = data.t[which]
     slopes = lean(data, times - what.lag) if with_lean else np.zeros((len(times), 2))
     rows, t0 = [], float(times[0] - 1.0)
@@ -124,10 +124,10 @@ def follow(data: Walk, what: Known, which: Mask, with_lean: bool = True) -> Arra
         true_t = t - what.lag
         while now + IMU_S <= true_t:
             turn = np.diff(data.imu.yaw(np.array((now, now + IMU_S))))[0]
-            lights.predict(filter_, Imu(now, now + IMU_S, float(turn)))
+            light_filter.predict(filter_, Imu(now, now + IMU_S, float(turn)))
             now += IMU_S
-        lights.lean(filter_, *slopes[k].tolist())
-        result = lights.update(filter_, epoch(data, what, int(np.flatnonzero(data.t == t)[0])))
+        light_filter.lean(filter_, *slopes[k].tolist())
+        result = light_filter.update(filter_, epoch(data, what, int(np.flatnonzero(data.t == t)[0])))
         true = places(data, np.array([result.t_pose]))[0]
         sigma = math.sqrt(float(result.covariance[0, 0] + result.covariance[1, 1]))
         done = result.fix not in (Fix.NONE, Fix.LOST)

@@ -10,11 +10,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from tools.sim.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.buildings import BUILDINGS, Building, building
-from tools.sim.people import Crowd
+from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
+from tools.sim.building.buildings import BUILDINGS, Building, building
+from tools.sim.building.people import Crowd
+from tools.sim.building.world import CIRCLE, MATERIAL_ID, Array
 from tools.sim.robot import Body, Drive
-from tools.sim.world import CIRCLE, MATERIAL_ID, Array
 
 COLOURS: Final = {"glass": "deepskyblue", "black": "black", "steel": "tab:gray", "wood": "peru", "polished": "tab:pink"}
 

@@ -12,7 +12,7 @@ from typing import IO, Final
 
 import numpy as np
 
-from hal.input_codec import ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, encode
+from hal.net.input_codec import ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, encode
 from tools.sim.scene import Scene
 
 TRUTH_PERIOD_S: Final = 0.01

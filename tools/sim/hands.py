@@ -13,8 +13,8 @@ from typing import Final, Protocol
 import numpy as np
 
 from hal.fake.faults import Fault, Parameter, Vocabulary, Word
+from tools.sim.building.world import Array
 from tools.sim.robot import Drive
-from tools.sim.world import Array
 
 VOCABULARY: Final[Vocabulary] = {
     "carry": Word(

@@ -15,25 +15,25 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.budget import FixedBudget
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
-from daemon.cycle import Cycle, Sink
-from daemon.endpoints import NO_DEVICE
-from daemon.main import Daemon, World
-from daemon.publish.snapshot import Snapshot, State
-from daemon.worker import CycleWorker
+from daemon.app import Daemon, World
+from daemon.config.endpoints import NO_DEVICE
+from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.runtime.budget import FixedBudget
+from daemon.runtime.cycle import Cycle, Sink
+from daemon.runtime.worker import CycleWorker
+from daemon.snapshot import Snapshot, State
 from hal.clock import LoopClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import Unit
 from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.transport import FakeOpener
-from hal.inputs import InputPort
+from hal.net.inputs import InputPort
+from tools.sim.building.world import Array
 from tools.sim.feed import feed_odometry
 from tools.sim.hands import Hands
-from tools.sim.harness_light import BUS, LEVEL, LinkBridge, light_up, lights_of
+from tools.sim.light.harness import BUS, LEVEL, LinkBridge, light_up, lights_of
+from tools.sim.light.scene import LINK
 from tools.sim.scene import Scenario, Scene, SimulatedScene
-from tools.sim.scene_light import LINK
-from tools.sim.world import Array
 
 DEVICE: Final = "/dev/simulated"
 _ANY_PORT: Final = 1  # says that odometry is configured; the harness delivers the datagrams itself
@@ -180,7 +180,7 @@ def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
     """What the daemon meets in virtual time: no thread, no stopwatch, no chance."""
 
     async def warm() -> None:
-        from daemon.warmup import load
+        from daemon.runtime.warmup import load
 
         load()
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from hal.fake.models import ECHOES, UTM_30LX, LidarModel
-from hal.fake.rotor import TimetableRotor
-from hal.fake.scan import FakeScan
+from hal.fake.lidar.models import ECHOES, UTM_30LX, LidarModel
+from hal.fake.lidar.rotor import TimetableRotor
+from hal.fake.lidar.scan import FakeScan
 from hal.lidar import VALID, LidarGeometry, RawScan
 from hal.odometry import RawOdometry
-from tools.sim.world import Array
+from tools.sim.building.world import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

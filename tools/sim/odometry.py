@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from tools.sim.building.world import Array, World
 from tools.sim.robot import Drive
-from tools.sim.world import Array, World
 
 _BLOCK: Final = 512
 

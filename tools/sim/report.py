@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.publish.snapshot import State
-from daemon.reasons import REASONS, Reason
-from hal.fake.models import MODELS
-from tools.sim.buildings import BUILDINGS
-from tools.sim.ceiling import Effects
+from daemon.health.reasons import REASONS, Reason
+from daemon.snapshot import State
+from hal.fake.lidar.models import MODELS
+from tools.sim.building.buildings import BUILDINGS
+from tools.sim.ceiling.ceiling import Effects
 from tools.sim.harness import Run, run
+from tools.sim.light.scene import LINK, WAVEFORM, Lights
 from tools.sim.scene import Scenario
-from tools.sim.scene_light import LINK, WAVEFORM, Lights
 
 WRONG_M = 0.3
 """A pose further off than this is wrong, whatever is said about it."""

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from tools.sim.world import Array
+from tools.sim.building.world import Array
 
 STEP_M: Final = 0.01
 SHARP_RAD: Final = 0.075

@@ -26,24 +26,24 @@ from typing import Any
 
 import numpy as np
 
-from daemon.surveyfile import SurveyError
+from daemon.config.survey_loader import SurveyError
 from hal.errors import HalError
 from hal.fake.control import Control, serve_control
 from hal.fake.faults import FaultError
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import MODELS, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import MODELS, Unit
 from hal.fake.pty_server import PtyServer
 from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.tcp_server import TcpServer
-from hal.serving import work_until_told
-from tools.sim.buildings import BUILDINGS
-from tools.sim.ceiling import Effects
+from hal.run_server import work_until_told
+from tools.sim.building.buildings import BUILDINGS
+from tools.sim.ceiling.ceiling import Effects
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
 from tools.sim.hands import Hands
 from tools.sim.hybrid import HybridScene
+from tools.sim.light.scene import Lights
+from tools.sim.light.serve import serve_light, write_plan
 from tools.sim.scene import Scenario, Scene, SimulatedScene
-from tools.sim.scene_light import Lights
-from tools.sim.serve_light import serve_light, write_plan
 
 LOG_LEAD_S = 3.0
 """A log starts this long after the simulator, so that its first scans find a reader."""

@@ -11,18 +11,18 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from hal.fake.models import MODELS, LidarModel
-from hal.fake.rotor import Rotor
-from hal.fake.scan import FakeScan
-from tools.sim import beams
-from tools.sim.beams import Optics, Posture, Returns, Scanner, Sweep
-from tools.sim.buildings import Building, building
+from hal.fake.lidar.models import MODELS, LidarModel
+from hal.fake.lidar.rotor import Rotor
+from hal.fake.lidar.scan import FakeScan
+from tools.sim.building import beams
+from tools.sim.building.beams import Optics, Posture, Returns, Scanner, Sweep
+from tools.sim.building.buildings import Building, building
+from tools.sim.building.people import Crowd
+from tools.sim.building.world import Array
 from tools.sim.hands import Way, start_of, then
+from tools.sim.light.scene import Lights, SceneLight
 from tools.sim.odometry import Odometer, Wheels
-from tools.sim.people import Crowd
 from tools.sim.robot import Body, Drive
-from tools.sim.scene_light import Lights, SceneLight
-from tools.sim.world import Array
 
 OPTICS: Final[dict[str, Optics]] = {
     "URG-04LX": beams.URG_04LX, "URG-04LX-UG01": beams.URG_04LX, "UBG-04LX-F01": beams.URG_04LX,
@@ -49,7 +49,7 @@ class Scene(Protocol):
         ...
 
     def scan(self, t_mono: float) -> FakeScan | None:
-        """A :data:`hal.fake.scan.ScanSource`."""
+        """A :data:`hal.fake.lidar.scan.ScanSource`."""
         ...
 
     def odometry_after(self, t_mono: float) -> tuple[float, Array] | None:
@@ -66,8 +66,8 @@ class Scenario:
     """Everything that makes a simulated run repeatable.
 
     Attributes:
-        building: name, see :data:`tools.sim.buildings.BUILDINGS`.
-        lidar: name in :data:`hal.fake.models.MODELS`, or a model of one's own.
+        building: name, see :data:`tools.sim.building.buildings.BUILDINGS`.
+        lidar: name in :data:`hal.fake.lidar.models.MODELS`, or a model of one's own.
         seed: of noise, people and slip. people: False empties the building.
         dwell_s: standing still before each lap. laps: how many.
         optics: None takes the lidar's own. lights: coded lamps overhead; None: there are none.

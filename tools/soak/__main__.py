@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from tools.figures import Figure, save, table
+from tools.ci.figures import Figure, save, table
 from tools.soak.watched import Watch
 
 COMMAND: Final = "python -m tools.soak"

@@ -11,18 +11,18 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma_epoch import LightEpoch
-from estimator.lamps import Survey
+from estimator.cdma.epoch import LightEpoch
+from estimator.light_filter.survey import Survey
 from hal.lidar import VALID, LidarGeometry, RawScan
 from hal.odometry import RawOdometry
-from tools.sim.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.buildings import building
-from tools.sim.ceiling import Array, Effects, ceiling_of
-from tools.sim.ceiling_links import EPOCH_S, Links
-from tools.sim.ceiling_movers import lean_of, walkers_of
-from tools.sim.ceiling_records import frames, light_epoch, survey
+from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
+from tools.sim.building.buildings import building
+from tools.sim.building.people import Crowd
+from tools.sim.ceiling.ceiling import Array, Effects, ceiling_of
+from tools.sim.ceiling.links import EPOCH_S, Links
+from tools.sim.ceiling.movers import lean_of, walkers_of
+from tools.sim.ceiling.records import frames, light_epoch, survey
 from tools.sim.odometry import Odometer, Wheels
-from tools.sim.people import Crowd
 from tools.sim.robot import Body, Drive
 from tools.sim.scene import compose
 

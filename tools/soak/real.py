@@ -13,9 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from daemon.publish.client import NoAnswer, Reader
-from daemon.publish.snapshot import State
-from tools.demo import (
+from daemon.cli.status import NoAnswer, Reader
+from daemon.snapshot import State
+from tools.demo.run import (
     BUS,
     CONTROL,
     SURVEY,

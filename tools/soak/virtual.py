@@ -14,18 +14,18 @@ from typing import Final
 
 import numpy as np
 
-from daemon.bridge import ScanBridge
-from daemon.budget import FixedBudget
-from daemon.config import LidarConfig, Mount
-from daemon.cycle import Cycle, Parts
-from daemon.publish.modbus import ModbusPublisher
-from daemon.publish.snapshot import Snapshot, State
-from daemon.publish.udp import PoseSender
-from daemon.worker import CycleWorker
-from estimator import se2
-from estimator.light import LightsSetup
+from daemon.config.schema import LidarConfig, Mount
+from daemon.devices.conversion import ScanBridge
+from daemon.publish.modbus.server import ModbusPublisher
+from daemon.publish.udp_sender import PoseSender
+from daemon.runtime.budget import FixedBudget
+from daemon.runtime.cycle import Cycle, Parts
+from daemon.runtime.worker import CycleWorker
+from daemon.snapshot import Snapshot, State
+from estimator.light_filter.light_channel import LightsSetup
+from estimator.measurements import Limits, Record
+from estimator.numerics import se2
 from estimator.pipeline import new_state, step
-from estimator.records import Limits, Record
 from estimator.result import StepResult
 from hal.clock import SystemClock
 from hal.lidar import LidarStatus, Link

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.figures import Figure, bounded
+from tools.ci.figures import Figure, bounded
 
 Array = npt.NDArray[np.float64]
 

@@ -9,11 +9,11 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-from daemon.publish import modbus
-from daemon.publish.modbus import ModbusPublisher
+from daemon.publish.modbus import server
+from daemon.publish.modbus.server import ModbusPublisher
 from hal.clock import SystemClock
 from hal.errors import DeviceRefused
-from tests.daemon.publish.test_registers import snapshot
+from tests.daemon.publish.modbus.test_registers import snapshot
 
 PATIENCE_S = 5.0
 BLOCK = (4, 0, 64)
@@ -147,8 +147,8 @@ class Wire(asyncio.Transport):
     abort = close
 
 
-def plugged(endpoint: modbus.TcpEndpoint) -> tuple[modbus.Connection, Wire]:
-    connection = modbus.Connection(endpoint)
+def plugged(endpoint: server.TcpEndpoint) -> tuple[server.Connection, Wire]:
+    connection = server.Connection(endpoint)
     wire = Wire(connection)
     connection.connection_made(wire)
     return connection, wire

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish import document, registers
+from daemon.publish import document
+from daemon.publish.modbus import registers
 
 DOCS = Path(__file__).parents[3] / "docs"
 

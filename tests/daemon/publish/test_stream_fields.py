@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from daemon import streambeat
-from daemon.maptiles import MapTiles
-from daemon.publish.snapshot import LightPicture
-from daemon.publish.stream import SIDE, TOPICS, StreamServer
+from daemon.maps.tiles import MapTiles
+from daemon.publish import stream_ticker
 from daemon.publish.stream_fields import FIELDS, RECORDS
+from daemon.publish.stream_server import SIDE, TOPICS, StreamServer
+from daemon.snapshot import LightPicture
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.test_stream import SNAPSHOT, connected, raw_scan, run
-from tests.daemon.test_cycle import on_bench
+from tests.daemon.publish.test_stream_server import SNAPSHOT, connected, raw_scan, run
+from tests.daemon.runtime.test_cycle import on_bench
 
 
 def expected(topic: str) -> set[str]:
@@ -40,7 +40,7 @@ def test_every_topic_tells_what_is_written_down(tmp_path: Path) -> None:
                 break
         server.publish(replace(SNAPSHOT, light=LightPicture(), loop_counter=1))
         server.on_scan(raw_scan())
-        server.on_statistics(lambda: streambeat.figures(bench.cycle, 5.0))
+        server.on_statistics(lambda: stream_ticker.figures(bench.cycle, 5.0))
         server.on_raw("lidar", "rx", 1.5, b"x")
         while told.keys() != set(TOPICS):
             frame = await tap.frame()

@@ -9,17 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import maptiles, streambeat
-from daemon.maptiles import MapTiles
-from daemon.publish import stream, stream_client
-from daemon.publish.stream import StreamServer
-from estimator import livemap, patch, pipeline
-from estimator.records import UNLIMITED, Scan
+from daemon.maps import tiles as maps_tiles
+from daemon.maps.tiles import MapTiles
+from daemon.publish import stream_client, stream_server, stream_ticker
+from daemon.publish.stream_server import StreamServer
+from estimator import pipeline
+from estimator.mapping import grid_patches, live_grid
+from estimator.measurements import UNLIMITED, Scan
 from estimator.state import State
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.test_stream import Tap, connected, run, until, wanting
+from tests.daemon.publish.test_stream_server import Tap, connected, run, until, wanting
 from tests.daemon.room import HALF_X, HALF_Y, ranges_m
-from tests.daemon.test_cycle import on_bench
+from tests.daemon.runtime.test_cycle import on_bench
 
 SILENT = (104, "no valid scan", "check the cable")
 
@@ -105,7 +106,7 @@ async def received(tap: Tap) -> dict[tuple[int, int], np.ndarray]:
 def known(tiles: dict[tuple[int, int], np.ndarray]) -> tuple[float, float]:
     """Width and height, m, of what is occupied."""
     at = [
-        (column * stream.SIDE + i, row * stream.SIDE + j)
+        (column * stream_server.SIDE + i, row * stream_server.SIDE + j)
         for (column, row), cells in tiles.items()
         for j, i in np.argwhere(cells > 0).tolist()
     ]
@@ -172,14 +173,14 @@ def test_drawing_that_has_failed_is_tried_again(
 ) -> None:
     fails = [True, True]
 
-    def advance(task: livemap.Task) -> livemap.Progress:
+    def advance(task: live_grid.Task) -> live_grid.Progress:
         if fails and fails.pop():
             raise MemoryError
         return draw(task)
 
-    draw = livemap.advance
-    monkeypatch.setattr(livemap, "advance", advance)
-    monkeypatch.setattr(maptiles, "AGAIN_S", 0.05)
+    draw = live_grid.advance
+    monkeypatch.setattr(live_grid, "advance", advance)
+    monkeypatch.setattr(maps_tiles, "AGAIN_S", 0.05)
 
     async def body(server: StreamServer) -> None:
         robot = Robot()
@@ -206,20 +207,20 @@ def test_drawing_that_has_failed_is_tried_again(
 
 def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_client, "BUFFER_BYTES", 1024)
-    monkeypatch.setattr(stream, "TILE_BYTES", 1)
+    monkeypatch.setattr(stream_server, "TILE_BYTES", 1)
 
     async def body(server: StreamServer) -> None:
         tiles = server.tiles = MapTiles(lambda: None, server.on_tiles)
         noise = np.random.default_rng(1)
         for column in range(200):
-            cells = noise.integers(-50, 50, (stream.SIDE, stream.SIDE)).astype(np.int8)
+            cells = noise.integers(-50, 50, (stream_server.SIDE, stream_server.SIDE)).astype(np.int8)
             tiles.tiles[column, 0] = 1, zlib.compress(cells.tobytes(), 1)
         tap = await wanting(server, "map")
         (client,) = server.clients
         assert client.stuck
         first = await tap.frame()
         assert first["data"]["more"]
-        tiles.tiles[199, 0] = 2, zlib.compress(bytes(stream.SIDE**2))
+        tiles.tiles[199, 0] = 2, zlib.compress(bytes(stream_server.SIDE**2))
         assert len(await received(tap)) == 199
         assert client.shown == (2, (199, 0))
 
@@ -227,12 +228,12 @@ def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, mon
 
 
 def test_side_and_unit_are_those_of_the_estimator() -> None:
-    assert (stream.SIDE, stream.UNIT) == (patch.SIDE, patch.UNIT)
+    assert (stream_server.SIDE, stream_server.UNIT) == (grid_patches.SIDE, grid_patches.UNIT)
 
 
 def test_statistics_are_numbers() -> None:
     bench = on_bench(lambda bench: bench.drive(0, 5))
-    figures = streambeat.figures(bench.cycle, 5.0)
+    figures = stream_ticker.figures(bench.cycle, 5.0)
     assert figures["t_mono"] == 5.0
     assert figures["cycles"] == bench.cycle.cycles > 0
     assert all(value is None or isinstance(value, int | float) for value in figures.values())

@@ -10,14 +10,15 @@ from typing import Any
 
 import pytest
 
-from daemon import blackbox, checkpoint, cli, disk
-from daemon.config import Config
-from daemon.disk import CLOCK, SegmentWriter
-from daemon.faults import Fault
-from daemon.flight import ABOUT, DUMP, Flight
-from daemon.moment import CYCLE_PARTS
-from daemon.replay import replay
-from daemon.statefile import read_header
+from daemon.cli import parser
+from daemon.cli.replay import replay
+from daemon.config.schema import Config
+from daemon.health.faults import Fault
+from daemon.recording import checkpoint, disk_writer, flight_recorder
+from daemon.recording.disk_writer import CLOCK, SegmentWriter
+from daemon.recording.replay_start import CYCLE_PARTS
+from daemon.recording.retention import ABOUT, DUMP, Flight
+from daemon.recording.state_file import read_header
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
 from hal.replay.recording import Kind, frames_in, open_recording
@@ -25,15 +26,15 @@ from hal.replay.report import LogReport
 from tests.daemon.replay.test_recorded_lights import Recorded
 from tests.daemon.replay.test_recorded_lights import record as record_lit
 from tests.daemon.replay.test_recorded_run import USB, Bench, record
-from tests.daemon.test_lights import decoded
+from tests.daemon.scenarios.test_lights import decoded
 
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk's thread lives in real time, the daemon in virtual time: both are to get somewhere."""
-    monkeypatch.setattr(disk, "WRITE_S", 0.002)
-    monkeypatch.setattr(blackbox, "EVERY_S", 2.0)
-    monkeypatch.setattr(blackbox, "LEAST_S", 2.0)
+    monkeypatch.setattr(disk_writer, "WRITE_S", 0.002)
+    monkeypatch.setattr(flight_recorder, "EVERY_S", 2.0)
+    monkeypatch.setattr(flight_recorder, "LEAST_S", 2.0)
 
 
 def let_write(seconds: float) -> None:
@@ -42,7 +43,7 @@ def let_write(seconds: float) -> None:
 
 
 def replayed(folder: Path, out: Path) -> dict[str, dict[str, Any]]:
-    assert cli.main(["replay", str(folder), "--out", str(out)]) == cli.OK
+    assert parser.main(["replay", str(folder), "--out", str(out)]) == parser.OK
     summary: dict[str, dict[str, Any]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -95,7 +96,7 @@ async def asked(bench: Bench) -> None:
     bench.recorder.box.dump(said.append)
     refused: list[str] = []
     bench.recorder.box.dump(refused.append)
-    assert refused == [blackbox.UNDER_WAY]
+    assert refused == [flight_recorder.UNDER_WAY]
     for _ in range(100):
         await bench.drive(0.1)
         let_write(0.01)
@@ -152,7 +153,7 @@ async def unplugged_at_the_end(bench: Bench) -> None:
     await bench.drive(4.0)
     let_write(0.05)
     bench.opener.unplug(USB)
-    await bench.drive(blackbox.AFTER_S - 1.0)
+    await bench.drive(flight_recorder.AFTER_S - 1.0)
     assert bench.recorder.box._pending is not None
 
 
@@ -193,7 +194,7 @@ def test_with_lights(tmp_path: Path) -> None:
 @pytest.mark.parametrize("scans", [1, 2, 5])
 def test_who_joins_a_line_hears_the_last_pieces_that_ended_scans_whole(scans: int) -> None:
     """A piece may hold several scans, and the beginning of the next."""
-    line = blackbox.Line()
+    line = flight_recorder.Line()
     line.passed(Kind.OPEN, 0.0, b"port")
     line.passed(Kind.RX, 0.0, b"PP")
     for number in range(10):

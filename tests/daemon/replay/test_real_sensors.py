@@ -16,24 +16,24 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from daemon.budget import FixedBudget
-from daemon.config import Config, LidarConfig, Mask, ModbusConfig, Mount
-from daemon.cycle import CycleRecord
-from daemon.main import Daemon, World
-from daemon.replay import Given, replay
-from daemon.worker import CycleWorker
-from estimator import se2
+from daemon.app import Daemon, World
+from daemon.cli.replay import Given, replay
+from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
+from daemon.runtime.budget import FixedBudget
+from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.worker import CycleWorker
+from estimator.numerics import se2
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import URG_04LX_UG01, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import URG_04LX_UG01, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.rotor import TimetableRotor
+from hal.fake.lidar.scan import FakeScan
 from hal.fake.pty_server import PtyServer
-from hal.fake.rotor import TimetableRotor
-from hal.fake.scan import FakeScan
 from hal.fake.transport import FakeOpener
 from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
-from hal.opening import open_port
-from hal.port import PortOpener
+from hal.port.opening import open_port
+from hal.port.port import PortOpener
 from tools import convert
 
 Array = npt.NDArray[np.float64]
@@ -116,7 +116,7 @@ class Stage:
 
 def make_daemon(lidar: LidarConfig, device: str, clock: Clock, opener: PortOpener) -> Daemon:
     async def warm() -> None:
-        from daemon.warmup import load
+        from daemon.runtime.warmup import load
 
         load()
 

@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from daemon import cli
-from daemon.budget import FixedBudget
-from daemon.config import Config, Mount
-from daemon.configfile import dump
-from daemon.lights import RESIDUALS, Lights, from_header
-from daemon.main import Daemon
-from daemon.record import Recorder, decode_cycle
-from daemon.replay import Given, lights_for
-from daemon.residualfile import write_residuals
-from daemon.sources import open_log
-from daemon.surveyfile import write_survey
-from daemon.teach import read_drive
-from estimator.cdma_profile import PROFILE_A
-from estimator.records import Limits
+from daemon.app import Daemon
+from daemon.cli import parser
+from daemon.cli.replay import Given, lights_for
+from daemon.commissioning.teach_drive import read_drive
+from daemon.config.loader import dump
+from daemon.config.residual_file import write_residuals
+from daemon.config.schema import Config, Mount
+from daemon.config.survey_loader import write_survey
+from daemon.recording.recorder import Recorder, decode_cycle
+from daemon.replay.sources import open_log
+from daemon.runtime.budget import FixedBudget
+from daemon.runtime.light_setup import RESIDUALS, Lights, from_header
+from estimator.cdma.air_interface import PROFILE_A
+from estimator.measurements import Limits
 from hal.clock import run_virtual
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
@@ -35,8 +35,8 @@ from hal.replay.report import LogReport
 from tests.daemon.driven import during
 from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.replay.test_recorded_run import assert_the_same
-from tests.daemon.test_lights import LIDAR, Bench, decoded, settings
-from tests.daemon.test_lights_residuals import even_map
+from tests.daemon.scenarios.test_lights import LIDAR, Bench, decoded, settings
+from tests.daemon.scenarios.test_residual_maps import even_map
 
 
 class UnevenBudget(FixedBudget):
@@ -86,7 +86,7 @@ def record(
 
 
 def replay(folder: Path, out: Path, *options: str) -> dict[str, dict[str, object]]:
-    assert cli.main(["replay", str(folder), "--out", str(out), *options]) == cli.OK
+    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == parser.OK
     summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -150,7 +150,7 @@ def test_another_survey_may_be_asked_for(tmp_path: Path, capsys: pytest.CaptureF
     record(tmp_path / "rec", calm, lidar=True)
     missing = tmp_path / "nowhere.toml"
     arguments = ["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out"), "--set", f"lights.survey={missing}"]
-    assert cli.main(arguments) == cli.FAILED
+    assert parser.main(arguments) == parser.FAILED
     assert "no such survey" in capsys.readouterr().err
     without = replay(tmp_path / "rec", tmp_path / "out", "--set", "photodiode.bus=")
     assert without["counts"]["poses"]

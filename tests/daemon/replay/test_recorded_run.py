@@ -15,24 +15,24 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon import cli
-from daemon.budget import FixedBudget
-from daemon.config import Config, LidarConfig, ModbusConfig, Mount
-from daemon.faults import Fault
-from daemon.main import Daemon, World
-from daemon.publish.snapshot import Snapshot, State
-from daemon.reasons import Reason
-from daemon.record import CycleEntry, Recorder, decode_cycle
-from daemon.store import Start
-from daemon.worker import CycleWorker
-from estimator import se2
-from estimator.records import Command, Limits, Order
+from daemon.app import Daemon, World
+from daemon.cli import parser
+from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount
+from daemon.health.faults import Fault
+from daemon.health.reasons import Reason
+from daemon.maps.store import Start
+from daemon.recording.recorder import CycleEntry, Recorder, decode_cycle
+from daemon.runtime.budget import FixedBudget
+from daemon.runtime.worker import CycleWorker
+from daemon.snapshot import Snapshot, State
+from estimator.measurements import Command, Limits, Order
+from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import URG_04LX, URG_04LX_UG01, LidarModel
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import URG_04LX, URG_04LX_UG01, LidarModel
+from hal.fake.lidar.scan_world import Room
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
-from hal.fake.world import Room
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
@@ -87,7 +87,7 @@ class Bench:
 
     def _world(self) -> World:
         async def warm() -> None:
-            from daemon.warmup import load
+            from daemon.runtime.warmup import load
 
             load()
 
@@ -134,7 +134,7 @@ def record(
 
 
 def replay(folder: Path, out: Path) -> dict[str, dict[str, object]]:
-    assert cli.main(["replay", str(folder), "--out", str(out)]) == cli.OK
+    assert parser.main(["replay", str(folder), "--out", str(out)]) == parser.OK
     summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -257,7 +257,7 @@ def test_a_state_or_reason_that_is_not_the_recorded_one_is_a_difference(
         entry = decode_cycle(payload)
         return msgspec.structs.replace(entry, **other) if entry.cycle == 40 else entry
 
-    monkeypatch.setattr("daemon.sources.decode_cycle", decode)
+    monkeypatch.setattr("daemon.replay.sources.decode_cycle", decode)
     said = replay(tmp_path / "rec", tmp_path / "out")["recorded_run"]
     assert said["differ"] == 1
     assert str(said["first_difference"]).startswith("cycle 40: state and reason are (")
@@ -327,7 +327,7 @@ def test_a_recording_with_a_hole_says_where_it_is_not_the_same_run_any_more(
 def test_a_person_may_replay_with_another_configuration(tmp_path: Path) -> None:
     record(tmp_path / "rec", calm)
     arguments = ["--out", str(tmp_path / "out"), "--set", "lidar.mount.yaw=29"]
-    assert cli.main(["replay", str(tmp_path / "rec"), *arguments]) == cli.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), *arguments]) == parser.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["config"]["lidar"]["mount"] == {"x": 0.1, "y": -0.02, "yaw": 29.0, "inverted": False}
     assert summary["config"]["lidar"]["device"] == USB  # what nobody asked for is as recorded

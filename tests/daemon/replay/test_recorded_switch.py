@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from daemon import blackbox, disk, flight
-from daemon.config import MapConfig
-from daemon.lights import Lights
-from daemon.main import Daemon
-from daemon.record import Recorder
-from daemon.store import started
-from estimator.cdma_profile import PROFILE_A
-from estimator.records import Command, Order
+from daemon.app import Daemon
+from daemon.config.schema import MapConfig
+from daemon.maps.store import started
+from daemon.recording import disk_writer, flight_recorder, retention
+from daemon.recording.recorder import Recorder
+from daemon.runtime.light_setup import Lights
+from estimator.cdma.air_interface import PROFILE_A
+from estimator.measurements import Command, Order
 from hal.clock import run_virtual
 from tests.daemon.driven import during
 from tests.daemon.lightroom import SURVEY
 from tests.daemon.replay.test_dump import let_write, replayed
 from tests.daemon.replay.test_recorded_lights import Recorded
-from tests.daemon.test_lights import decoded, settings
+from tests.daemon.scenarios.test_lights import decoded, settings
 
 KEEP_S = 5.0
 Ask = Callable[[Callable[[str], None]], None]
@@ -65,8 +65,8 @@ async def on_to_another_map_and_back(bench: Stored) -> None:
 
 
 def test_a_switch_under_lamps_is_in_the_dump_and_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk, "WRITE_S", 0.002)
-    monkeypatch.setattr(blackbox, "LEAST_S", 2.0)
+    monkeypatch.setattr(disk_writer, "WRITE_S", 0.002)
+    monkeypatch.setattr(flight_recorder, "LEAST_S", 2.0)
 
     async def go() -> Stored:
         bench = Stored(tmp_path, True, Lights(SURVEY, PROFILE_A, 12.5))
@@ -80,13 +80,13 @@ def test_a_switch_under_lamps_is_in_the_dump_and_is_repeated(tmp_path: Path, mon
     assert np.hypot(*steps[:, :2].T).max() < 0.1, "T_odom_base does not jump"
     assert [one.map_id for one in (posed[0], posed[-1])] == [1, 1]
     assert len({one.map_id for one in posed}) == 2
-    (dump,) = (tmp_path / "rec").glob(f"{flight.DUMP}*-{flight.ASKED}")
-    assert len(list(dump.glob(flight.SWITCHED))) == 1
+    (dump,) = (tmp_path / "rec").glob(f"{retention.DUMP}*-{retention.ASKED}")
+    assert len(list(dump.glob(retention.SWITCHED))) == 1
     assert not (dump / "000000.lumirec").exists(), "it begins in the middle of the run"
     said = replayed(dump, tmp_path / "out")["recorded_run"]
     assert said["differ"] == 0, said
     whole = said["cycles"]
-    next(dump.glob(flight.SWITCHED)).unlink()
+    next(dump.glob(retention.SWITCHED)).unlink()
     said = replayed(dump, tmp_path / "without")["recorded_run"]
     assert "cannot be used" in said["first_difference"]
     assert 0 < said["differ"] <= said["cycles"] == whole, "what cannot be run again was recorded all the same"

@@ -12,12 +12,12 @@ import pytest
 import yaml
 from PIL import Image
 
-from daemon.mapimage import WALL, draw, lettered
-from daemon.mapserver import FREE, OCCUPIED
-from daemon.png import encode_png
-from daemon.publish.snapshot import State
-from daemon.results import Folder, OutputRefused, Trajectory, greys, guessed, map_files, map_yaml, pgm, tum
-from estimator.grid import Grid
+from daemon.maps.map_drawing import WALL, draw, lettered
+from daemon.maps.map_server import FREE, OCCUPIED
+from daemon.maps.png import encode_png
+from daemon.replay.results import Folder, OutputRefused, Trajectory, greys, guessed, map_files, map_yaml, pgm, tum
+from daemon.snapshot import State
+from estimator.mapping.occupancy_grid import Grid
 
 LOGITS = np.array([[4.0, 0.0, -4.0], [-1.4, -1.42, 0.61], [0.63, 10.0, -10.0]], dtype=np.float32)
 """Row 0 has the smallest y: wall, unknown, free; then just over FREE, just under, just under OCCUPIED; then walls."""

@@ -8,18 +8,23 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hal import i2c_frames as frames
 from hal.adc import Blemish
-from hal.i2c import Transferred, read, write
-from hal.photodiode.blocks import inspect
-from hal.photodiode.capability import Capability
-from hal.photodiode.judge import Judge
+from hal.bus import i2c_frames as frames
+from hal.bus.i2c import Transferred, read, write
+from hal.photodiode.adapter_limits import Capability
+from hal.photodiode.block_check import inspect
+from hal.photodiode.diagnosis import Judge
 from hal.photodiode.mcp3221 import CHIP
 from hal.photodiode.sampler import Sampler
 from tests.fuzz.targets import refused
 
 MEGABYTES = 10
-PARSERS = ("hal/photodiode/blocks.py", "hal/photodiode/sampler.py", "hal/photodiode/judge.py", "hal/i2c_frames.py")
+PARSERS = (
+    "hal/photodiode/block_check.py",
+    "hal/photodiode/sampler.py",
+    "hal/photodiode/diagnosis.py",
+    "hal/bus/i2c_frames.py",
+)
 
 LENGTH, SCL = 2222, 400e3
 SPAN = (10 + 9 * LENGTH) / SCL + 60e-6

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable
 from itertools import islice
 
-from daemon.sources import open_log
+from daemon.replay.sources import open_log
 from hal.errors import HalError
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
@@ -17,8 +17,8 @@ from tests.fuzz.targets import a_file, refused, scip
 MEGABYTES = 3
 PARSERS = (
     "hal/replay/carmen.py", "hal/replay/carmen_lines.py", "hal/replay/carmen_scans.py", "hal/replay/text.py",
-    "hal/replay/capture.py", "hal/replay/recording.py", "hal/replay/mount.py", "hal/replay/stamps.py",
-    "daemon/sources.py",
+    "hal/replay/capture.py", "hal/replay/recording.py", "hal/replay/mount.py", "hal/replay/monotone_stamps.py",
+    "daemon/replay/sources.py",
 )  # fmt: skip
 EVENTS = 20_000
 

@@ -6,15 +6,20 @@ import struct
 import zlib
 from collections.abc import Callable
 
-from daemon.store_file import HEAD, ROW, BadMap
-from daemon.store_image import image_from
-from daemon.store_tables import read, summary
-from estimator.mapimage import restored
+from daemon.maps.container import HEAD, ROW, BadMap
+from daemon.maps.image import image_from
+from daemon.maps.schema import read, summary
+from estimator.mapping.map_snapshot import restored
 from tests.daemon.mapmaker import Shape, content
 from tests.fuzz.targets import refused
 
 MEGABYTES = 3
-PARSERS = ("daemon/store_file.py", "daemon/store_tables.py", "daemon/store_image.py", "estimator/mapimage.py")
+PARSERS = (
+    "daemon/maps/container.py",
+    "daemon/maps/schema.py",
+    "daemon/maps/image.py",
+    "estimator/mapping/map_snapshot.py",
+)
 
 
 def seeds() -> list[bytes]:

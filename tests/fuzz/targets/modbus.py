@@ -7,16 +7,20 @@ import struct
 import weakref
 from collections.abc import Callable
 
-from daemon.publish import modbus, registers, rtu_frames
-from daemon.publish.requests import MAX_FRAME, frame_size
+from daemon.publish.modbus import registers, rtu_frames, server
+from daemon.publish.modbus.requests import MAX_FRAME, frame_size
 from hal.clock import VirtualLoop
-from hal.share import Share
+from hal.net.fair_share import Share
+from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import plugged
-from tests.daemon.publish.test_registers import snapshot
 from tests.fuzz.test_modbus import check_answer, framed, responder, whole_frames
 
 MEGABYTES = 10
-PARSERS = ("daemon/publish/requests.py", "daemon/publish/holding.py", "daemon/publish/rtu_frames.py")
+PARSERS = (
+    "daemon/publish/modbus/requests.py",
+    "daemon/publish/modbus/holding.py",
+    "daemon/publish/modbus/rtu_frames.py",
+)
 
 READ = framed(1, 1, b"\x04\0\0\0\x40")
 
@@ -53,7 +57,7 @@ def feeder() -> Callable[[bytes], None]:
     loop, answering = VirtualLoop(), responder()
 
     async def stream(data: bytes) -> None:
-        endpoint = modbus.TcpEndpoint(responder(), modbus.Counts(), share=Share(loop.time))
+        endpoint = server.TcpEndpoint(responder(), server.Counts(), share=Share(loop.time))
         connection, wire = plugged(endpoint)
         expected, faulty = whole_frames(data)
         cut = len(data) * 2 // 3

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
-from daemon.maptiles import MapTiles
-from daemon.publish.stream import TOPICS, Client, StreamServer, framed
+from daemon.maps.tiles import MapTiles
 from daemon.publish.stream_client import BUFFER_BYTES
+from daemon.publish.stream_server import TOPICS, Client, StreamServer, framed
 from hal.clock import VirtualLoop
-from hal.share import Share
-from tests.daemon.publish.test_registers import snapshot
+from hal.net.fair_share import Share
+from tests.daemon.publish.modbus.test_registers import snapshot
 
 MEGABYTES = 10
 PARSERS = ("daemon/publish/stream_client.py",)

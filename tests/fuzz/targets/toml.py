@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from daemon import configfile, mapserver, surveyfile
-from daemon.config import Config
+from daemon.config import loader, survey_loader
+from daemon.config.schema import Config
+from daemon.maps import map_server
 from tests.daemon.mapmaker import SURVEY
 from tests.fuzz.targets import a_file, refused
 
 MEGABYTES = 3
 PARSERS = (
-    "daemon/configfile.py",
-    "daemon/configwords.py",
-    "daemon/config.py",
-    "daemon/surveyfile.py",
-    "daemon/surveytree.py",
-    "daemon/surveywords.py",
-    "daemon/mapserver.py",
+    "daemon/config/loader.py",
+    "daemon/config/errors.py",
+    "daemon/config/schema.py",
+    "daemon/config/survey_loader.py",
+    "daemon/config/survey_schema.py",
+    "daemon/config/survey_errors.py",
+    "daemon/maps/map_server.py",
 )
 
 DESCRIPTION = (
@@ -26,12 +27,12 @@ DESCRIPTION = (
 
 
 def seeds() -> list[bytes]:
-    whole = configfile.dump(Config())
+    whole = loader.dump(Config())
     return [
         whole.encode(),
         b'[lidar]\ndevice = "auto"\n[modbus]\nport = 1502\nwrite = true\n',
         b"[lidar]\nmount = [0.1, 0.0, 0.0]\n[photodiode]\nlever = [0.0, 0.0, 0.4]\n",
-        surveyfile.dump(SURVEY).encode(),
+        survey_loader.dump(SURVEY).encode(),
         DESCRIPTION,
         DESCRIPTION + b"mode: trinary\n# a comment\n",
         b"\xef\xbb\xbf[lidar]\r\ndevice = 'x'\r\n",
@@ -47,15 +48,15 @@ def feeder() -> Callable[[bytes], None]:
     file = a_file("a.toml")
 
     def configured() -> None:
-        assert configfile.dump(configfile.load(file))
+        assert loader.dump(loader.load(file))
 
     def feed(data: bytes) -> None:
         file.write_bytes(data)
-        said = refused(configured, by=configfile.ConfigError)
+        said = refused(configured, by=loader.ConfigError)
         assert not said or "a.toml" in said
-        said = refused(surveyfile.read_survey, file, by=surveyfile.SurveyError)
+        said = refused(survey_loader.read_survey, file, by=survey_loader.SurveyError)
         assert not said or "a.toml" in said
-        said = refused(mapserver.load, file, by=mapserver.BadMapServer)
+        said = refused(map_server.load, file, by=map_server.BadMapServer)
         assert not said or file.parent.name in said
 
     return feed

@@ -7,18 +7,19 @@ import struct
 import zlib
 from collections.abc import Callable
 
-from daemon.publish import registers, subscribe
+from daemon.publish import udp_subscriptions
+from daemon.publish.modbus import registers
 from hal.clock import SystemClock
 from hal.errors import DataInvalid
 from hal.imu import RawImu
-from hal.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, decode, encode
-from hal.inputs import InputPort
+from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, decode, encode
+from hal.net.inputs import InputPort
 from hal.odometry import RawOdometry
-from tests.daemon.publish.test_registers import snapshot
+from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.fuzz.targets import refused
 
 MEGABYTES = 10
-PARSERS = ("hal/input_codec.py", "hal/inputs.py", "daemon/publish/subscribe.py")
+PARSERS = ("hal/net/input_codec.py", "hal/net/inputs.py", "daemon/publish/udp_subscriptions.py")
 
 
 def seeds() -> list[bytes]:
@@ -26,11 +27,11 @@ def seeds() -> list[bytes]:
         InputDatagram(ODOMETRY_MAGIC, 7, k, k % 2, 1000.0 + k, (0.1 * k, -0.2, 3.0)) for k in (0, 1, 2, 5, 2**32 - 1)
     ]
     gyro = [InputDatagram(IMU_MAGIC, 8, k, 1, 1000.0, (0.5,)) for k in (0, 3)]
-    cookie = subscribe.Leases(bytes(32))._cookie(("192.0.2.1", subscribe.SIZE), 1000.0)
-    asked = [subscribe.Message(subscribe.Status(k), 60, (0, cookie)[k % 2]) for k in range(5)]
-    asked += [subscribe.Message(subscribe.Status.ASK, lease, cookie) for lease in (0, 1, 65535)]
+    cookie = udp_subscriptions.Leases(bytes(32))._cookie(("192.0.2.1", udp_subscriptions.SIZE), 1000.0)
+    asked = [udp_subscriptions.Message(udp_subscriptions.Status(k), 60, (0, cookie)[k % 2]) for k in range(5)]
+    asked += [udp_subscriptions.Message(udp_subscriptions.Status.ASK, lease, cookie) for lease in (0, 1, 65535)]
     sent = [*(encode(one) for one in (*readings, *gyro)), registers.encode_datagram(snapshot())]
-    return [*sent, *(subscribe.encode(one) for one in asked)]
+    return [*sent, *(udp_subscriptions.encode(one) for one in asked)]
 
 
 def mend(data: bytes) -> bytes:
@@ -44,7 +45,7 @@ def mend(data: bytes) -> bytes:
 
 def feeder() -> Callable[[bytes], None]:
     port, state = InputPort(SystemClock(), "127.0.0.1", 0), {"t": 1000.0, "fed": 0}
-    leases = subscribe.Leases(bytes(32))
+    leases = udp_subscriptions.Leases(bytes(32))
     odometry: list[RawOdometry] = []
     imu: list[RawImu] = []
     port.send_odometry_to(odometry.append)
@@ -67,11 +68,11 @@ def feeder() -> Callable[[bytes], None]:
         subscribing(data)
 
     def subscribing(data: bytes) -> None:
-        asked: list[subscribe.Message] = []
-        refused(lambda: asked.append(subscribe.decode(data)), by=ValueError)
+        asked: list[udp_subscriptions.Message] = []
+        refused(lambda: asked.append(udp_subscriptions.decode(data)), by=ValueError)
         for message in asked:
             answer = leases.answer(("192.0.2.1", len(data)), message, state["t"])
-            assert answer is None or len(subscribe.encode(answer)) <= len(data)
-            assert len(leases) <= subscribe.SUBSCRIBERS
+            assert answer is None or len(udp_subscriptions.encode(answer)) <= len(data)
+            assert len(leases) <= udp_subscriptions.SUBSCRIBERS
 
     return feed

@@ -14,13 +14,13 @@ import numpy as np
 
 from hal.clock import LoopClock, run_virtual
 from hal.errors import HalError
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UTM_30LX, LidarModel, Unit
-from hal.fake.rotor import Rotor
-from hal.fake.scan import FakeScan, ScanSource
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.rotor import Rotor
+from hal.fake.lidar.scan import FakeScan, ScanSource
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
-from hal.port import Port
+from hal.port.port import Port
 
 T = TypeVar("T")
 

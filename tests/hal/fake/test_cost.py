@@ -8,11 +8,11 @@ import time
 import numpy as np
 import pytest
 
-from hal.fake.commands import Measure
-from hal.fake.frames import payload
-from hal.fake.models import UTM_30LX
-from hal.fake.scan import FakeScan
-from hal.fake.scip_encoder import measurement, reply
+from hal.fake.lidar.commands import Measure
+from hal.fake.lidar.models import UTM_30LX
+from hal.fake.lidar.payload import payload
+from hal.fake.lidar.scan import FakeScan
+from hal.fake.lidar.scip_encoder import measurement, reply
 from tests.hal.fake.bench import Talk, virtual
 
 LIMIT_S = 300e-6

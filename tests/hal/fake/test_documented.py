@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from hal.fake.adc_faults import ADC
+from hal.fake.adc.faults import ADC
+from hal.fake.adc.i2c_adapters import ADAPTERS
 from hal.fake.faults import Vocabulary
-from hal.fake.i2c_adapters import ADAPTERS
-from hal.fake.lidar_faults import LIDAR
-from hal.fake.models import MODELS
+from hal.fake.lidar.faults import LIDAR
+from hal.fake.lidar.models import MODELS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "fake-devices.md").read_text(encoding="utf-8")
 

@@ -11,7 +11,7 @@ from hal.clock import run_virtual
 from hal.fake.faults import FaultError
 from hal.fake.odometry import ODOMETRY, FakeOdometry
 from hal.fake.schedule import FaultSchedule
-from hal.input_codec import InputDatagram, decode
+from hal.net.input_codec import InputDatagram, decode
 
 HZ, SPEED = 50.0, 0.5
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from hal.fake.models import UTM_30LX
+from hal.fake.lidar.models import UTM_30LX
 from tests.hal.fake.bench import Talk, read, summed, virtual
 
 PERIOD = UTM_30LX.true_period_s

@@ -10,15 +10,15 @@ import numpy as np
 
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
 from hal.errors import HalError
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UTM_30LX, LidarModel, Unit
-from hal.fake.scan import FakeScan
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.scan import FakeScan
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import RawScan
-from hal.opening import open_port
-from hal.port import PortOpener
+from hal.port.opening import open_port
+from hal.port.port import PortOpener
 
 PORT = "/dev/ttyACM7"  # a name that stands for USB; nothing is opened under it
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from hal.errors import DeviceMissing, DeviceRefused
-from hal.fake.answers import State
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UTM_30LX, Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.dialect_grid import State
+from hal.fake.lidar.models import UTM_30LX, Unit
 from hal.hokuyo import discover
 from hal.lidar import Link
-from hal.port import Port
+from hal.port.port import Port
 from tests.hal.hokuyo.bench import PORT, Bench, Scene, error_of, on_fake
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from hal.fake.models import ECHOES, PLAIN, UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.models import ECHOES, PLAIN, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.hokuyo.driver import HokuyoDriver
 from hal.hokuyo.passive import PassiveHokuyo
-from hal.port import OnData, OnLost, Port
+from hal.port.port import OnData, OnLost, Port
 from tests.hal.hokuyo.bench import PORT, Bench, on_fake
 
 

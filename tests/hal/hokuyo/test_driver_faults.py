@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hal.fake.lidar_faults import LIDAR
-from hal.fake.models import MODELS, UST_10LX, UTM_30LX, LidarModel
+from hal.fake.lidar.faults import LIDAR
+from hal.fake.lidar.models import MODELS, UST_10LX, UTM_30LX, LidarModel
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import VALID, Link, RawScan
 from tests.hal.hokuyo.bench import Bench, on_fake

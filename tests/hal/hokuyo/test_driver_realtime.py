@@ -12,16 +12,16 @@ import pytest
 
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing
-from hal.fake.answers import State
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import UST_10LX, UTM_30LX, LidarModel
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.dialect_grid import State
+from hal.fake.lidar.models import UST_10LX, UTM_30LX, LidarModel
 from hal.fake.pty_server import PtyServer
 from hal.fake.schedule import FaultSchedule
 from hal.fake.tcp_server import TcpServer
 from hal.hokuyo.passive import PassiveHokuyo
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import FrameSplitter, parse_reply
-from hal.opening import open_port
+from hal.port.opening import open_port
 from tests.hal.hokuyo import encoder
 from tests.hal.hokuyo.bench import Bench, Scene, error_of
 

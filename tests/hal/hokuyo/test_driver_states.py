@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hal.errors import DeviceRefused
-from hal.fake.answers import State
-from hal.fake.models import MODELS, UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.dialect_grid import State
+from hal.fake.lidar.models import MODELS, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.lidar import VALID, Link
-from hal.port import Port
+from hal.port.port import Port
 from tests.hal.hokuyo.bench import Bench, on_bench, on_fake
 
 BY_HAND = {

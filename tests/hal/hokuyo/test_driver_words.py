@@ -8,7 +8,7 @@ import logging
 import pytest
 
 from hal.errors import DeviceFault
-from hal.fake.models import MODELS, UST_10LX
+from hal.fake.lidar.models import MODELS, UST_10LX
 from tests.hal.hokuyo.bench import PORT, Bench, error_of, on_fake
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.errors import DeviceRefused
-from hal.fake.models import MODELS
+from hal.fake.lidar.models import MODELS
 from hal.hokuyo.models import UNKNOWN_MODEL, Identity, facts_of, identify, line_speed, stream_request
 from tests.hal.hokuyo import encoder
 

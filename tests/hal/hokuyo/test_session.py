@@ -9,10 +9,10 @@ import pytest
 
 from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
-from hal.hokuyo.line import Line
 from hal.hokuyo.payload import ScanRequest
+from hal.hokuyo.scip_line import Line
 from hal.hokuyo.session import AbnormalState, Session, explain_status
-from hal.port import MemoryPort, memory_pair
+from hal.port.port import MemoryPort, memory_pair
 from tests.hal.hokuyo import encoder
 
 OK = "00"

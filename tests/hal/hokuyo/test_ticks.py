@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.hokuyo.envelope import Envelope
+from hal.hokuyo.clock_envelope import Envelope
 from hal.hokuyo.scip import TICK_MODULUS
 from hal.hokuyo.ticks import ScanTime, TickClock, Unwrapper, Verdict
 from tests.rotation import share

@@ -9,7 +9,7 @@ import pytest
 
 from hal.adc import Blemish
 from hal.photodiode import adc121c021, ads1x15, mcp3221
-from hal.photodiode.blocks import STUCK_RUN, inspect
+from hal.photodiode.block_check import STUCK_RUN, inspect
 from hal.photodiode.chips import BlockChip, chip_named
 
 MCP = mcp3221.CHIP

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hal.adc import Blemish
-from hal.fake.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
-from hal.i2c import AsyncBus
+from hal.bus.i2c import AsyncBus
+from hal.fake.adc.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
 from hal.lidar import Link
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
 from tests.hal.photodiode.bench import Bench, falsehoods, on_bench, on_fake

@@ -13,8 +13,8 @@ import pytest
 from hal.adc import Blemish
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceRefused
-from hal.fake.adc import FakeAdc
-from hal.opening import open_bus
+from hal.fake.adc.converter import FakeAdc
+from hal.port.opening import open_bus
 from tests.hal.i2c_kernel import Kernel
 from tests.hal.photodiode.bench import Bench, Light, error_of, falsehoods
 
@@ -135,7 +135,7 @@ def test_a_second_program_gets_the_converter_when_the_first_has_ended(monkeypatc
 
 def test_a_transaction_that_hangs_in_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop goes on, the status says so, and no second thread is started on the bus meanwhile."""
-    monkeypatch.setattr("hal.photodiode.silence.HANG_S", 0.4)
+    monkeypatch.setattr("hal.photodiode.bus_watchdog.HANG_S", 0.4)
 
     async def body(bench: Bench, linux: Kernel) -> None:
         driver = bench.driver()

@@ -15,15 +15,15 @@ import pytest
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
-from daemon import cli
-from taps import zenohlink
+from daemon.cli import parser
+from taps import zenoh_session
 from taps.fleet import messages, robot, show
 from taps.fleet.claim import SURE_S, Claim
 from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import MOST_ROBOTS, Roster
-from taps.stream import Stream
-from taps.zenohlink import config, joined
+from taps.stream.client import Stream
+from taps.zenoh_session import config, joined
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 from tests.taps.serving import served
 
@@ -173,7 +173,7 @@ def test_who_leaves_while_the_name_is_asked_for_does_not_keep_it(monkeypatch: py
             await asyncio.sleep(0.2)
 
             async def listed(*asked: Any) -> list[str]:
-                found = await zenohlink.listed(*asked)
+                found = await zenoh_session.listed(*asked)
                 token.undeclare()
                 await asyncio.sleep(0.3)
                 return found
@@ -277,7 +277,7 @@ def test_a_router_that_takes_the_connection_and_says_nothing_is_said_and_holds_u
             pytest.fail("there is none")
 
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        monkeypatch.setattr("taps.zenohlink.LEASE_S", 0.5)
+        monkeypatch.setattr("taps.zenoh_session.LEASE_S", 0.5)
         begun = time.monotonic()
         asyncio.run(beside(stop(), join(f"127.0.0.1:{silent.getsockname()[1]}")))
         assert time.monotonic() - begun < 3.0
@@ -285,14 +285,14 @@ def test_a_router_that_takes_the_connection_and_says_nothing_is_said_and_holds_u
 
 def in_a_loop_of_its_own(words: list[str]) -> int:
     """The command, in a thread that cannot take signals."""
-    args = cli.parser().parse_args(words)
+    args = parser.parser().parse_args(words)
     return int(args.body(args))
 
 
 def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def body(made: Router, words: list[str]) -> None:
         await asyncio.sleep(1.0)
-        assert await asyncio.to_thread(in_a_loop_of_its_own, ["fleet", "--router", made.address, *words]) == cli.OK
+        assert await asyncio.to_thread(in_a_loop_of_its_own, ["fleet", "--router", made.address, *words]) == parser.OK
 
     picture = tmp_path / "fleet.png"
     with served(tmp_path / "s"), served(tmp_path / "t", place=(3.0, -4.0, 1.0)), router() as made:
@@ -315,7 +315,7 @@ def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.
             assert any("2" in line and "#" in line for line in drawn)
             assert said == f"{picture}: agv2 red"  # agv1 is beyond the tile that there is
             assert picture.read_bytes()[:4] == b"\x89PNG"
-        assert cli.main(["fleet", "--router", made.address]) == cli.FAILED
+        assert parser.main(["fleet", "--router", made.address]) == parser.FAILED
         assert "no robot tells anything" in capsys.readouterr().err
 
 
@@ -381,7 +381,7 @@ def test_who_asks_once_does_not_wait_for_ever(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("taps.fleet.show.ROUTER_S", 0.3)
-    assert cli.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == cli.FAILED
+    assert parser.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == parser.FAILED
     told = capsys.readouterr()
     assert told.out == ""
     assert "no router answers at tcp/127.0.0.1:1 within 0.3 s: start one (`lumiloop fleet router`)" in told.err

@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
-from daemon import cli
-from taps.zenohlink import BadEndpoint, config
+from daemon.cli import parser
+from taps.zenoh_session import BadEndpoint, config
 from tests.taps.routers import router
 
 
@@ -33,28 +33,28 @@ def test_what_cannot_be_is_said(
     words: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "tcp/127.0.0.1:1" in words:
-        monkeypatch.setattr("taps.zenohlink.RETRY_S", -1.0)
+        monkeypatch.setattr("taps.zenoh_session.RETRY_S", -1.0)
         monkeypatch.setattr(asyncio, "sleep", interrupted)
     try:
-        code = cli.main(words)
+        code = parser.main(words)
     except KeyboardInterrupt:
-        code = cli.INTERRUPTED
-    assert code != cli.OK
+        code = parser.INTERRUPTED
+    assert code != parser.OK
     assert said in capsys.readouterr().err
 
 
 def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.main(["ros2", "--domain", "-1"])
+        parser.main(["ros2", "--domain", "-1"])
     assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
 
 
 def test_what_is_not_shared_cannot_be_fetched(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.main(["fleet", "fetch", "maps"])
+        parser.main(["fleet", "fetch", "maps"])
     assert capsys.readouterr().err.endswith("maps: name survey, map, or none for both\n")
     for words in ([], ["map"], ["survey", "map"]):
-        assert cli.parser().parse_args(["fleet", "fetch", *words]).what == words
+        assert parser.parser().parse_args(["fleet", "fetch", *words]).what == words
 
 
 @pytest.mark.parametrize(
@@ -75,5 +75,5 @@ async def interrupted(seconds: float) -> None:
 
 def test_a_port_that_is_taken_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     with router() as made:
-        assert cli.main(["fleet", "router", "--listen", made.address]) == cli.FAILED
+        assert parser.main(["fleet", "router", "--listen", made.address]) == parser.FAILED
     assert f"cannot listen on {made.address}" in capsys.readouterr().err

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from taps.fleet import drawing, messages
 from taps.fleet.messages import Held, MapHead, PoseTold, StateTold, Unreadable
 from taps.fleet.roster import Roster
-from taps.frames import Fault, Pose, Trust
-from taps.tiles import FREE, UNSEEN, WALL
-from taps.vda5050 import position_v2
+from taps.metrics.vda5050 import position_v2
+from taps.stream.messages import Fault, Pose, Trust
+from taps.stream.tiles import FREE, UNSEEN, WALL
 
 POSE = Pose(
     seq=1, t_mono=1.0, t_sent=1.0, t_utc=1.7e9, state=3, state_name="TRACKING", reason=0, pose=(1.0, 2.0, 7.0),

@@ -23,7 +23,7 @@ import pytest
 
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
-from daemon.publish.holding import Outcome, Request
+from daemon.publish.modbus.holding import Outcome, Request
 from tests.daemon import mapmaker
 from tests.daemon.mapmaker import Shape
 from tests.daemon.publish.network import publishing

@@ -8,11 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.config import Config, LightsConfig, MapConfig, PhotodiodeConfig
-from daemon.store import Store
-from daemon.surveyfile import dump, read_survey
-from estimator.cdma_profile import PROFILES
-from estimator.lamps import Lamp, Receiver, Survey
+from daemon.config.schema import Config, LightsConfig, MapConfig, PhotodiodeConfig
+from daemon.config.survey_loader import dump, read_survey
+from daemon.maps.store import Store
+from estimator.cdma.air_interface import PROFILES
+from estimator.light_filter.survey import Lamp, Receiver, Survey
 from taps.fleet.messages import Held
 from taps.fleet.placing import MAP, RECORD, SURVEY, Offer, Records, Refused, check, chosen, offer_of, place
 from tests.daemon import mapmaker

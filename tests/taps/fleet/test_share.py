@@ -12,14 +12,14 @@ import pytest
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
-from daemon.config import Config, LightsConfig
-from daemon.surveyfile import dump, read_survey
-from estimator.lamps import Lamp, Survey
+from daemon.config.schema import Config, LightsConfig
+from daemon.config.survey_loader import dump, read_survey
+from estimator.light_filter.survey import Lamp, Survey
 from taps.fleet import messages
 from taps.fleet.fetch import Fetcher
 from taps.fleet.placing import MAP, SURVEY, Offer, Records, offer_of
 from taps.fleet.share import key_of, share
-from taps.zenohlink import config, joined, listed
+from taps.zenoh_session import config, joined, listed
 from tests.daemon import mapmaker
 from tests.daemon.mapmaker import Shape
 from tests.taps.routers import Heard, Router, beside, router, told_to, until

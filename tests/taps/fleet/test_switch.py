@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
-from daemon.publish.holding import CommandCode, Outcome, Request
+from daemon.publish.modbus.holding import CommandCode, Outcome, Request
 from taps.fleet.fetch import switched
 from taps.fleet.placing import Refused
 from tests.daemon.publish.network import publishing

@@ -13,14 +13,14 @@ from typing import Any
 import msgspec
 from aiohttp import ClientSession, ClientWebSocketResponse, web
 
-from daemon.publish.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
-from daemon.publish.stream import StreamServer
-from taps.stream import Stream
-from taps.view.film import Film
-from taps.view.guard import Guard
+from daemon.publish.stream_server import StreamServer
+from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
+from taps.stream.client import Stream
+from taps.view.access_guard import Guard
+from taps.view.page_hello import Scene
+from taps.view.replay_file import Film
 from taps.view.server import TOPICS, View
-from taps.view.words import Scene
-from tests.daemon.publish.test_stream import until
+from tests.daemon.publish.test_stream_server import until
 
 TOKEN = "a-token-of-more-than-sixteen-letters"
 PATIENCE_S = 5.0

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tools.browser import CHROMIUM, Robot, Tab, chromium, robot, tab, view
+from tools.docs.browser import CHROMIUM, Robot, Tab, chromium, robot, tab, view
 
 pytestmark = [
     pytest.mark.system,

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from taps.frames import MapTiles
+from taps.stream.messages import MapTiles
 from taps.view import server
-from taps.view.guard import Guard
+from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, serving, snapshot
-from tools.browser import CHROMIUM, Tab, chromium, tab
+from tools.docs.browser import CHROMIUM, Tab, chromium, tab
 
 pytestmark = [
     pytest.mark.system,

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.folders import stream_path
-from taps.view.guard import Guard
+from daemon.config.paths import stream_path
+from taps.view.access_guard import Guard
 from taps.view.orders import OrderRefused, switch_map
 from tests.taps.view.house import TOKEN, serving
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from taps.view import server
-from taps.view.guard import Guard
+from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, snapshot
 from tests.taps.view.test_server import run
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from daemon.surveyfile import write_survey
-from estimator.lamps import Lamp, Survey
+from daemon.config.survey_loader import write_survey
+from estimator.light_filter.survey import Lamp, Survey
 from taps.view.command import _scene
-from taps.view.words import CannotLook, Scene
+from taps.view.page_hello import CannotLook, Scene
 from tests.taps.view.house import House, serving
-from tools.browser import CHROMIUM, chromium, tab
+from tools.docs.browser import CHROMIUM, chromium, tab
 
 BEFORE, AFTER = Scene("agv", lamps=[(1, 5, 0.0, 0.0)]), Scene("agv", (0.1, 0.0, 90.0, False), [(1, 5, 3.0, 4.0)])
 

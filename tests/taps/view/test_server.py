@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from aiohttp import WSServerHandshakeError
 
-from daemon.publish import stream as daemon_stream
-from daemon.publish.snapshot import State
-from taps.frames import Loop, MapTiles, Scan
+from daemon.publish import stream_server as daemon_stream
+from daemon.snapshot import State
+from taps.stream.messages import Loop, MapTiles, Scan
 from taps.view import server, viewers
-from taps.view.guard import Guard
-from tests.daemon.publish.test_stream import raw_scan, until
+from taps.view.access_guard import Guard
+from tests.daemon.publish.test_stream_server import raw_scan, until
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 
 

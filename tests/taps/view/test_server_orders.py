@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.publish.holding import CommandCode, Outcome, Request
+from daemon.publish.modbus.holding import CommandCode, Outcome, Request
 from taps.view import orders
-from taps.view.guard import Guard
+from taps.view.access_guard import Guard
 from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing
-from tests.daemon.publish.test_stream import until
+from tests.daemon.publish.test_stream_server import until
 from tests.taps.view.house import TOKEN, House, Page, serving
 from tests.taps.view.test_server import run
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tools.bench._scenes import office
+from tools.bench.support.scenes import office
 from tools.experiments import beamquality as bq
 from tools.experiments.report import Work
 

@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.lamps import Survey
-from estimator.links import Method, Solver
-from tools.experiments import adaptive, fig4, fig4_recorded
+from estimator.light_filter.survey import Survey
+from estimator.paper.lateration import Method, Solver
+from tools.experiments import adaptive
+from tools.experiments.paper_figures import fig4, fig4_recorded
 from tools.experiments.places import CENTRED, error, grid, sheet_of, spots
 from tools.experiments.report import Work
-from tools.sim.ceiling import IDEAL, Ceiling
-from tools.sim.ceiling_lamps import row, with_codes
-from tools.sim.world import Plan
+from tools.sim.building.world import Plan
+from tools.sim.ceiling.ceiling import IDEAL, Ceiling
+from tools.sim.ceiling.lamps import row, with_codes
 
 
 def ideal(seed: int = 0) -> tuple[Ceiling, Survey]:

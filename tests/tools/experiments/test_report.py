@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tools.ci.figures import bounded
 from tools.experiments import __main__ as program
-from tools.experiments import table1
+from tools.experiments.paper_figures import table1
 from tools.experiments.report import Picture, Report, Skipped, Table, Work, draw, save
-from tools.figures import bounded
 
 
 def square(x: int) -> int:
@@ -185,8 +185,9 @@ def test_wrong_words_end_the_program(words: list[str], capsys: pytest.CaptureFix
 def test_every_experiment_is_offered() -> None:
     """A module of the folder that can be run as one is in the list, and what is in the list is there."""
     folder = Path(program.__file__).parent
-    found = {path.stem for path in folder.glob("*.py") if "def run(quick: bool, work: Work)" in path.read_text()}
-    assert found == set(program.EXPERIMENTS)
+    found = {path for path in folder.rglob("*.py") if "def run(quick: bool, work: Work)" in path.read_text()}
+    offered = {folder.parents[1] / (program.MODULES[name].replace(".", "/") + ".py") for name in program.EXPERIMENTS}
+    assert found == offered
 
 
 def test_the_conditions_of_the_paper_are_those_of_the_room() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.optics import expected
+from estimator.light_filter.lambertian import expected
 from tools.experiments import static
 from tools.experiments.static import Taught
 from tools.experiments.vlp import STATIC_LAMPS, Campaign

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from hal.clock import run_virtual
-from hal.input_codec import SHARED_CLOCK, InputDatagram, decode
+from hal.net.input_codec import SHARED_CLOCK, InputDatagram, decode
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth, udp_target
 from tools.sim.run import main
 from tools.sim.scene import PAPER, SimulatedScene

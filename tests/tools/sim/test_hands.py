@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.fake.faults import FaultError, read_fault
-from hal.fake.models import UTM_30LX
+from hal.fake.lidar.models import UTM_30LX
 from tools.sim.hands import VOCABULARY, Hands, Way, start_of, then
 from tools.sim.odometry import Wheels
 from tools.sim.robot import Body, Drive, Route

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish.snapshot import State
+from daemon.snapshot import State
 from hal.replay.carmen import read_carmen
 from tools.sim.harness import Run, in_frame_of, run
 from tools.sim.hybrid import HybridScene

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tools.sim.buildings import BUILDINGS, building
+from tools.sim.building.buildings import BUILDINGS, building
+from tools.sim.building.world import Array, Plan
 from tools.sim.odometry import Odometer, Wheels
 from tools.sim.robot import Body, Drive, Route
-from tools.sim.world import Array, Plan
 
 BODY = Body()
 SQUARE = Route(((2.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0), (0.0, 0.0)))

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hal.fake.models import MODELS
+from hal.fake.lidar.models import MODELS
 from hal.lidar import VALID, LidarGeometry, RawScan
 from hal.odometry import RawOdometry
-from tools.sim.beams import IDEAL, Returns
+from tools.sim.building.beams import IDEAL, Returns
 from tools.sim.hybrid import HybridScene, Trajectory
 from tools.sim.scene import PAPER, Scenario, SimulatedScene, no_return, to_device
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from tools.bench.otherclock import OtherClock
+from tools.bench.system.otherclock import OtherClock
 from tools.bench.vm.booted import Booted
 from tools.bench.vm.image import ROOT
 from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started

@@ -334,7 +334,7 @@ def _compile(say: Say) -> Path:
     say("compiling kernels for any processor")
     warm = [sys.executable, "-m", "daemon", "warm", "--config", str(GUEST / "lumiloop.toml")]
     _do([*warm, "--set", "photodiode.bus=adapter:bench"], "compiling kernels", WARM)
-    where = "from estimator.kernel_folder import CACHE_DIR; print(CACHE_DIR)"
+    where = "from estimator.numerics.jit_cache import CACHE_DIR; print(CACHE_DIR)"
     compiled = Path(_do([sys.executable, "-c", where], "finding the kernels", WARM).split()[-1])
     _do([sys.executable, "-m", "tools.bench.vm.reference"], "driving outside", {"PYTHONPATH": str(ROOT)})
     return compiled
@@ -351,7 +351,7 @@ def plant(root: Path, compiled: Path) -> None:
     inside = f"/{installed.relative_to(root)}"
     place = root / CACHE_PLACE / compiled.name / cache_name(Path(inside))
     shutil.copytree(compiled / cache_name(ROOT / "estimator"), place)
-    mark = "from daemon import warmup; warmup.ROOM = {!r}; print(warmup.mark_of({!r}).name)"
+    mark = "from daemon.runtime import warmup; warmup.ROOM = {!r}; print(warmup.mark_of({!r}).name)"
     for what in ("warm", "warm-lights"):
         named = _do([sys.executable, "-c", mark.format(inside, what)], "naming the marks", WARM)
         (place.parent / named.split()[-1]).touch()

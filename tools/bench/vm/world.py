@@ -16,15 +16,15 @@ import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
 
+from hal.bus.i2c_server import BusServer
 from hal.clock import SystemClock
-from hal.fake.adc import FakeAdc, FakeBuses
-from hal.fake.adc_light import OrdinaryLamps
+from hal.fake.adc.converter import FakeAdc, FakeBuses
+from hal.fake.adc.light import OrdinaryLamps
 from hal.fake.control import Control, serve_control
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import Unit
 from hal.fake.schedule import FaultSchedule
 from hal.fake.tcp_server import TcpServer
-from hal.i2c_server import BusServer
 from tools.bench.world.room import LIDAR, room
 from tools.bench.world.stage import ForeignSender
 from tools.sim.feed import UdpSender, feed_odometry, feed_truth

@@ -22,7 +22,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
-from daemon.warmup import CannotLoad
+from daemon.runtime.warmup import CannotLoad
 from hal.errors import HalError
 from tools.bench.against import SCENARIO, Before, CannotCompare, digest, read
 from tools.bench.report import About, CannotReport, Result, demand_apart, demand_room, facts, write

@@ -12,12 +12,12 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from daemon import warmup
+from daemon.runtime import warmup
 from tools.bench.report import ROOT
 from tools.bench.vm.places import LEASH
 from tools.bench.world.scenario import Scenario
 from tools.bench.world.stage import CannotPlay, Ends
-from tools.sim.serve_light import write_plan
+from tools.sim.light.serve import write_plan
 
 
 def warm(lamps: bool, say: Callable[[str], None]) -> None:

@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from typing import Any
 
 from hal.clock import SystemClock
-from hal.fake.adc import FakeAdc
-from hal.fake.adc_light import OrdinaryLamps
+from hal.fake.adc.converter import FakeAdc
+from hal.fake.adc.light import OrdinaryLamps
 from hal.fake.faults import FaultError, read_fault
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import LidarModel
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import LidarModel
+from hal.fake.lidar.scan_world import Room
 from hal.fake.schedule import Target
-from hal.fake.world import Room
 from tools.sim import hands
 
 

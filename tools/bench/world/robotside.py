@@ -8,7 +8,7 @@ from typing import Final
 
 from tools.bench.world.scenario import Scenario
 from tools.bench.world.stage import CannotPlay, Ends, is_port
-from tools.sim.serve_light import write_plan
+from tools.sim.light.serve import write_plan
 
 CONFIG: Final = "lumiloop.toml"
 SURVEY: Final = "lamps.toml"

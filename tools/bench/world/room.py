@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from hal.fake.models import MODELS, PAPER, LidarModel
-from tools.sim.buildings import Building, building
+from hal.fake.lidar.models import MODELS, PAPER, LidarModel
+from tools.sim.building.buildings import Building, building
+from tools.sim.building.world import Plan
 from tools.sim.robot import Route
-from tools.sim.world import Plan
 
 BENCH: Final = "bench"
 LIDAR: Final[LidarModel] = replace(

@@ -39,14 +39,14 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.faults import Fault
+from daemon.health.faults import Fault
 from tools.bench.world import orders, room
 from tools.clients.read_modbus import STATES
-from tools.sim.buildings import BUILDINGS
+from tools.sim.building.buildings import BUILDINGS
+from tools.sim.light.scene import Lights
 from tools.sim.robot import Body
 from tools.sim.scene import Scenario as SceneScenario
 from tools.sim.scene import SimulatedScene
-from tools.sim.scene_light import Lights
 
 CODES: Final = frozenset(map(int, Fault))
 BUILT_IN: Final = Path(__file__).parent / "scenarios"

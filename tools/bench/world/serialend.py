@@ -11,8 +11,8 @@ from pathlib import Path
 import serial
 
 from hal.errors import DeviceMissing, HalError
-from hal.fake.hokuyo import FakeHokuyo
-from hal.serial_port import explain_open_error
+from hal.fake.lidar.device import FakeHokuyo
+from hal.port.serial_port import explain_open_error
 
 QUEUE = 64 * 1024
 """Bytes that may wait for the line before whole replies are lost, as in a sensor."""
@@ -48,7 +48,7 @@ class SerialEnd:
         device.attach(self)
 
     def take(self, data: bytes) -> bool:
-        """See :class:`hal.fake.outlet.HostEnd`."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self.lost is not None or len(self._waiting) + len(data) > QUEUE:
             return False
         self._waiting += data
@@ -56,11 +56,11 @@ class SerialEnd:
         return True
 
     def baud(self) -> int:
-        """See :class:`hal.fake.outlet.HostEnd`: both ends are set to the same rate."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`: both ends are set to the same rate."""
         return self._baud
 
     def hang_up(self) -> None:
-        """See :class:`hal.fake.outlet.HostEnd`: a serial line cannot hang up; it only falls silent."""
+        """See :class:`hal.fake.lidar.output_line.HostEnd`: a serial line cannot hang up; it only falls silent."""
         self._waiting.clear()
 
     def close(self) -> None:

@@ -16,18 +16,18 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
+from hal.bus.i2c_server import BusServer
 from hal.clock import SystemClock
 from hal.errors import DeviceRefused, HalError
-from hal.fake.adc import FakeBuses
+from hal.fake.adc.converter import FakeBuses
 from hal.fake.faults import read_fault
-from hal.fake.hokuyo import FakeHokuyo
-from hal.fake.models import Unit
+from hal.fake.lidar.device import FakeHokuyo
+from hal.fake.lidar.models import Unit
 from hal.fake.pty_server import PtyServer
 from hal.fake.schedule import FaultSchedule, Target
 from hal.fake.tcp_server import TcpServer
-from hal.i2c_server import BusServer
-from hal.input_codec import decode, encode
-from tools.bench.otherclock import OtherClock
+from hal.net.input_codec import decode, encode
+from tools.bench.system.otherclock import OtherClock
 from tools.bench.world.dac import DacThread
 from tools.bench.world.judge import Played, Pose, Read
 from tools.bench.world.scenario import Scenario
@@ -36,8 +36,8 @@ from tools.clients.read_lights import Reader as LightReader
 from tools.clients.read_modbus import Reader
 from tools.sim.feed import UdpSender, feed_odometry
 from tools.sim.hands import Hands
+from tools.sim.light.serve import BUS, converter
 from tools.sim.scene import SimulatedScene
-from tools.sim.serve_light import BUS, converter
 
 LINES: Final = "/dev/ttyUSB0, /dev/ttyUSB0@115200, pty:PATH or tcp://HOST:PORT"
 POLL_S: Final = 0.01

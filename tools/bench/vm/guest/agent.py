@@ -94,8 +94,8 @@ def transaction(data: bytes) -> tuple[int, list[tuple[int, bytes, int]]]:
 
 def carry_i2c(name: str) -> None:
     """For ever: transactions of the adapter, on the bench's bus of that name."""
-    from hal.i2c import Bus, Message
-    from hal.i2c_remote import open_remote
+    from hal.bus.i2c import Bus, Message
+    from hal.bus.i2c_remote import open_remote
 
     bus: Bus | None = None
     wire = os.open(WIRE, os.O_RDWR)

@@ -1,0 +1,388 @@
+"""Puts the rooms together, keeps every part running, and stops cleanly; `daemon/cli/run.py` is the command.
+
+Start order: publishers, lidar, photodiode and inputs (their hand-shakes take time), then the estimator is loaded in a
+thread while they do, then cycles. Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recording.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import math
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from daemon.config.paths import state_folder
+from daemon.config.schema import Config
+from daemon.devices.conversion import SampleBridge, ScanBridge
+from daemon.devices.photodiode import BlockWatch
+from daemon.devices.port_tap import tapped
+from daemon.environment import NoLidar, World
+from daemon.health.assessment import Vitals
+from daemon.health.report import Reporter
+from daemon.health.supervisor import Supervisor
+from daemon.health.thread_watch import COMPUTING_S, DISK_S, Answers
+from daemon.maps.autosave import About, Keeper
+from daemon.maps.last_pose import LastPose
+from daemon.maps.schema import digest_of
+from daemon.maps.store import NoMap, Start, judge_for
+from daemon.maps.switching import Maps, MapSwitch, Switch, take_over
+from daemon.publish.network import Feeds, Network
+from daemon.publish.stream_ticker import StreamBeat
+from daemon.runtime.cycle import Cycle, Parts, Step
+from daemon.runtime.heartbeat import Heartbeat
+from daemon.runtime.light_setup import CannotBegin, Lights, load_lights, new_state
+from daemon.runtime.scheduler import Pacemaker
+from daemon.runtime.vitals import process_age_s, resident_mb, statistics, vitals
+from daemon.runtime.warmup import Warmth
+from daemon.runtime.worker import ThreadWorker
+from daemon.snapshot import Snapshot, State, Thread
+from daemon.system.realtime import claim, line_up
+from daemon.system.sd_notify import notify
+from estimator.measurements import Command, Limits, Order, Record, no_lap
+from estimator.result import StepResult
+from hal.adc import BusStuck, RawSamples
+from hal.lidar import Lidar, RawScan
+from hal.net.inputs import OnImu, OnOdometry
+from hal.photodiode.bus_watchdog import HANG_S
+from hal.replay.recording import Kind
+
+if TYPE_CHECKING:
+    from daemon.recording.recorder import Recorder
+    from estimator.state import State as Estimate
+
+__all__ = ["Daemon", "World"]
+
+log = logging.getLogger(__name__)
+
+QUIET_S: Final = 2.0
+"""Seconds a part may take to stop: the lidar has to be told to switch its laser off."""
+EXTEND_US: Final = 30_000_000
+"""Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
+STARTING_S: Final = 900.0
+"""For so long it is asked: a start that hangs for good (at a disk, or behind a process that compiles and does not end)
+is begun anew after that, and finds the kernels that it has compiled."""
+PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
+"""States in which there is a pose to speak of."""
+
+
+class Daemon:
+    """One run of the daemon: everything is built here, nothing is opened before :meth:`run`.
+
+    Raises:
+        SurveyError: the survey of the lamps cannot be used.
+    """
+
+    def __init__(self, settings: Config, world: World, recorder: Recorder | None = None) -> None:
+        self.supervisor = Supervisor()
+        self._world = world
+        self._begun = world.clock.now()
+        self._recorder = recorder
+        lights = world.lights or load_lights(settings)
+        opener = world.opener if recorder is None else recorder.tap(world.opener)
+        opener = opener if world.stream is None else tapped(opener, self._on_raw, world.clock)
+        fitted = settings.lidar.fitted
+        self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
+        self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
+        self._estimator = _Estimator(lights, world.start, settings.map.localise)
+        self.cycle = Cycle(
+            Parts(
+                clock=world.clock,
+                step=self._estimator,
+                scans=ScanBridge(settings.lidar),
+                budget=world.make_budget(),
+                worker=world.make_worker(),
+                status=self.lidar.status,
+                lidar=fitted,
+                odometry=settings.odometry.port > 0,
+                samples=None if lights is None else SampleBridge(lights.profile),
+                blocks=None if lights is None or self.adc is None else BlockWatch(self.adc.status, lights.profile),
+                budget_us=1e3 * settings.cycle.budget_ms,
+                stopwatch=world.stopwatch,
+                tap=None if recorder is None else recorder.on_cycle,
+                map_id=world.draw_map_id() if world.start is None else world.start.stored.meta.map_id,
+                alert_m=settings.integrity.alert_m,
+                t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay begins at the same instant
+            )
+        )
+        self._estimator.lap = self.cycle.laps.lap
+        self.keeper = self._keeper(settings, lights)
+        self.last_pose = None if world.store is None else LastPose(world.store.folder, state_folder())
+        self.maps = self._map_switch(lights)
+        self.pacemaker = Pacemaker(self.cycle)
+        self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
+        on_samples = self.pacemaker.on_samples
+        self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
+        self.network = Network(settings, world.clock, self._feeds(), world.stream)
+        kept = [] if self.last_pose is None else [self.last_pose.take]
+        self.cycle.parts.sinks += [*self.network.sinks, *kept, *world.sinks, _FirstPose()]
+        self.answers = self._answers()
+        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle), lambda: self.answers.alive)
+        self.cycle.parts.fault = self.heartbeat.fault
+        drivers = self.lidar.status, None if self.adc is None else self.adc.status
+        reporter = Reporter(world.clock, self.supervisor, self.answers, lambda: self.heartbeat.faults, drivers)
+        self.cycle.parts.condition = reporter
+        if recorder is not None:
+            recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults)
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Run until ``stop`` is set.
+
+        Raises:
+            Exception: a defect in the cycle itself. The estimate cannot be trusted any more; only a new start helps.
+        """
+        tasks = {name: asyncio.create_task(part, name=name) for name, part in self._parts().items()}
+        stopped = asyncio.create_task(stop.wait(), name="stop")
+        warming = asyncio.create_task(self._warm_up(), name="warm-up")
+        if self.last_pose is not None:
+            self.last_pose.start()
+        try:
+            await _first_to_end(warming, stopped, tasks["heartbeat"])
+            if not stop.is_set():
+                log.info("%s", "; ".join(claim()))
+                tasks["cycle"] = asyncio.create_task(self.pacemaker.run(), name="cycle")
+                notify("READY=1", "STATUS=running")
+                await _first_to_end(stopped, tasks["cycle"], tasks["heartbeat"])
+        finally:
+            notify("STOPPING=1")
+            log.info("stopping")
+            self._keep_sample_clock()
+            await _stop(tasks.get("cycle"))
+            saving = asyncio.create_task(self.keeper.finish(stop.is_set()), name="map at the stop")
+            for name in ("lidar", *tasks):  # the lidar before what only listens: its laser is to go off
+                await _stop(tasks.get(name))
+            for task in (stopped, warming):
+                await _stop(task)
+            self.cycle.parts.worker.close()
+            for kept in (self.last_pose, self._world.sample_clock):
+                if kept is not None:
+                    kept.close()
+            await saving
+            if self._recorder is not None:
+                self._recorder.close(ended=stop.is_set())
+
+    async def _warm_up(self) -> None:
+        warmth = await self._world.warm_up()
+        if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
+            self.cycle.parts.budget.learn_code(warmth.code_us)
+        if self._world.store is not None:
+            self._world.store.trial.begin()
+        if self._world.start is not None:
+            self._begin(self._world.start.stored.meta.map_id)
+            gc.freeze()  # the map stays
+            self._remember()
+        self.keeper.loaded()
+
+    def _begin(self, map_id: int) -> None:
+        """Load the map that is stored; without it, and under another identity, where nothing can be begun with it.
+
+        An earlier generation of it is gone on in as soon as the cycles run, as after the command SWITCH_MAP.
+
+        Raises:
+            NoMap: there is none that can be used, and `map.localise` asks for one.
+        """
+        store = self._world.store
+        try:
+            self._estimator.load()
+        except CannotBegin as error:
+            assert store is not None
+            store.refuse(error)
+            if self._estimator.localise:
+                raise NoMap(f"map {map_id:08x} cannot be used, and `map.localise` is true; start again") from error
+            self._estimator.start = None
+            self._estimator.load()
+            self.cycle.map_id = self._world.draw_map_id()
+            self.keeper.without_start()
+            self.maps.ask(map_id, lambda why: log.warning("a new map is begun: %s", why) if why else None, patient=True)
+
+    def _remember(self) -> None:
+        """Tell the estimator where the run before has left the robot."""
+        pose = None if self.last_pose is None else self.last_pose.of_map(self.cycle.map_id)
+        if pose is not None:
+            log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
+            self.cycle.inbox.put_command(Command(self._world.clock.now(), Order.REMEMBERED, np.array(pose)))
+
+    def _keeper(self, settings: Config, lights: Lights | None) -> Keeper:
+        survey = "" if lights is None else digest_of(lights.survey)
+        about = About(settings.name, survey, settings.map.localise)
+        world, cycle = self._world, self.cycle
+        return Keeper(world.store, world.start, lambda: self._estimator.state, lambda: cycle.map_id, about, world.clock)
+
+    def _map_switch(self, lights: Lights | None) -> MapSwitch:
+        keep = None if self._recorder is None else self._recorder.keep_switch
+        maps = Maps(self._world.store, judge_for(lights), self._estimator.made, keep)
+        return MapSwitch(maps, self.keeper, self._put_switch)
+
+    def _put_switch(self, switch: Switch | None, taken: Callable[[], None]) -> None:
+        """The cycle takes it over (None: does not after all); what is kept of maps knows it in the same instant."""
+        if switch is None:
+            self.cycle.switch(None)
+            return
+
+        def take_over() -> tuple[int, str]:
+            self._estimator.take_over(switch)
+            self.keeper.switched(switch.map_id, switch.start)
+            taken()
+            return switch.map_id, switch.sha256
+
+        self.cycle.switch(take_over)
+
+    def _parts(self) -> dict[str, Coroutine[None, None, None]]:
+        """What runs beside the cycle, in order of start."""
+        parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._take_scan)}
+        if self._world.store is not None:
+            parts["map"] = self.keeper.run
+        if (adc := self.adc) is not None:
+            parts["photodiode"] = lambda: adc.run(self._take_samples)
+        if self.network.stream is not None:
+            beat = StreamBeat(
+                self.network.stream, self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults
+            )
+            parts["stream beat"] = beat.run
+        supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
+        return {"heartbeat": self.heartbeat.run(), **supervised}
+
+    def _answers(self) -> Answers:
+        """The threads that are watched."""
+        answers, keeper, worker = Answers(), self.keeper, self.cycle.parts.worker
+        answers.watch(Thread.MAP, lambda: keeper.busy_since, DISK_S)
+        if isinstance(worker, ThreadWorker):
+            answers.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
+            answers.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
+        if (last := self.last_pose) is not None:
+            answers.watch(Thread.POSE, lambda: last.busy_since, DISK_S)
+        if (recorder := self._recorder) is not None:
+            answers.watch(Thread.RECORDING, lambda: recorder.disk.busy_since, DISK_S)
+        if (adc := self.adc) is not None:
+            answers.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
+        return answers
+
+    def _on_raw(self, kind: Kind, t_mono: float, data: bytes) -> None:
+        if self.network.stream is not None:
+            self.network.stream.on_raw("lidar", kind.name.lower(), t_mono, data)
+
+    def _take_samples(self, block: RawSamples) -> None:
+        self._on_samples(block)
+        if self.network.stream is not None:
+            self.network.stream.on_samples(block)
+
+    def _take_scan(self, scan: RawScan) -> None:
+        self._on_scan(scan)
+        if self.network.stream is not None:
+            self.network.stream.on_scan(scan)
+
+    def _feeds(self) -> Feeds:
+        cycle, recorder = self.cycle, self._recorder
+        on_odometry: OnOdometry = cycle.inbox.put_odometry
+        on_imu: OnImu = cycle.inbox.put_imu
+        if recorder is not None:
+            on_odometry, on_imu = recorder.on_odometry(on_odometry), recorder.on_imu(on_imu)
+        return Feeds(
+            on_odometry,
+            on_imu,
+            on_command=cycle.inbox.put_command,
+            on_save=self.keeper.ask,
+            on_dump=None if recorder is None else recorder.box.dump,
+            on_switch=self.maps.ask,
+            on_loop_seen=cycle.loops_seen,
+        )
+
+    def _keep_sample_clock(self) -> None:
+        result, store = self.cycle.result, self._world.sample_clock
+        if store is not None and result is not None and result.lights is not None:
+            store.learn(result.lights.clock_ppm)
+
+    def _vitals(self, lateness: float) -> Vitals:
+        self._keep_sample_clock()
+        line_up()
+        if self.cycle.cycles == 0:
+            self.cycle.announce()
+            if self._world.clock.now() - self._begun < STARTING_S:
+                notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
+        failed = self.supervisor.failed | self.network.failing
+        failed |= set() if self._recorder is None else self._recorder.failing
+        if self.keeper.error:
+            failed.add("map")
+        if self.last_pose is not None and self.last_pose.error:
+            failed.add("last pose")
+        if self.keeper.refused:
+            failed.add("stored map")
+        if self.answers.look() - {Thread.I2C}:  # a bus has faults of its own
+            failed.add("thread")
+        return vitals(self.cycle, failed, max(lateness, self.pacemaker.latest()))
+
+
+class _Estimator:
+    """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
+
+    Attributes:
+        state: None until then. start: the map that it begins with. localise: maps are only used, never changed.
+        lap: told the name of each part of a step that has ended.
+    """
+
+    def __init__(self, lights: Lights | None, start: Start | None, localise: bool = False) -> None:
+        self.state: Estimate | None = None
+        self.localise = localise
+        self._lights = lights
+        self.start = start
+        self._step: Step | None = None
+        self.lap: Callable[[str], object] = no_lap
+
+    def made(self, start: Start) -> Estimate:
+        """A state as at a start in a stored map; may be called in another thread."""
+        from estimator import pipeline
+
+        return new_state(self._lights, pipeline.Settings(), replace(start, localise=self.localise))
+
+    def take_over(self, switch: Switch) -> None:
+        """Go on in another map."""
+        assert self.state is not None
+        take_over(self.state, switch.donor)
+
+    def load(self) -> Step:
+        """Load the estimator, and the map into it."""
+        from estimator import pipeline
+
+        self.state = new_state(self._lights, pipeline.Settings(localise=self.localise), self.start)
+        self._step = partial(pipeline.step, self.state, lap=self.lap)
+        return self._step
+
+    def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
+        step = self._step or self.load()
+        return step(records, limits)
+
+
+class _FirstPose:
+    """Says once how long the first pose took, from the start of the process."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def __call__(self, snapshot: Snapshot) -> None:
+        if snapshot.pose is not None and snapshot.state in PLACED and not self._said:
+            self._said = True
+            log.info("first pose %.2f s after the start, %.0f MB", process_age_s(), resident_mb())
+
+
+async def _first_to_end(*tasks: asyncio.Task[Any]) -> None:
+    """Wait until one of the tasks ends; raises what it raised."""
+    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in done:
+        task.result()
+
+
+async def _stop(task: asyncio.Task[Any] | None) -> None:
+    """Cancel a task and wait for it, but not for ever; what it raises on its way out is logged."""
+    if task is None or task.done():
+        return
+    task.cancel()
+    await asyncio.wait([task], timeout=QUIET_S)
+    if not task.done():
+        log.warning("%s does not stop", task.get_name())
+    elif not task.cancelled() and (error := task.exception()) is not None:
+        log.error("%s failed while stopping", task.get_name(), exc_info=error)

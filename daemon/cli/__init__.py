@@ -1,0 +1,1 @@
+"""The `lumiloop` command: one module for each command."""

@@ -1,0 +1,149 @@
+"""`lumiloop calibrate REC`: what lamps and receiver really are, from a recorded drive, with uncertainties.
+
+Prints residuals before and after and every parameter with its sigma, writes the survey anew with the residual map
+beside it, and a picture; for wheels and laser mount the configuration anew (`daemon/commissioning/odometry.py`).
+Nothing that is there is overwritten unless ``--force`` says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from daemon.cli import parser
+from daemon.cli.replay import Given
+from daemon.commissioning.fit_plot import draw_calibration
+from daemon.commissioning.odometry import calibrate_wheels
+from daemon.commissioning.teach_drive import Drive, heard, read_drive, rows_for
+from daemon.config.loader import ConfigError, refuse_overwriting
+from daemon.config.residual_file import ResidualError, write_residuals
+from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside, write_survey
+from estimator.calibration.calibrate import Calibrated, Estimate, TooLittle, calibrate
+from estimator.calibration.lamp_mapping import Heard, survey
+from estimator.calibration.observations import Rows
+from estimator.calibration.parameters import COMMONS, Common, Priors, placed
+from estimator.calibration.residual_map_fit import learn
+from estimator.calibration.survey_alignment import Unaligned, align
+from estimator.light_filter.residual_map import ResidualMap
+from estimator.light_filter.survey import Survey
+from estimator.measurements import Array
+from hal.errors import HalError
+
+SURVEY_OUT = Path("lights-calibrated.toml")
+CONFIG_OUT = Path("lumiloop-calibrated.toml")
+FRAME = Priors(frame=0.15, frame_yaw=0.05)
+"""The alignment found from lamp places is good to this."""
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    keys = tuple(override.partition("=")[0].strip() for override in args.set)
+    wheels = args.odometry or args.lidar_mount
+    args.out = args.out or (CONFIG_OUT if wheels else SURVEY_OUT)
+    try:
+        refuse_overwriting(args.out, args.force)  # before the work is done, not after it
+        drive = read_drive(args.log, args.settings, Given(args.config is not None, keys))
+        if drive.stopped:
+            sys.stderr.write(f"lumiloop: {drive.stopped}; the drive up to there is used\n")
+        if wheels:
+            return calibrate_wheels(drive, args)
+        return _lights(args, drive)
+    except (HalError, ConfigError, SurveyError, ResidualError, TooLittle, Unaligned) as error:
+        return parser.fail(f"{args.log}: {error}" if isinstance(error, ValueError) else str(error))
+
+
+def _lights(args: argparse.Namespace, drive: Drive) -> int:
+    given = read_survey(args.survey, drive.profile) if args.survey else drive.survey
+    if not given.lamps:
+        raise SurveyError(
+            f"{drive.path}: recorded without a survey; name one with --survey, or make one: lumiloop survey"
+        )
+    strengths = heard(drive)
+    start = np.array(args.start) if args.start else found_frame(given, strengths)
+    if args.start:
+        start[2] = math.radians(start[2])
+    rows = rows_for(given, strengths, start)
+    found = calibrate(given, rows, FRAME, start)
+    residuals = learn(found.survey, in_survey(found, found.rows))
+    sys.stdout.write(report(found, residuals))
+    write_survey(args.out, found.survey, notes(drive, found), remarks(found), force=args.force)
+    beside = residuals_beside(args.out)
+    write_residuals(beside, residuals, found.survey)
+    sys.stdout.write(f"written: {args.out}, {beside}\n{draw_calibration(found, args.out.with_suffix('.png'))}\n")
+    return parser.OK
+
+
+def found_frame(given: Survey, strengths: Heard) -> Array:
+    """Where the drive began in the survey's frame, from the lamps it can locate by itself.
+
+    Raises:
+        Unaligned, TooLittle: not to be found; --start says it instead.
+    """
+    try:
+        z = float(np.median([lamp.z for lamp in given.lamps]))
+        return align(given, survey(strengths, given.receiver, given.depth, z).found.survey)
+    except (Unaligned, TooLittle) as error:
+        raise type(error)(
+            f"{error}; say where the drive began in the survey's frame with --start X Y DEGREES"
+        ) from error
+
+
+def in_survey(found: Calibrated, rows: Rows) -> Rows:
+    """The rows with their poses in the survey's frame."""
+    theta = np.zeros(COMMONS)
+    theta[Common.FRAME_X : Common.FRAME_YAW + 1] = found.T_survey_drive
+    return Rows(placed(theta, rows.pose), rows.lamp, rows.amplitude, rows.sigma, rows.t)
+
+
+def report(found: Calibrated, residuals: ResidualMap) -> str:
+    """All of it for people."""
+    before, after = found.rms()
+    x, y, yaw = found.T_survey_drive
+    used, total = int(found.used.sum()), len(found.used)
+    lines = [
+        f"{used} strengths used of {total} (the rest out of plain view, blocked, or contradicting)",
+        f"residual of ln strength, rms: {before:.4f} before, {after:.4f} after",
+        f"the drive began at x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg of the survey",
+        f"residual map: {residuals.noise:.4f} left unexplained, one sigma of ln",
+        "",
+        f"{'lamp':>6} {'parameter':<12} {'before':>10} {'after':>10} {'sigma':>9}",
+        *(line(e) for e in found.estimates if not e.name.startswith("frame") and e.lamp_id not in found.untouched),
+    ]
+    if found.untouched:
+        lines += [
+            "",
+            "hardly seen, nothing but the gain common to all was changed: lamps "
+            + ", ".join(map(str, found.untouched)),
+        ]
+    if not found.converged:
+        lines += ["", "the fit had not settled when it was stopped: take these figures with care"]
+    return "\n".join(lines) + "\n"
+
+
+def line(e: Estimate) -> str:
+    """One parameter."""
+    lamp = "all" if e.lamp_id is None else str(e.lamp_id)
+    told = "" if e.told else "  not told by this drive"
+    return f"{lamp:>6} {e.name:<12} {e.before:>10.4f} {e.after:>10.4f} {e.sigma:>9.4f} {e.unit}{told}".rstrip()
+
+
+def notes(drive: Drive, found: Calibrated) -> list[str]:
+    """The head of the written survey."""
+    before, after = found.rms()
+    return [
+        f"Calibrated from {drive.path.name}: residual of ln strength {before:.4f} before, {after:.4f} after (rms).",
+        "power_w is what this receiver makes of each lamp; sigma is one sigma of its ln.",
+    ]
+
+
+def remarks(found: Calibrated) -> dict[int, str]:
+    """Behind each lamp: the sigmas of what the drive told."""
+    said: dict[int, list[str]] = {}
+    for e in found.estimates:
+        if e.lamp_id is not None and e.lamp_id not in found.untouched:
+            said.setdefault(e.lamp_id, []).append(f"{e.name} +-{e.sigma:.3f}" if e.told else f"{e.name} not told")
+    return {lamp: ", ".join(words) for lamp, words in said.items()}

@@ -1,0 +1,54 @@
+"""`lumiloop doctor`: runs every check and tells a person, or a program, what to fix first."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from daemon.cli import parser
+from daemon.config import loader
+from daemon.config.paths import stream_path
+from daemon.diagnosis.checks import CHECKS, Case, Finding, Level
+from daemon.diagnosis.host import Host
+
+_WORDS = {Level.GOOD: "good", Level.REMARK: "note", Level.FIX: "FIX"}
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns 0 where nothing has to be fixed, 1 else, 2 for a configuration that is wrong."""
+    return examine(args, Host())
+
+
+def examine(args: argparse.Namespace, host: Host) -> int:
+    """The same, of a given computer."""
+    try:
+        settings = loader.load(args.config, list(args.set))
+    except loader.ConfigError as error:
+        wrong = Finding("configuration", Level.FIX, str(error), "mend it; nothing else can be judged before")
+        _tell([wrong], args.json)
+        return parser.USAGE
+    case = Case(settings, args.config, host, host.listen(args.stream or stream_path(settings.name)))
+    found = [finding for check in CHECKS for finding in check(case)]
+    _tell(found, args.json)
+    return parser.FAILED if any(finding.level is Level.FIX for finding in found) else parser.OK
+
+
+def _tell(found: list[Finding], as_json: bool) -> None:
+    if as_json:
+        told = [{"about": f.about, "level": f.level.name.lower(), "text": f.text, "remedy": f.remedy} for f in found]
+        sys.stdout.write(json.dumps(told, indent=2) + "\n")
+        return
+    width = max(len(finding.about) for finding in found)
+    lines = []
+    for finding in found:
+        lines.append(f"{_WORDS[finding.level]:<5}{finding.about:<{width + 2}}{finding.text}")
+        if finding.remedy:
+            lines.append(f"{'':<{width + 7}}-> {finding.remedy}")
+    first = next((finding for finding in found if finding.level is Level.FIX), None)
+    count = sum(finding.level is Level.FIX for finding in found)
+    if first is None:
+        lines.append("nothing has to be fixed")
+    else:
+        lines.append(f"{count} to fix; first: {first.about}: {first.remedy}")
+    sys.stdout.write("\n".join(lines) + "\n")

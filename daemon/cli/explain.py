@@ -1,0 +1,160 @@
+"""``lumiloop explain WORD``: what a key, a state, a number in the log or a register means, and what to do about it.
+
+Everything comes from the tables that the daemon itself works by, so that an explanation cannot lag behind it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final
+
+from daemon.cli.parser import FAILED, OK, fail
+from daemon.config import loader
+from daemon.config.schema import Config
+from daemon.health.faults import FAULTS
+from daemon.health.reasons import REASONS
+from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
+from daemon.publish.modbus import holding, integrity_block, registers
+from daemon.publish.modbus.points import Layout, Point
+from daemon.publish.modbus.requests import BLOCKS
+
+_BLOCKS: Final = (
+    ("input register", registers.BODY_ADDRESS, registers.BODY),
+    *(("input register", block.body, block) for block in BLOCKS),
+    ("holding register", holding.COMMAND_ADDRESS, holding.COMMAND),
+    ("holding register", holding.ODOMETRY_ADDRESS, holding.ODOMETRY),
+)
+_BITS: Final = (
+    ("bit of `flags`", registers.FLAGS),
+    ("bit of `devices`", registers.DEVICES),
+    ("bit of `witnesses`", integrity_block.WITNESSES),
+)
+_PORTS: Final = (
+    (Config().modbus.port, "MODBUS_PORT", "where the daemon answers Modbus, UDP and TCP", "`modbus.port` sets another"),
+    (8090, "WEB_PAGE", "where `lumiloop view` serves the web page", "`--port` sets another"),
+    (8765, "FOXGLOVE", "where `lumiloop foxglove` serves the Foxglove app", "`--listen` sets another"),
+    (9464, "METRICS", "where `lumiloop metrics` serves Prometheus", "`--listen` sets another"),
+    (7447, "ZENOH_ROUTER", "where `lumiloop fleet` and `lumiloop ros2` look for it", "`--router` sets another"),
+)
+"""Ports that are used where nobody has said otherwise."""
+_MOST: Final = 12
+"""Explanations shown for one word; a whole table of keys has fewer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Something that can be asked about.
+
+    Attributes:
+        kind: fault, reason, configuration key... name: how it is written. numbers: that stand for it.
+        text: what it is. remedy: what to do, empty where there is nothing to be done.
+    """
+
+    kind: str
+    name: str
+    numbers: range
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        number = f" {self.numbers[0]}" if self.numbers else ""
+        remedy = f"\n  what to do: {self.remedy}" if self.remedy else ""
+        return f"{self.kind}{number}: {self.name}\n  {self.text}{remedy}"
+
+
+def main(args: argparse.Namespace) -> int:
+    """Body of the command; ``args.words`` is what was asked: one word, or a kind and a word as in `fault 302`."""
+    asked = " ".join(args.words).strip().strip("`")
+    everything = list(entries())
+    found = find(asked, everything)
+    if not found:
+        return fail(f"{asked}: nothing of that name or number; {_hint(asked, everything)}", FAILED)
+    sys.stdout.write("\n\n".join(str(entry) for entry in found[:_MOST]) + "\n")
+    if len(found) > _MOST:
+        sys.stdout.write(f"\nand {len(found) - _MOST} more; ask more exactly\n")
+    return OK
+
+
+def _hint(asked: str, everything: Sequence[Entry]) -> str:
+    kind = asked.lower()
+    for entry in everything:
+        if entry.numbers and kind in (entry.kind, entry.kind.rpartition(" ")[2]):
+            return f"name a number, too, as in: {kind} {entry.numbers[0]}"
+    names = {entry.name.lower() for entry in everything}
+    near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.7)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    kinds = "a key, a state, a fault, a reason, a command, a register, a bit or a port"
+    return f"ask for {kinds}, as in: fault 302, TRACKING, bind"
+
+
+def entries() -> Iterator[Entry]:
+    """All that can be asked about."""
+    for option in loader.options():
+        default = loader.value_text(option.default)
+        yield Entry(
+            "configuration key", option.path, range(0), f"{option.description} ({option.kind}; default {default})"
+        )
+    for path, remedy in loader.MOVED.items():
+        yield Entry("configuration key of earlier versions", path, range(0), "there is no such key any more", remedy)
+    yield from _meanings("reason", REASONS)
+    yield from _meanings("fault", FAULTS)
+    yield from _names("state", STATES)
+    yield from _names("light fix", FIXES)
+    yield from _names("link use", USES)
+    yield from _names("loop reason", LOOPS)
+    yield from _names("command", COMMANDS)
+    for port, name, text, remedy in _PORTS:
+        yield Entry("port", name, range(port, port + 1), text, remedy)
+    yield from _registers()
+
+
+def _meanings(kind: str, table: Mapping[Any, tuple[str, str]]) -> Iterator[Entry]:
+    for code, (text, remedy) in table.items():
+        yield Entry(kind, code.name, _one(code), text, remedy)
+
+
+def _names(kind: str, table: Mapping[Any, str]) -> Iterator[Entry]:
+    for code, text in table.items():
+        yield Entry(kind, code.name, _one(code), text)
+
+
+def _registers() -> Iterator[Entry]:
+    for kind, start, layout in _BLOCKS:
+        yield from _points(kind, start, layout)
+    for kind, bits in _BITS:
+        for number, (name, text, _) in enumerate(bits):
+            yield Entry(kind, name, range(number, number + 1), f"set when {text}")
+
+
+def _points(kind: str, start: int, layout: Layout) -> Iterator[Entry]:
+    for offset, point in zip(layout.offsets, layout.points, strict=True):
+        step = f", steps of 1/{point.per_unit} {point.unit}" if point.per_unit > 1 else ""
+        text = f"{point.label}. {_elsewhere(point)}".strip().rstrip(".") + f" ({point.wire.name}{step})"
+        yield Entry(kind, point.name, range(start + offset, start + offset + point.wire.words), text)
+
+
+def _elsewhere(point: Point) -> str:
+    """The point's text, with what to ask where the documents point to a table below."""
+    kind = "link use" if point.name.endswith("_use") else point.name
+    text = point.text.replace("Bits, see below", "Bits; what each means: lumiloop explain bit NUMBER")
+    return text.replace("See below", f"What each means: lumiloop explain {kind} NUMBER")
+
+
+def _one(code: IntEnum) -> range:
+    return range(code.value, code.value + 1)
+
+
+def find(asked: str, everything: Sequence[Entry]) -> list[Entry]:
+    """Entries of that number or name, of one kind where the first words name it; a table's name gives its keys."""
+    kind, _, last = asked.lower().rpartition(" ")
+    of_kind = [entry for entry in everything if kind in entry.kind]
+    if last.isascii() and last.isdigit():
+        return [entry for entry in of_kind if int(last) in entry.numbers]
+    exact = [entry for entry in of_kind if entry.name.lower() == last]
+    return exact or [entry for entry in of_kind if f".{last}." in f".{entry.name.lower()}."]

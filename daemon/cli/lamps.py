@@ -1,0 +1,103 @@
+"""`lumiloop lamps`: gathers what the maps say of the lamps, and tells which need somebody to come."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from daemon.cli import parser
+from daemon.config.paths import maps_folder, stream_path
+from daemon.config.schema import Config
+from daemon.diagnosis.host import Heard, Host, standing
+from daemon.diagnosis.lamp_history import BadHistory, by_lamp, in_maps, load, merged, save
+from daemon.diagnosis.lamp_trend import Verdict, judge, together
+
+FILE: Final = "lamps.csv"
+TOGETHER: Final = -0.02
+"""A year; that all lamps dim by so much together is worth a word."""
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns 0 where no lamp is urgent, 1 else."""
+    return tell(args, Host())
+
+
+def tell(args: argparse.Namespace, host: Host) -> int:
+    """The same, on a given computer."""
+    settings: Config = args.settings
+    if not settings.map.kept and args.history is None:
+        return parser.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", parser.USAGE)
+    maps = maps_folder(settings.map.folder) if settings.map.kept else None
+    path: Path = args.history or (maps.parent / FILE if maps is not None else Path(FILE))
+    if args.history is not None and not path.parent.is_dir():
+        return parser.fail(
+            f"--history {path}: there is no folder {path.parent}; make it, or name another file", parser.USAGE
+        )
+    try:
+        kept = load(path)
+        fresh = in_maps(maps) if maps is not None else []
+        looks = merged(kept, fresh)
+        if looks != kept:
+            save(path, looks)
+    except BadHistory as error:
+        return parser.fail(str(error))
+    except OSError as error:
+        return parser.fail(
+            f"{error.filename or path}: {error.strerror}; run it as the daemon's user, or name --history FILE"
+        )
+    heard = host.listen(args.stream or stream_path(settings.name))
+    verdicts = judge(by_lamp(looks), host.utc(), _said_of(heard) if isinstance(heard, Heard) else {})
+    if not verdicts:
+        return parser.fail("nothing is known of any lamp yet: drive under surveyed lamps until the map has been saved")
+    if not isinstance(heard, Heard):
+        why = heard if isinstance(heard, str) else heard.text
+        parser.say(f"which lamps are dead or moved just now is not known, no daemon tells it: {why}")
+    sys.stdout.write(_as_json(verdicts) if args.json else _table(verdicts))
+    return parser.FAILED if any(one.urgent for one in verdicts) else parser.OK
+
+
+def _said_of(heard: Heard) -> dict[int, int]:
+    """What the daemon uses each lamp for; dead or moved only where its faults say so: a passing shadow is none."""
+    lasts = standing(heard)
+    return {lamp: use for (_, lamp), use in heard.lamps.items() if lamp is not None and lasts(use)}
+
+
+def _table(verdicts: list[Verdict]) -> str:
+    lines = [f"{'lamp':>6}  {'level':>6}  {'a year':>14}  {'replace by':<24}what"]
+    for one in verdicts:
+        trend = "-" if one.per_year is None else f"{100 * one.per_year:+.1f} +- {100 * one.sigma:.1f} %"
+        when = "-" if one.replace_by is None else f"{_day(one.replace_by)} ({_day(one.earliest)})"
+        since = "" if one.since is None else f", since {_day(one.since)}"
+        lines.append(f"{one.lamp:>6}  {100 * one.level:>4.0f} %  {trend:>14}  {when:<24}{one.finding.value}{since}")
+    common = together(verdicts)
+    if common is not None and common < TOGETHER:
+        lines.append(f"all lamps together: {100 * common:+.1f} % a year: clean the receiver's window first")
+    urgent = [str(one.lamp) for one in verdicts if one.urgent]
+    lines.append(f"go to: lamp {', '.join(urgent)}" if urgent else "no lamp is urgent")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _as_json(verdicts: list[Verdict]) -> str:
+    told = [
+        {
+            "lamp": one.lamp,
+            "finding": one.finding.name.lower(),
+            "urgent": one.urgent,
+            "level": round(one.level, 4),
+            "per_year": one.per_year,
+            "sigma": one.sigma,
+            "replace_by": one.replace_by,
+            "earliest": one.earliest,
+            "since": one.since,
+        }
+        for one in verdicts
+    ]
+    return json.dumps(told, indent=2) + "\n"
+
+
+def _day(utc: float | None) -> str:
+    return "-" if utc is None else f"{datetime.fromtimestamp(utc, UTC):%Y-%m-%d}"

@@ -1,0 +1,356 @@
+"""The command line. Each command's body is imported only when it runs, so that small commands stay small.
+
+Exit codes: 0 done, 1 it failed (the text says what and what to do), 2 wrong usage or configuration, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+OK: Final = 0
+FAILED: Final = 1
+USAGE: Final = 2
+INTERRUPTED: Final = 130
+LONGEST_RING: Final = 1440.0
+"""Minutes; whoever wants more keeps all of it."""
+PICTURES: Final = (".png", ".svg", ".pdf")
+"""Endings of files that can be drawn."""
+
+Body = Callable[[argparse.Namespace], int]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code. Wrong usage raises SystemExit(2) after explaining itself."""
+    try:
+        words = parser()
+        args = words.parse_args(argv)
+        body: Body | None = getattr(args, "body", None)
+        if body is None:
+            words.print_help(sys.stderr)
+            return USAGE
+        return body(args)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has gone; there is nobody to tell
+        return OK
+
+
+def fail(message: str, code: int = FAILED) -> int:
+    """Say on stderr what went wrong and return the exit code."""
+    sys.stderr.write(f"lumiloop: {message}\n")
+    return code
+
+
+def say(text: str) -> None:
+    """One line on stderr, at once."""
+    sys.stderr.write(f"lumiloop: {text}\n")
+    sys.stderr.flush()
+
+
+def parser() -> argparse.ArgumentParser:
+    """Every command with its options; ``body`` of what it parses is the :data:`Body` to run."""
+    parser = argparse.ArgumentParser(
+        prog="lumiloop",
+        description="Indoor robot localisation from a 2D lidar and coded ceiling lights: a pose over Modbus and UDP. "
+        "Not a safety function.",
+    )
+    _print_option(parser, "--version", _version, "the version")
+    _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
+    _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
+    _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
+    from daemon.cli import tap_parsers
+
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
+    _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
+    _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
+    _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
+    _why(commands.add_parser("why", help="replay what was recorded around a moment, and say why it was as it was"))
+    _status(commands.add_parser("status", help="show what a running daemon publishes"))
+    _explain(commands.add_parser("explain", help="what a key, a state, a fault, a reason or a register means"))
+    _map(commands.add_parser("map", help="work with maps"))
+    _calibrate(commands.add_parser("calibrate", help="lamps, receiver, wheels and mount, from a recorded drive"))
+    _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
+    _warm(commands.add_parser("warm", help="compile the kernels of this version now, and not at the first start"))
+    _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
+    tap_parsers.add(commands)
+    return parser
+
+
+def _print_option(parser: argparse.ArgumentParser, flag: str, text: Callable[[], str], what: str) -> None:
+    def body(args: argparse.Namespace) -> int:
+        sys.stdout.write(text())
+        return OK
+
+    parser.add_argument(flag, action="store_const", const=body, dest="body", help=f"print {what}")
+
+
+def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
+    """The options of every command that reads the configuration; see :func:`configured`."""
+    if file:
+        parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
+    parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
+
+
+def _run(parser: argparse.ArgumentParser) -> None:
+    config_arguments(parser)
+    parser.add_argument("--lidar", metavar="DEVICE", help="same as --set lidar.device=DEVICE")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record raw bytes and cycles into this directory")
+    parser.add_argument(
+        "--last", type=_minutes, metavar="MINUTES", help="record in a ring; a fault, or a command, makes a dump of it"
+    )
+    parser.set_defaults(body=_recording(later("daemon.cli.run", "main")))
+
+
+def _minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of minutes: name 1 to {LONGEST_RING:.0f}") from None
+    if not 1.0 <= minutes <= LONGEST_RING:
+        raise argparse.ArgumentTypeError(f"{text} minutes: name 1 to {LONGEST_RING:.0f}")
+    return minutes
+
+
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in PICTURES:
+        raise argparse.ArgumentTypeError(f"{text}: a picture ends with {', '.join(PICTURES)}")
+    return path
+
+
+def _recording(body: Body) -> Body:
+    def check_and_run(args: argparse.Namespace) -> int:
+        if args.last is not None and args.record is None:
+            return fail("--last says how much --record keeps: name a directory with --record DIR", USAGE)
+        return body(args)
+
+    return check_and_run
+
+
+def _check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
+    config_arguments(parser, file=False)
+    parser.set_defaults(body=loaded("daemon.cli.check", "main"))  # it resolves the configuration itself
+
+
+def _probe(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("devices", nargs="*", metavar="DEVICE", help="where to look; default: everywhere it may be")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.cli.probe", "main"))
+
+
+def _replay(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="LOG", help="CARMEN log (.gz too), or a recording's directory")
+    parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the results")
+    parser.add_argument(
+        "--journal", metavar="N[,N..]", help="write these matches in full, counted from 1; or: failed; or failed,5"
+    )
+    parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
+    config_arguments(parser)
+    parser.set_defaults(body=estimating("daemon.cli.replay", "main"))
+
+
+def _why(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("time", metavar="TIME", help="21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning")
+    parser.add_argument(
+        "log",
+        nargs="?",
+        type=Path,
+        metavar="REC",
+        help="a recording or a dump, or a folder of several; default: `flight` in the state directory",
+    )
+    parser.add_argument("--out", type=_picture, metavar="FILE", help="and draw it: .png, .svg or .pdf")
+    config_arguments(parser)
+    parser.set_defaults(body=estimating("daemon.cli.why", "main"))
+
+
+def _status(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("address", nargs="?", metavar="HOST[:PORT]", help="default: the configuration's Modbus server")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.cli.status", "main"))
+
+
+def _explain(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("words", nargs="+", metavar="WORD", help="as in: alert_m; DEGRADED; fault 302; map_yaw; 1008")
+    parser.set_defaults(body=loaded("daemon.cli.explain", "main"))
+
+
+def _map(parser: argparse.ArgumentParser) -> None:
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    export = verbs.add_parser("export", help="write a map as other programs read it")
+    export.add_argument("log", type=Path, metavar="SOURCE", help="a map file, *.lumimap; or a log or a recording")
+    export.add_argument("--out", type=Path, metavar="DIR", required=True, help="directory for the files")
+    export.add_argument("--pgm", action="store_true", help="map.pgm, map.yaml, map.png; what is written by default")
+    export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
+    export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
+    config_arguments(export)
+    export.set_defaults(body=estimating("daemon.cli.map_export", "main"))
+    taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
+    taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
+    taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
+    taken.add_argument(
+        "--out", type=Path, metavar="FILE", help="default: the configured folder of maps; the next start takes it"
+    )
+    config_arguments(taken)
+    taken.set_defaults(body=estimating("daemon.cli.map_convert", "take_in", "warm-plan"))
+    render = verbs.add_parser("render", help="draw a map file as a picture")
+    render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
+    config_arguments(render)
+    render.set_defaults(body=estimating("daemon.cli.map_convert", "render", "warm-plan"))
+    _map_changes(verbs)
+    info = verbs.add_parser("info", help="say what a map file holds")
+    info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    info.add_argument("--json", action="store_true", help="machine-readable output")
+    info.set_defaults(body=loaded("daemon.cli.map_info", "info"))
+    verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
+    verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
+    verify.set_defaults(body=loaded("daemon.cli.map_info", "verify"))
+
+
+def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    align = verbs.add_parser("align", help="move a map so that points of it lie where they should")
+    align.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    align.add_argument(
+        "--point",
+        action="append",
+        default=[],
+        metavar="X,Y=X',Y'",
+        help="from, to, in m; two or more; --point=-1,0=0,0 where the first is negative",
+    )
+    name = verbs.add_parser("name", help="say which floor or building a map is of")
+    name.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    name.add_argument("text", metavar="NAME", help="at most 64 characters")
+    for parser, verb in ((align, "align"), (name, "name")):
+        parser.add_argument(
+            "--out",
+            type=Path,
+            metavar="FILE",
+            help="default: beside FILE, as the newest; the daemon there has to be stopped",
+        )
+        parser.set_defaults(body=loaded("daemon.maps.edit", verb))
+
+
+def _calibrate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="REC", help="recording of a teach drive (lumiloop run --record)")
+    parser.add_argument("--survey", type=Path, metavar="FILE", help="survey to start from; default: the recording's")
+    parser.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "DEG"), help="where the drive began in it")
+    parser.add_argument("--odometry", action="store_true", help="wheel scale and track, instead of lights")
+    parser.add_argument("--lidar-mount", action="store_true", help="where the lidar sits, instead of lights")
+    other = "with --odometry or --lidar-mount the configuration, lumiloop-calibrated.toml"
+    _written(parser, f"survey to write, default lights-calibrated.toml; {other}")
+    parser.set_defaults(body=estimating("daemon.cli.calibrate", "main", "warm-teach"))
+
+
+def _survey(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="REC", help="recording of a drive under the lamps")
+    parser.add_argument("--height", type=float, metavar="M", help="of the lamps above the floor; default: estimated")
+    _written(parser, "survey to write; default: lights.toml", Path("lights.toml"))
+    parser.set_defaults(body=estimating("daemon.cli.survey", "main", "warm-teach"))
+
+
+def _written(parser: argparse.ArgumentParser, what: str, default: Path | None = None) -> None:
+    parser.add_argument("--out", type=Path, metavar="FILE", default=default, help=what)
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    config_arguments(parser)
+
+
+def _warm(parser: argparse.ArgumentParser) -> None:
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.cli.warm", "main"))
+
+
+def _codes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--profile", choices=("A", "B", "D"), default="A", help="air interface; default: A")
+    parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
+    parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
+    parser.set_defaults(body=loaded("daemon.cli.codes", "main"))
+
+
+def later(module: str, name: str) -> Body:
+    """A body that resolves the configuration (``args.settings``, a `Config`) and then loads its module."""
+    return configured(loaded(module, name))
+
+
+def estimating(module: str, name: str, what: str = "warm") -> Body:
+    """As `later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
+
+    def body(args: argparse.Namespace) -> int:
+        from daemon.runtime import warmup
+
+        try:
+            warmup.load_aloud(say, what, warmup.load, module)
+        except warmup.CannotLoad as error:
+            return fail(str(error))
+        return loaded(module, name)(args)
+
+    return configured(body)
+
+
+def loaded(module: str, name: str) -> Body:
+    """A body that loads its module when it runs."""
+
+    def body(args: argparse.Namespace) -> int:
+        run: Body = getattr(import_module(module), name)
+        return run(args)
+
+    return body
+
+
+def configured(body: Body) -> Body:
+    """A body that is run with the resolved configuration as ``args.settings``."""
+
+    def resolve_and_run(args: argparse.Namespace) -> int:
+        from daemon.config import loader
+
+        overrides = list(args.set)
+        if getattr(args, "lidar", None):
+            overrides.append(f"lidar.device={args.lidar}")
+        try:
+            args.settings = loader.load(args.config, overrides)
+        except loader.ConfigError as error:
+            return fail(str(error), USAGE)
+        if args.print_config:
+            sys.stdout.write(loader.dump(args.settings))
+            return OK
+        return body(args)
+
+    return resolve_and_run
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"lumiloop {version('lumiloop')}\n"
+    except PackageNotFoundError:
+        return "lumiloop, run from its source tree without being installed\n"
+
+
+def _schema() -> str:
+    from daemon.config.loader import schema
+
+    return schema()
+
+
+def _reference() -> str:
+    from daemon.config.loader import reference
+
+    return reference()
+
+
+def _defaults() -> str:
+    from daemon.config.loader import dump, load
+
+    return dump(load(None))

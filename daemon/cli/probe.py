@@ -1,0 +1,130 @@
+"""``lumiloop probe``: find lidars and photodiode converters, say what they are, or what is wrong and what to do."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import re
+import sys
+
+from daemon.cli import parser
+from daemon.config.endpoints import LidarPlace, parse_lidar
+from hal.bus import i2c_linux
+from hal.hokuyo import discover
+from hal.photodiode.probe import BusFinding, Chip, probe_bus
+from hal.port.opening import open_bus, open_port
+from hal.probe import Finding, identify_at
+
+NOTHING = (
+    "nothing to look at: no serial device that may be a HOKUYO is plugged in, and there is no I2C bus\n"
+    "  plug the sensor in and give it power; an Ethernet model is not searched for, name it:\n"
+    "  lumiloop probe tcp://192.168.0.10:10940\n"
+    "  a photodiode's bus may have to be enabled first; one that is served elsewhere is named like\n"
+    "  lumiloop probe unix:/run/lumiloop/i2c\n"
+)
+
+Found = Finding | BusFinding
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command ``probe``; 0 when a lidar or a converter was found, and one at every device named."""
+    devices = list(args.devices) or [*discover.candidates(), *i2c_linux.buses()]
+    if not devices and not args.json:
+        sys.stderr.write(NOTHING)
+        return 1
+    try:
+        places = {device: LidarPlace(device) if is_bus(device) else parse_lidar(device) for device in devices}
+    except ValueError as error:
+        return parser.fail(str(error))
+    findings = asyncio.run(_look(places, quiet=args.json))
+    if args.json:
+        sys.stdout.write(json.dumps([as_dict(finding) for finding in findings], indent=2) + "\n")
+    good = sum(map(_usable, findings))
+    return 0 if good and (not args.devices or good == len(findings)) else 1
+
+
+def is_bus(device: str) -> bool:
+    """Whether this is the name of an I2C bus; ``tcp://`` names a lidar here, so such a bus is named ``i2c+tcp://``."""
+    return re.match(r"/dev/i2c-|adapter:|unix:|i2c\+tcp://", device) is not None
+
+
+async def _look(places: dict[str, LidarPlace], quiet: bool) -> list[Found]:
+    """``places``: by what a person writes for them."""
+    findings: list[Found] = []
+    for device, place in places.items():
+        if not quiet:
+            sys.stderr.write(f"looking at {device} ...\n")
+        bus = is_bus(device)
+        finding: Found = (
+            await probe_bus(open_bus, device.removeprefix("i2c+"))
+            if bus
+            else await identify_at(open_port, place.device, place.baud)
+        )
+        findings.append(finding)
+        if not quiet:
+            sys.stdout.write(describe(finding, device))
+            sys.stdout.flush()
+    return findings
+
+
+def _usable(finding: Found) -> bool:
+    if isinstance(finding, BusFinding):
+        return any(chip.usable for chip in finding.chips)
+    return finding.error is None
+
+
+def describe(finding: Found, device: str) -> str:
+    """What a person wants to read: the line and how to use it; ``device``: as it was written."""
+    if isinstance(finding, BusFinding):
+        use = (_how_to_use(finding.bus, chip) for chip in finding.chips)
+        return "\n".join((str(finding), *(f"  use it: {text}" for text in use if text))) + "\n"
+    if finding.error is not None:
+        return f"no lidar: {finding}\n"
+    return f"{finding}\n  use it: lumiloop run --lidar {device}\n"
+
+
+def _how_to_use(bus: str, chip: Chip) -> str:
+    """Keys of the configuration for a chip; empty for what is none of ours."""
+    name = chip.name.lower().rpartition(" ")[2]  # one of two that look alike will do
+    where = f"{name}@{chip.address:#04x}"
+    if chip.usable:
+        return f'photodiode.bus = "{bus}", photodiode.converter = "{where}"'
+    return f'photodiode.level = "{where}/0"' if name else ""
+
+
+def as_dict(finding: Found) -> dict[str, object]:
+    """The same for programs. Angles in degrees, ranges in m, times in s; keys are absent where nothing is known."""
+    if isinstance(finding, BusFinding):
+        return _bus_as_dict(finding)
+    if finding.error is not None:
+        error = finding.error
+        return {"device": finding.device, "problem": error.problem, "remedy": error.remedy}
+    known: dict[str, object] = {"device": finding.device, "product": finding.product, "protocol": finding.protocol}
+    known |= {"state": finding.state} if finding.state else {}
+    known |= {"baud": finding.baud} if finding.baud else {}
+    if (g := finding.geometry) is not None:
+        known |= {
+            "model": g.model,
+            "serial": g.serial,
+            "firmware": g.firmware,
+            "beams": g.amax - g.amin + 1,
+            "from_deg": round((g.amin - g.afrt) * 360.0 / g.ares, 3),
+            "to_deg": round((g.amax - g.afrt) * 360.0 / g.ares, 3),
+            "period_s": g.period_s,
+            "range_m": [round(g.dmin * g.range_unit_m, 6), round(g.dmax * g.range_unit_m, 6)],
+        }
+    return known
+
+
+def _bus_as_dict(finding: BusFinding) -> dict[str, object]:
+    chips = [
+        {"address": chip.address, "usable": chip.usable}
+        | ({"name": chip.name} if chip.name else {})
+        | ({"problem": chip.problem} if chip.problem else {})
+        for chip in finding.chips
+    ]
+    known: dict[str, object] = {"bus": finding.bus, "adapter": finding.adapter, "chips": chips}
+    if finding.error is not None:
+        known |= {"problem": finding.error.problem, "remedy": finding.error.remedy}
+    return known

@@ -1,0 +1,119 @@
+"""``lumiloop run``: the daemon of this computer, with what is stored and surveyed, until a signal stops it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import math
+import signal
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon.app import EXTEND_US, Daemon
+from daemon.cli.parser import FAILED, OK, USAGE
+from daemon.config import loader
+from daemon.config.paths import maps_folder, runtime_folder, streams_served
+from daemon.config.schema import Config
+from daemon.devices.sample_clock import SampleClock
+from daemon.environment import World
+from daemon.maps.store import NoMap, started
+from daemon.runtime.light_setup import SurveyError, load_lights
+from daemon.runtime.stall_watch import StallWatch
+from daemon.runtime.warmup import CannotLoad, warm_up
+from daemon.system.logging import start_log
+from daemon.system.realtime import give_back
+from daemon.system.sd_notify import managed, notify
+from hal.clock import SystemClock
+from hal.errors import HalError
+
+if TYPE_CHECKING:
+    from daemon.recording.recorder import Recorder
+
+log = logging.getLogger(__name__)
+
+ANEW_S: Final = 10.0
+"""Pause before the end of a start that came to nothing: the service manager would start anew after 0.2 s, which is for
+a crash. What was missing (a map, room for kernels or a recording) has not come by then, and each start takes seconds of
+processor time and lines of the log."""
+
+SECOND: Final = (
+    "what it has open, sensors, ports, maps, this one cannot have; stop it (systemctl stop lumiloop), or give this one "
+    "a `name`, devices and ports of its own"
+)
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command ``run``. ``args``: the configuration (``settings``), where to ``record``, how much (``last``)."""
+    start_log()
+    settings: Config = args.settings
+    log.info("%s: configuration\n%s", settings.name, loader.dump(settings).rstrip())
+    for other in streams_served(settings.name):  # need not be a mistake, but each device has one owner
+        log.warning("a daemon named %s runs on this computer already (%s): %s", settings.name, other, SECOND)
+    recorder = None
+    give_back()
+    try:
+        world = _world(settings)
+        log.info("%s", _whereabouts(settings, args.record, world.stream))
+        if args.record is not None:
+            from daemon.recording.recorder import Recorder
+
+            keep_s = math.inf if args.last is None else 60.0 * args.last
+            recorder = Recorder(args.record, settings, world.clock, world.lights, world.start, keep_s)
+        asyncio.run(_run_until_signal(settings, world, recorder))
+    except SurveyError as error:
+        log.error("%s", error)
+        return USAGE
+    except (HalError, CannotLoad, NoMap) as error:
+        log.error("%s", error)
+        _wait_before_anew()
+        return FAILED
+    return OK
+
+
+def _wait_before_anew() -> None:
+    """Let the service manager wait where a start came to nothing; a stop ends it (SIGTERM, as its default is)."""
+    if managed():
+        notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=cannot start, see the log; tried again soon")
+        log.info("the next start is tried in %.0f s", ANEW_S)
+        time.sleep(ANEW_S)
+
+
+def _world(settings: Config) -> World:
+    """The real one, with what is stored and surveyed of map and lights; raises `SurveyError` and `NoMap`."""
+    stream = runtime_folder() / f"{settings.name}.stream"
+    if not settings.photodiode.fitted:
+        store, start = started(settings.map, None)
+        return World(SystemClock(), store=store, start=start, stream=stream)
+    clock = SampleClock(settings.photodiode)
+    lights = load_lights(settings, clock.ppm)
+    store, start = started(settings.map, lights)
+    world = World(SystemClock(), store=store, start=start, stream=stream)
+    return replace(world, warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=clock)
+
+
+def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> str:
+    """One line for the person at the terminal: where the pose can be read, what is kept, how to stop."""
+    modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
+    said = [modbus if settings.modbus.port else "no Modbus on the network"]
+    said += [f"Modbus RTU on {settings.modbus.serial}"] if settings.modbus.serial else []
+    said += [f"answering {', '.join(settings.allow)} only"] if settings.allow else []
+    said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
+    said += [f"stream {stream}"] if stream is not None else []
+    used = "map from" if settings.map.localise else "maps in"
+    said += [f"{used} {maps_folder(settings.map.folder)}"] if settings.map.kept else ["no map is kept"]
+    said += [f"recording into {record}"] if record is not None else []
+    return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
+
+
+async def _run_until_signal(settings: Config, world: World, recorder: Recorder | None) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    daemon = Daemon(settings, world, recorder)
+    daemon.pacemaker.watch = StallWatch()
+    await daemon.run(stop)

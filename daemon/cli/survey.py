@@ -1,0 +1,63 @@
+"""`lumiloop survey REC`: a light survey from a recorded drive, in the frame of the drive's map."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from daemon.cli import parser
+from daemon.cli.replay import Given
+from daemon.commissioning.fit_plot import draw_survey
+from daemon.commissioning.teach_drive import heard, read_drive
+from daemon.config.survey_loader import SurveyError, write_survey
+from estimator.calibration.calibrate import TooLittle
+from estimator.calibration.lamp_mapping import Surveyed, survey
+from hal.errors import HalError
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    if args.out.exists() and not args.force:
+        return parser.fail(
+            f"{args.out} exists: name another file with --out, or ask for it to be replaced with --force"
+        )
+    keys = tuple(override.partition("=")[0].strip() for override in args.set)
+    try:
+        drive = read_drive(args.log, args.settings, Given(args.config is not None, keys))
+        if drive.stopped:
+            sys.stderr.write(f"lumiloop: {drive.stopped}; the drive up to there is used\n")
+        found = survey(heard(drive), drive.survey.receiver, drive.survey.depth, args.height)
+        sys.stdout.write(report(found, args.height))
+        head = [
+            f"Lamps located by the drive {drive.path.name}; the frame is that of its map: the robot's start, x ahead.",
+            "Height: " + ("as given." if args.height else "from the drive." if found.height_told else "a guess."),
+        ]
+        write_survey(args.out, found.found.survey, head, remarks(found), force=args.force)
+        sys.stdout.write(f"written: {args.out}\n{draw_survey(found, args.out.with_suffix('.png'))}\n")
+    except (HalError, SurveyError) as error:
+        return parser.fail(str(error))
+    except (TooLittle, ValueError) as error:
+        return parser.fail(f"{args.log}: {error}")
+    return parser.OK
+
+
+def report(found: Surveyed, height: float | None) -> str:
+    """All of it for people."""
+    lines = [
+        f"{'lamp':>6} {'code':>5} {'x m':>8} {'y m':>8} {'z m':>6} {'sigma m':>8} {'power W':>8} {'nearest m':>10}"
+    ]
+    for lamp, sigma, near in zip(found.found.survey.lamps, found.sigma, found.nearest, strict=True):
+        spread = float((sigma[0] ** 2 + sigma[1] ** 2) ** 0.5)
+        place = f"{lamp.x:>8.3f} {lamp.y:>8.3f} {lamp.z:>6.2f}"
+        lines.append(f"{lamp.lamp_id:>6} {lamp.code:>5} {place} {spread:>8.3f} {lamp.power_w:>8.3f} {near:>10.2f}")
+    if height is None and not found.height_told:
+        lines.append("this drive does not tell the lamps' height; z is a guess: measure one lamp and give --height")
+    if found.left_out:
+        lines.append("heard too seldom or too weakly to be placed: codes " + ", ".join(map(str, found.left_out)))
+    return "\n".join(lines) + "\n"
+
+
+def remarks(found: Surveyed) -> dict[int, str]:
+    """Behind each lamp: how well it is placed, and how near the drive came."""
+    rows = zip(found.found.survey.lamps, found.sigma, found.nearest, strict=True)
+    return {lamp.lamp_id: f"x +-{s[0]:.3f}, y +-{s[1]:.3f} m, passed at {near:.1f} m" for lamp, s, near in rows}

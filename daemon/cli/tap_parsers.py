@@ -1,0 +1,229 @@
+"""Commands that listen to a running daemon's local stream, or need a library of their own: words and options.
+
+Their bodies are in the room `taps`, which is loaded only when one of them runs; what it needs beyond the core is an
+extra of the package, and who lacks it is told which.
+"""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from pathlib import Path
+
+from daemon.cli import parser as cli_parser
+from daemon.system.extras import how_to_install
+
+Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
+MOST_DOMAIN = 232
+"""The ports of a larger one would be beyond 65535 (DDS)."""
+OURS = ("daemon", "estimator", "hal", "taps")
+
+
+def add(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add them all."""
+    _export(commands.add_parser("export", help="write a recording as MCAP (ROS 2, Foxglove), TUM or KITTI"))
+    _record_mcap(commands.add_parser("record-mcap", help="record a running daemon as MCAP, until interrupted"))
+    _view(commands.add_parser("view", help="show a running daemon, or a recording, as a web page"))
+    _doctor(commands.add_parser("doctor", help="say what is wrong with this installation, and what to fix first"))
+    _plan(commands.add_parser("plan", help="where to hang how many lamps over a floor, and what comes of it"))
+    _metrics(commands.add_parser("metrics", help="serve Prometheus metrics and VDA 5050's position, on this computer"))
+    _foxglove(commands.add_parser("foxglove", help="serve a running daemon live for the Foxglove app"))
+    _ros2(commands.add_parser("ros2", help="a running daemon as a node of ROS 2, which need not be installed (Zenoh)"))
+    _fleet(commands.add_parser("fleet", help="all robots on one map; join, share a survey and a map, fetch them"))
+    _lamps(commands.add_parser("lamps", help="which lamps are dead, dimming or moved, and when to replace them"))
+
+
+def _lamps(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--history", type=Path, metavar="FILE", help="default: lamps.csv beside the folder of maps")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    listening(parser)
+    parser.set_defaults(body=cli_parser.later("daemon.cli.lamps", "main"))
+
+
+def _metrics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--listen", default="127.0.0.1:9464", metavar="HOST:PORT", help="default: 127.0.0.1:9464")
+    listening(parser)
+    parser.set_defaults(body=cli_parser.later("taps.metrics.server", "main"))
+
+
+def _foxglove(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
+    listening(parser)
+    parser.set_defaults(body=needing("foxglove", "taps.foxglove_live", "main"))
+
+
+def _ros2(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--domain", type=_domain, default=0, metavar="N", help="ROS_DOMAIN_ID; default: 0")
+    parser.add_argument(
+        "--namespace", default="", metavar="NAME", help="before every topic, as in /agv1; default: none"
+    )
+    parser.add_argument("--humble", action="store_true", help="for ROS 2 Humble, whose types have no hash")
+    _meeting(parser)
+    listening(parser)
+    parser.set_defaults(body=needing("zenoh", "taps.ros.node", "main"))
+
+
+def _fleet(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="and draw it")
+    _meeting(parser)
+    cli_parser.config_arguments(parser)
+    parser.set_defaults(body=needing("zenoh", "taps.fleet.show", "main"))
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB")
+    join = verbs.add_parser("join", help="tell the fleet what this robot's daemon tells, until stopped")
+    join.add_argument("--rate", type=_hertz, default=5.0, metavar="HZ", help="poses a second, at most; default: 5")
+    listening(join)
+    join.set_defaults(body=needing("zenoh", "taps.fleet.robot", "main"))
+    share = verbs.add_parser("share", help="offer a survey, a map, or both, until stopped")
+    share.add_argument("--survey", type=Path, metavar="FILE", help="lamps that all robots see")
+    share.add_argument("--map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    share.add_argument(
+        "--version", type=int, metavar="N", help="larger is newer; default: when the file was changed, s"
+    )
+    cli_parser.config_arguments(share)
+    share.set_defaults(body=needing("zenoh", "taps.fleet.share", "main"))
+    fetch = verbs.add_parser("fetch", help="take what is offered, check it, put it to its place")
+    fetch.add_argument("what", nargs="*", type=_shared, metavar="survey|map", help="default: both")
+    fetch.add_argument("--survey", type=Path, metavar="FILE", help="where the survey goes; default: `lights.survey`")
+    fetch.add_argument("--switch", action="store_true", help="have the running daemon go on in the map (SWITCH_MAP)")
+    fetch.add_argument("--follow", action="store_true", help="take newer ones, too, until stopped")
+    cli_parser.config_arguments(fetch)
+    fetch.set_defaults(body=needing("zenoh", "taps.fleet.fetch", "main"))
+    router = verbs.add_parser("router", help="be the router that they all meet at, until stopped")
+    router.add_argument("--listen", default="127.0.0.1:7447", metavar="HOST:PORT", help="default: 127.0.0.1:7447")
+    cli_parser.config_arguments(router)
+    router.set_defaults(body=needing("zenoh", "taps.fleet.share", "router"))
+    for verb in (join, share, fetch, router):
+        _meeting(verb)
+        for option in verb._actions:  # argparse has no other way: what was said before the verb counts
+            if option.dest in ("router", "zenoh", "config", "set", "print_config"):
+                option.default = argparse.SUPPRESS
+
+
+def _meeting(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--router", default="127.0.0.1:7447", metavar="HOST:PORT", help="Zenoh router; default: 127.0.0.1:7447"
+    )
+    parser.add_argument("--zenoh", type=Path, metavar="FILE", help="Zenoh's own configuration: certificates, rights")
+
+
+def _shared(text: str) -> str:
+    if text not in ("survey", "map"):  # argparse's own `choices` have no way to say that none is allowed, too
+        raise argparse.ArgumentTypeError(f"{text}: name survey, map, or none for both")
+    return text
+
+
+def _domain(text: str) -> int:
+    number = int(text)
+    if not 0 <= number <= MOST_DOMAIN:
+        raise argparse.ArgumentTypeError(f"{text}: ROS 2 has domains 0 to {MOST_DOMAIN}")
+    return number
+
+
+def _hertz(text: str) -> float:
+    rate = float(text)
+    if not 0.1 <= rate <= 50.0:
+        raise argparse.ArgumentTypeError(f"{text} Hz: name 0.1 to 50")
+    return rate
+
+
+def _megabytes(text: str) -> float:
+    size = float(text)
+    if not 0.0 <= size < 1e12:
+        raise argparse.ArgumentTypeError(f"{text} MB: name 0 (fill the disk) or more")
+    return size
+
+
+def _port(text: str) -> int:
+    number = int(text)
+    if not 0 <= number < 1 << 16:
+        raise argparse.ArgumentTypeError(f"{text}: a port is 1 to 65535; 0: any that is free")
+    return number
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0.0 < seconds < 1e9:
+        raise argparse.ArgumentTypeError(f"{text} s: name more than 0, or leave it out")
+    return seconds
+
+
+def _plan(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("map", type=Path, metavar="MAP", help="floor plan: map_server's YAML or PGM, or a *.lumimap")
+    parser.add_argument("--height", type=float, default=2.5, metavar="M", help="of the lamps above the floor; 2.5")
+    parser.add_argument("--accuracy", type=float, default=0.10, metavar="M", help="wanted from light alone; 0.10")
+    parser.add_argument("--links", type=int, default=4, metavar="N", help="lamps that a place should see; 4")
+    parser.add_argument("--share", type=float, default=95.0, metavar="PERCENT", help="of places where both hold; 95")
+    parser.add_argument("--spacing", type=float, default=0.5, metavar="M", help="between spots for lamps; 0.5")
+    parser.add_argument("--reach", type=float, default=10.0, metavar="M", help="of the lidar; 10")
+    parser.add_argument("--lamps", type=int, metavar="N", help="as many, whatever is wanted")
+    parser.add_argument("--survey", type=Path, metavar="FILE", help="judge these lamps instead, in the map's frame")
+    parser.add_argument(
+        "--out", type=Path, default=Path("plan"), metavar="DIR", help="for lights.toml and plan.png; plan"
+    )
+    cli_parser.config_arguments(parser)
+    parser.set_defaults(body=cli_parser.later("daemon.cli.plan", "main"))
+
+
+def _doctor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    listening(parser)
+    parser.set_defaults(body=cli_parser.loaded("daemon.cli.doctor", "main"))
+
+
+def _export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, metavar="RECORDING", help="recording or dump; or an unfinished MCAP file")
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="ROS 2 messages; needs lumiloop[mcap]")
+    parser.add_argument("--tum", type=Path, metavar="FILE", help="trajectory: stamp x y z qx qy qz qw")
+    parser.add_argument("--kitti", type=Path, metavar="FILE", help="trajectory: 12 numbers of a matrix a line")
+    parser.add_argument("--online", action="store_true", help="trajectories as published, not as known at the end")
+    parser.add_argument("--force", action="store_true", help="replace an MCAP file that is there")
+    cli_parser.config_arguments(parser)
+    parser.set_defaults(body=cli_parser.estimating("taps.mcap.export", "main"))
+
+
+def _record_mcap(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", type=Path, metavar="FILE", help="MCAP file to write")
+    parser.add_argument("--raw", action="store_true", help="also the bytes between daemon and devices")
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after so long; default: when interrupted")
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    parser.add_argument(
+        "--reserve", type=_megabytes, default=200.0, metavar="MB", help="stop while so much is free; default: 200"
+    )
+    listening(parser)
+    parser.set_defaults(body=needing("mcap", "taps.mcap.record", "main"))
+
+
+def _view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", nargs="?", type=Path, metavar="REC", help="a recording or a log; default: the daemon")
+    parser.add_argument("--bind", default="127.0.0.1", metavar="ADDR", help="address to serve at; default: %(default)s")
+    parser.add_argument("--port", type=_port, default=8090, help="default: %(default)s; 0: any that is free")
+    parser.add_argument("--write", action="store_true", help="take orders from those who have the token")
+    parser.add_argument("--token", type=Path, metavar="FILE", help="that holds the token; default: a new one each time")
+    listening(parser)
+    parser.set_defaults(body=needing("view", "taps.view.command", "main"))
+
+
+def listening(parser: argparse.ArgumentParser) -> None:
+    """The options that say which daemon to listen to; ``args.stream``: Path or None for the configuration's."""
+    parser.add_argument(
+        "--stream", type=Path, metavar="SOCKET", help="the daemon's local stream; default: that of the configured name"
+    )
+    cli_parser.config_arguments(parser)
+
+
+def needing(extra: str, module: str, name: str) -> cli_parser.Body:
+    """A body that resolves the configuration and then loads its module, which needs an extra of the package."""
+
+    def body(args: argparse.Namespace) -> int:
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing in OURS:
+                raise
+            return cli_parser.fail(f"this command needs {missing}, which is not installed: {how_to_install(extra)}")
+        return cli_parser.loaded(module, name)(args)
+
+    return cli_parser.configured(body)

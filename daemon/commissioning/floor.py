@@ -1,0 +1,165 @@
+"""A floor plan as a planner needs it: what is solid, where a robot can be, where a lamp can hang."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from daemon.maps.map_server import BadMapServer, Trinary, load
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+CELL_M: Final = 0.1
+"""Of the plan; finer pictures are made coarser."""
+CLEARANCE_M: Final = 0.3
+"""A robot's middle keeps so far from walls."""
+FURNITURE_M: Final = 1.5
+"""What stands alone and is no longer than this does not reach the ceiling: light passes over it."""
+LEAST_AREA_M2: Final = 1.0
+"""Free spots smaller than this are flaws of the picture."""
+MOST_PLACES: Final = 5000
+FINEST_M: Final = 0.25
+
+
+class NoHall(Exception):
+    """The plan cannot be used; the text says why, and what to do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hall:
+    """Rows are from below, in the plan's own frame, whose corner and turn in the map frame are ``origin``.
+
+    Attributes:
+        origin: (x, y, yaw), m and rad. cell: m. solid: stops a laser. tall: stops light, too.
+        places: (n, 2) m in the plan's frame, where a robot can be, on a grid of ``step`` m. spots: (m, 2), where lamps
+            can hang.
+    """
+
+    origin: tuple[float, float, float]
+    cell: float
+    solid: Mask
+    tall: Mask
+    places: Array
+    step: float
+    spots: Array
+
+    def in_map(self, xy: Array) -> Array:
+        """Points of the plan's frame in the map frame."""
+        x, y, yaw = self.origin
+        c, s = math.cos(yaw), math.sin(yaw)
+        return np.column_stack((x + c * xy[:, 0] - s * xy[:, 1], y + s * xy[:, 0] + c * xy[:, 1]))
+
+
+def read_hall(path: Path, spacing: float) -> Hall:
+    """The plan in a picture of map_server's (its YAML file, or the picture beside it), or in a map file.
+
+    ``spacing`` is between spots for lamps, m.
+
+    Raises:
+        NoHall: it cannot be used.
+    """
+    if path.suffix == ".lumimap":
+        return hall_of(*_of_map(path), spacing)
+    if path.is_dir():
+        raise NoHall(f"{path}: is a folder; name the picture in it, its YAML, or a map file, *.lumimap")
+    if not path.exists():
+        raise NoHall(f"{path}: no such file; name map_server's picture, its YAML, or a map file, *.lumimap")
+    yaml = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
+    if not yaml.exists():
+        raise NoHall(f"{path}: {yaml.name}, which says how large a pixel is, is not beside it")
+    try:
+        described, cells = load(yaml)
+    except BadMapServer as error:
+        raise NoHall(str(error)) from error
+    return hall_of(cells, described.resolution, described.origin, spacing)
+
+
+def _of_map(path: Path) -> tuple[Trinary, float, tuple[float, float, float]]:
+    from daemon.cli.map_convert import grid_of
+    from daemon.maps.container import BadMap
+    from daemon.maps.edit import opened
+    from daemon.maps.image import image_from
+    from daemon.replay.results import greys
+
+    try:
+        grid = grid_of(image_from(opened(path)))
+    except (BadMap, OSError) as error:
+        raise NoHall(str(error)) from error
+    grey = greys(grid)[::-1]
+    cells = np.where(grey == 0, 1, np.where(grey == 254, 0, -1)).astype(np.int8)
+    return cells, grid.resolution, (float(grid.origin[0]), float(grid.origin[1]), 0.0)
+
+
+def hall_of(cells: Trinary, resolution: float, origin: tuple[float, float, float], spacing: float) -> Hall:
+    """The plan that cells (1 occupied, 0 free, -1 unknown; rows from below) make.
+
+    Raises:
+        NoHall: there is no place for a robot in it.
+    """
+    solid, free, cell = _coarser(cells, resolution)
+    room = ndimage.distance_transform_edt(free) * cell > CLEARANCE_M
+    regions, _ = ndimage.label(room)
+    large = np.bincount(regions.ravel()) * cell**2 >= LEAST_AREA_M2
+    large[0] = False
+    room = large[regions]
+    if not room.any():
+        raise NoHall(
+            "no place in the plan is free enough for a robot; is the picture the right one, or `negate` wrong?"
+        )
+    area = float(room.sum()) * cell**2
+    step = cell * max(round(FINEST_M / cell), math.ceil(math.sqrt(area / MOST_PLACES) / cell), 1)
+    spots = _on_grid(free, cell, max(spacing, cell))
+    return Hall(origin, cell, solid, _tall(solid, cell), _on_grid(room, cell, step), step, spots)
+
+
+def _coarser(cells: Trinary, resolution: float) -> tuple[Mask, Mask, float]:
+    """Solid and free at some :data:`CELL_M`: a block is solid if anything in it is, free if half of it is known so."""
+    k = max(1, round(CELL_M / resolution))
+    rows, columns = -(-cells.shape[0] // k), -(-cells.shape[1] // k)
+    padded = np.full((rows * k, columns * k), -1, np.int8)
+    padded[: cells.shape[0], : cells.shape[1]] = cells
+    blocks = padded.reshape(rows, k, columns, k)
+    solid = (blocks == 1).any(axis=(1, 3))
+    free = ((blocks == 0).mean(axis=(1, 3)) >= 0.5) & ~solid
+    return solid, free, resolution * k
+
+
+def _tall(solid: Mask, cell: float) -> Mask:
+    """Without what is no wall: small things that stand alone."""
+    labels, _ = ndimage.label(solid, structure=np.ones((3, 3)))
+    tall = solid.copy()
+    for number, where in enumerate(ndimage.find_objects(labels), 1):
+        if max(part.stop - part.start for part in where) * cell <= FURNITURE_M:
+            tall[where] &= labels[where] != number
+    return tall
+
+
+def _on_grid(mask: Mask, cell: float, step: float) -> Array:
+    """Middles of cells of the mask, ``step`` apart; a part that the grid misses has its middle-most cell."""
+    k = max(1, round(step / cell))
+    chosen = np.zeros_like(mask)
+    chosen[k // 2 :: k, k // 2 :: k] = mask[k // 2 :: k, k // 2 :: k]
+    row, column = np.nonzero(chosen)
+    if not len(row):
+        row, column = (part[:1] for part in np.nonzero(mask))
+    return np.column_stack(((column + 0.5) * cell, (row + 0.5) * cell))
+
+
+def clear(blocked: Mask, cell: float, start: Array, ends: Array) -> Mask:
+    """(n,) whether the straight way from ``start`` (2,) to each of ``ends`` (n, 2) crosses nothing that is blocked."""
+    if not len(ends):
+        return np.zeros(0, np.bool_)
+    longest = float(np.hypot(*(ends - start).T).max())
+    t = np.linspace(0.0, 1.0, max(2, math.ceil(1.5 * longest / cell)))
+    column = ((start[0] + np.outer(t, ends[:, 0] - start[0])) / cell).astype(np.int64)
+    row = ((start[1] + np.outer(t, ends[:, 1] - start[1])) / cell).astype(np.int64)
+    inside = (row >= 0) & (row < blocked.shape[0]) & (column >= 0) & (column < blocked.shape[1])
+    hit = inside & blocked[np.clip(row, 0, blocked.shape[0] - 1), np.clip(column, 0, blocked.shape[1] - 1)]
+    return np.asarray(~hit.any(axis=0))

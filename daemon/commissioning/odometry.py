@@ -1,0 +1,101 @@
+"""`lumiloop calibrate REC --odometry --lidar-mount`: wheels and laser mount, as text, configuration and picture."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from typing import Final
+
+import numpy as np
+from msgspec.structs import replace
+
+from daemon.cli import parser
+from daemon.commissioning.fit_plot import draw_wheels
+from daemon.commissioning.teach_drive import Drive, poses_at
+from daemon.config import loader
+from daemon.config.schema import Config
+from estimator.calibration.odometry_calibration import Wheel, WheelFit, fit_wheels, on_base
+from hal.errors import DataInvalid
+
+_ODOMETRY: Final = (Wheel.SCALE, Wheel.TURN, Wheel.DRIFT)
+_MOUNT: Final = (Wheel.MOUNT_X, Wheel.MOUNT_Y, Wheel.MOUNT_YAW)
+
+
+def calibrate_wheels(drive: Drive, args: argparse.Namespace) -> int:
+    """Fit, say it, and write configuration and picture; returns the exit code.
+
+    Args:
+        drive: with odometry in it.
+        args: ``odometry``, ``lidar_mount``: what is asked for; ``out``, ``force``: where the configuration goes.
+
+    Raises:
+        DataInvalid: no odometry in the recording, or too little motion.
+        ConfigError: the configuration cannot be written, or is there.
+    """
+    fit = fit_drive(drive)
+    found = findings(fit, args.odometry, args.lidar_mount)
+    config = with_mount(drive.config, fit) if args.lidar_mount else drive.config
+    sys.stdout.write("\n".join([*found, *(_paste(config) if args.lidar_mount else ())]) + "\n")
+    head = [f"Configuration of the drive {drive.path.name}, calibrated from it (lumiloop calibrate).", *found]
+    loader.write(args.out, config, head, force=args.force)
+    sys.stdout.write(f"written: {args.out}\n{draw_wheels(fit, args.out.with_suffix('.png'))}\n")
+    return parser.OK
+
+
+def findings(fit: WheelFit, odometry: bool, mount: bool) -> list[str]:
+    """What the drive told of what was asked for, for people."""
+    pair = [f"{1e3 * way:.1f} mm {_deg(turn):.3f} deg" for way, turn in (fit.before, fit.after)]
+    lines = [f"{fit.steps} steps; wheels against laser, rms: {pair[0]} before, {pair[1]} after"]
+    if odometry:
+        lines += [_line(fit, which) for which in _ODOMETRY]
+        lines.append("multiply the wheels' radii by `scale`, and the track by `scale / turn`")
+    return lines + [_line(fit, which) for which in _MOUNT if mount]
+
+
+def with_mount(config: Config, fit: WheelFit) -> Config:
+    """The same configuration with the laser where the drive found it."""
+    x, y, yaw = fit.value[Wheel.MOUNT_X :]
+    place = replace(
+        config.lidar.mount, x=_rounded(x, 4), y=_rounded(y, 4), yaw=_rounded(math.remainder(_deg(yaw), 360.0), 3)
+    )
+    return replace(config, lidar=replace(config.lidar, mount=place))
+
+
+def _rounded(value: float, decimals: int) -> float:
+    return round(float(value), decimals) + 0.0  # no -0.0
+
+
+def _paste(config: Config) -> list[str]:
+    mount = config.lidar.mount
+    return ["", "[lidar.mount]", f"x = {mount.x:.4f}", f"y = {mount.y:.4f}", f"yaw = {mount.yaw:.3f}", ""]
+
+
+def fit_drive(drive: Drive) -> WheelFit:
+    """Wheels against laser over the whole drive; raises `DataInvalid`."""
+    if len(drive.readings) < 2:
+        raise DataInvalid(str(drive.path), "no odometry in it", "record with odometry.port set and readings sent to it")
+    stamps, first = np.unique(drive.readings[:, 0], return_index=True)
+    wheels = drive.readings[first, 1:].copy()
+    wheels[:, 2] = np.unwrap(wheels[:, 2])
+    laser_t = drive.poses.stamps
+    inside = (laser_t >= stamps[0]) & (laser_t <= stamps[-1])
+    said = np.column_stack([np.interp(laser_t[inside], stamps, wheels[:, k]) for k in range(3)])
+    base, _ = poses_at(drive.poses, laser_t[inside])
+    try:
+        return fit_wheels(said, on_base(base, drive.mount), drive.mount)
+    except ValueError as error:
+        raise DataInvalid(str(drive.path), str(error), "turn on the spot and drive some curves, both ways") from error
+
+
+def _line(fit: WheelFit, which: Wheel) -> str:
+    value, sigma = fit.value[which], fit.sigma[which]
+    unit = {Wheel.DRIFT: " deg/m", Wheel.MOUNT_YAW: " deg", Wheel.MOUNT_X: " m", Wheel.MOUNT_Y: " m"}.get(which, "")
+    if unit.startswith(" deg"):
+        value, sigma = _deg(value), _deg(sigma)
+    told = "" if fit.told[which] else "  not told by this drive"
+    return f"{which.name.lower():<10} {value:>9.4f} +-{sigma:.4f}{unit}{told}"
+
+
+def _deg(rad: float) -> float:
+    return math.degrees(float(rad))

@@ -1,0 +1,166 @@
+"""A recorded teach drive: where the robot was, by laser alone, and what it received of each lamp there.
+
+The poses are those of a replay without lights, as the map stands at its end: what is to be calibrated has no part in
+them. The light is decoded once more from the recorded blocks, as far as a computer without a robot to drive can afford.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from daemon.cli.replay import Given, config_for, lights_for
+from daemon.config.schema import Config
+from daemon.devices.conversion import SampleBridge
+from daemon.replay.results import Trajectory
+from daemon.replay.runner import Rerun
+from daemon.replay.sources import Source, open_log
+from estimator.calibration.lamp_mapping import Heard
+from estimator.calibration.observations import Rows
+from estimator.cdma import decoder as cdma_decoder
+from estimator.cdma.air_interface import Profile
+from estimator.cdma.epoch import UNUSABLE, LightEpoch
+from estimator.light_filter.survey import Survey
+from estimator.measurements import Array
+from hal.adc import RawSamples
+from hal.errors import DataInvalid, HalError
+from hal.odometry import RawOdometry
+
+SEARCH_CODES: Final = 2000
+"""Effort per block; a replay has no cycle to keep."""
+GAP_S: Final = 0.3
+"""A strength between two poses farther apart than this has no place."""
+
+
+@dataclass(slots=True, eq=False)
+class Drive:
+    """What a recording holds.
+
+    Attributes:
+        path: of the recording. poses: T_map_base by laser, with stamps. survey: as it was when recorded.
+        epochs: decoded, with stamps of their middles on the same clock.
+        readings: of the wheels, (n, 4) stamp, x, y, yaw.
+        config: the recording's, or the one that was asked for.
+        profile: air interface of the light, None without a photodiode.
+        stopped: why reading ended early, empty otherwise.
+    """
+
+    path: Path
+    poses: Trajectory
+    survey: Survey
+    epochs: list[tuple[float, LightEpoch]] = field(default_factory=list)
+    readings: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    config: Config = field(default_factory=Config)
+    profile: Profile | None = None
+    stopped: str = ""
+
+    @property
+    def mount(self) -> Array:
+        """(3,) x, y, yaw of the laser on the robot, as the poses were computed with; m and rad."""
+        mount = self.config.lidar.mount
+        return np.array((mount.x, mount.y, np.radians(mount.yaw)))
+
+
+def read_drive(path: Path, settings: Config, given: Given) -> Drive:
+    """Replay a recording for its poses and decode its light.
+
+    Raises:
+        HalError: it cannot be opened, has no scans, or what it says of lights is not of this version.
+    """
+    source = open_log(path)
+    used = config_for(source, settings, given)
+    lights = lights_for(source, used, given)
+    drive = Drive(path, Trajectory(np.zeros(0), np.zeros((0, 3))), Survey() if lights is None else lights.survey)
+    drive.config, drive.profile = used, None if lights is None else lights.profile
+    rerun, readings = Rerun(source, used), []
+    bridge = None if lights is None else SampleBridge(lights.profile)
+    decoder = None if lights is None else cdma_decoder.new_decoder(lights.profile, lights.clock_ppm)
+    try:
+        for event in source.events():
+            if isinstance(event, RawSamples):
+                block = None if bridge is None else bridge.block(event)
+                if block is not None and decoder is not None:
+                    epoch = cdma_decoder.decode(decoder, block)
+                    cdma_decoder.search(decoder, SEARCH_CODES)
+                    drive.epochs.append((source.utc(0.5 * (epoch.t_begin + epoch.t_end)), epoch))
+                continue
+            if isinstance(event, RawOdometry):
+                readings.append((source.utc(event.t_mono), event.x, event.y, event.yaw))
+            rerun.feed(event)
+    except HalError as error:
+        drive.stopped = str(error)
+    rerun.finish()
+    drive.poses, drive.readings = rerun.ledger.final(), np.array(readings).reshape(-1, 4)
+    _check(source, drive)
+    return drive
+
+
+def _check(source: Source, drive: Drive) -> None:
+    if len(drive.poses.stamps) < 2:
+        remedy = "record the drive with the lidar on: where the robot was is taken from the laser"
+        raise DataInvalid(str(source.path), f"{source.kind} without scans that gave a pose", remedy)
+
+
+def heard(drive: Drive) -> Heard:
+    """Every strength that was received plainly, at the pose of its instant.
+
+    Raises:
+        DataInvalid: no light at all was decoded.
+    """
+    parts = [part for stamp, epoch in drive.epochs for part in _strengths(stamp, epoch)]
+    if not parts:
+        remedy = (
+            "a teach drive needs the photodiode configured (photodiode.bus) and lamps in view; see docs/calibration.md"
+        )
+        raise DataInvalid(str(drive.path), "no light of any lamp was decoded in it", remedy)
+    t, code, amplitude, sigma, name = np.array(parts).T
+    pose, known = poses_at(drive.poses, t)
+    rows = Rows(pose[known], code[known].astype(np.int64), amplitude[known], sigma[known], t[known])
+    return Heard(rows, name[known].astype(np.int64))
+
+
+def _strengths(stamp: float, epoch: LightEpoch) -> Iterator[tuple[float, ...]]:
+    """Stamp, code, amplitude, sigma of its ln and lamp ID (-1: unknown) of each link without a flag."""
+    if epoch.block & UNUSABLE:
+        return
+    columns = (epoch.ids.tolist(), epoch.amplitude.tolist(), epoch.variance.tolist(), epoch.flags.tolist())
+    for code, amplitude, variance, flag, frame in zip(*columns, epoch.lamps, strict=True):
+        if flag == 0 and amplitude > 0.0:
+            yield stamp, code, amplitude, variance**0.5 / amplitude, -1 if frame is None else frame.lamp_id
+
+
+def poses_at(trajectory: Trajectory, t: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Poses (n, 3) at stamps, between those there are; and (n,) whether there are poses near enough."""
+    order = np.argsort(trajectory.stamps, kind="stable")
+    stamps, poses = trajectory.stamps[order], trajectory.poses[order]
+    yaw = np.unwrap(poses[:, 2])
+    after = np.clip(np.searchsorted(stamps, t), 1, len(stamps) - 1)
+    between = (stamps[after - 1] <= t) & (t <= stamps[after]) & (stamps[after] - stamps[after - 1] < GAP_S)
+    columns = [np.interp(t, stamps, values) for values in (poses[:, 0], poses[:, 1], yaw)]
+    return np.column_stack(columns), between
+
+
+def rows_for(survey: Survey, strengths: Heard, T_survey_drive: Array) -> Rows:
+    """Rows of the survey's lamps: by the number a lamp said, else by code and the nearest such lamp.
+
+    ``rows.lamp`` counts the survey's lamps; poses stay in the drive's frame. Strengths of codes that the survey does
+    not know are left out.
+    """
+    x, y, yaw = T_survey_drive
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose = strengths.rows.pose
+    there = np.column_stack((x + c * pose[:, 0] - s * pose[:, 1], y + s * pose[:, 0] + c * pose[:, 1]))
+    best, far = np.full(len(pose), -1, dtype=np.int64), np.full(len(pose), np.inf)
+    for k, lamp in enumerate(survey.lamps):
+        mine = (strengths.rows.lamp == lamp.code) & ((strengths.lamp_id < 0) | (strengths.lamp_id == lamp.lamp_id))
+        distance = np.hypot(there[:, 0] - lamp.x, there[:, 1] - lamp.y)
+        nearer = mine & (distance < far)
+        best[nearer], far[nearer] = k, distance[nearer]
+    known = best >= 0
+    rows = strengths.rows.chosen(known)
+    return Rows(rows.pose, best[known], rows.amplitude, rows.sigma, rows.t)

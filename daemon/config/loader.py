@@ -1,0 +1,229 @@
+"""Reads, explains and prints the configuration tree.
+
+All errors are told at once (`daemon/config/errors.py` has the words). What is printed (``--print-config``, the
+reference in the documentation) can be pasted back.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from daemon.config.endpoints import AUTO
+from daemon.config.errors import MOVED, Option, Wrong, line_of, options, problems, value_text
+from daemon.config.schema import Config
+from daemon.system.atomic_file import write_whole
+
+__all__ = [
+    "MOVED",
+    "REFERENCE_HEAD",
+    "ConfigError",
+    "Option",
+    "brought_up",
+    "dump",
+    "load",
+    "options",
+    "reference",
+    "refuse_overwriting",
+    "schema",
+    "value_text",
+    "write",
+]
+
+REFERENCE_HEAD: Final = """\
+# Configuration
+
+Generated from the configuration tree by `lumiloop --reference`; a test keeps it current.
+
+One TOML file holds everything, and every key has a default: an empty file is a valid configuration. Unknown keys and
+wrong values are refused, all at once, each with the file, the line, the key, what was found, what is allowed and an
+example. `lumiloop check FILE` says whether a file is good, `lumiloop check FILE --print-config` prints every value that
+results, and `lumiloop --schema` prints a JSON schema for editors. `--set KEY=VALUE` on the command line overrules the
+file.
+
+All keys with their defaults, ready to paste:
+
+"""
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; each line of the text says where, what was expected and what to do.
+
+    Attributes:
+        rest: the configuration without what is wrong; None: nothing is left that could be judged.
+        wrong: the keys that are.
+    """
+
+    def __init__(self, text: str, rest: Config | None = None, wrong: frozenset[str] = frozenset()) -> None:
+        super().__init__(text)
+        self.rest, self.wrong = rest, wrong
+
+
+def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
+    """Read a file (None: defaults only), lay ``KEY=VALUE`` overrides over it, and check the result.
+
+    Raises:
+        ConfigError: unreadable, not TOML, unknown keys, or wrong values; all of them, a line each.
+    """
+    text = _read(file) if file is not None else ""
+    name = str(file) if file is not None else "built-in defaults"
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        at = re.search(r" \(at line (\d+), column \d+\)$", str(error))
+        place = f"{name}:{at[1]}" if at else name
+        raise ConfigError(f"{place}: not valid TOML: {error}") from None
+    found = problems(tree, name, text)
+    for override in overrides:
+        try:
+            _lay_over(tree, override)
+        except ConfigError as error:
+            found.append(Wrong(str(error), ""))
+        else:
+            found += problems(tree, f"--set {override}")
+    if found:
+        told = "\n".join(wrong.text for wrong in found)
+        raise ConfigError(told, _rest(tree, file), frozenset(wrong.path for wrong in found))
+    return _anchored(msgspec.convert(tree, Config), file)
+
+
+def _rest(tree: dict[str, Any], file: Path | None) -> Config | None:
+    try:
+        return _anchored(msgspec.convert(tree, Config), file)
+    except msgspec.ValidationError:
+        return None  # what is wrong is not one key, which could be left out
+
+
+def _anchored(config: Config, file: Path | None) -> Config:
+    """The same with paths as seen from the configuration file, not from wherever the process runs."""
+    if file is None:
+        return config
+    here = file.resolve().parent  # an absolute path stays what it is
+    if config.lights.survey:
+        lights = msgspec.structs.replace(config.lights, survey=str(here / config.lights.survey))
+        config = msgspec.structs.replace(config, lights=lights)
+    if config.map.folder and config.map.kept:
+        config = msgspec.structs.replace(
+            config, map=msgspec.structs.replace(config.map, folder=str(here / config.map.folder))
+        )
+    return config
+
+
+def naming(file: Path | None, key: str, path: Path) -> str:
+    """Who names a file that is wrong: ``FILE:LINE`` and the key; the key alone where ``--set`` names it."""
+    try:
+        text = file.read_text("utf-8") if file is not None else ""
+        told: Any = tomllib.loads(text)
+        for part in key.split("."):
+            told = told[part]
+        if file is not None and (file.resolve().parent / told) == path and (line := line_of(text, key)):
+            return f"{file}:{line} names it: `{key}`"
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # what is wrong with the configuration itself is told elsewhere
+    return f"`{key}` names it"
+
+
+def brought_up(tree: dict[str, Any]) -> dict[str, Any]:
+    """The resolved tree of an earlier version, as recordings hold it, in the keys of this one."""
+    lidar = dict(tree.get("lidar", {}))
+    serial, baud = lidar.pop("serial", ""), lidar.pop("baud", 0)
+    device = lidar.get("device", AUTO)
+    if serial and device == AUTO:
+        lidar["device"] = f"{AUTO}:{serial}"
+    elif baud and str(device).startswith("/"):
+        lidar["device"] = f"{device}@{baud}"
+    return tree | {"lidar": lidar} if lidar else tree
+
+
+def dump(config: Config) -> str:
+    """The whole resolved tree as TOML; reading it back yields an equal tree."""
+    lines: list[str] = []
+    _dump_table(msgspec.to_builtins(config), "", lines)
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def write(path: Path, config: Config, notes: Sequence[str] = (), force: bool = False) -> None:
+    """Write the whole resolved tree as a file, whole or not at all; `load` reads it back as an equal tree.
+
+    Args:
+        path: where to.
+        config: what.
+        notes: lines of comment at the head.
+        force: replace a file that is there.
+
+    Raises:
+        ConfigError: there is such a file already, or it cannot be written.
+    """
+    refuse_overwriting(path, force)
+    head = "".join(f"# {note}".rstrip() + "\n" for note in notes)
+    try:
+        write_whole(path, f"{head}\n{dump(config)}".lstrip("\n").encode())
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}; free space or name another file") from error
+
+
+def refuse_overwriting(path: Path, force: bool) -> None:
+    """Raises `ConfigError` where there is a file that nobody asked to be replaced."""
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists: name another file with --out, or ask for it to be replaced with --force")
+
+
+def schema() -> str:
+    """JSON schema of the tree (2020-12), for editors that complete and check TOML."""
+    return msgspec.json.format(msgspec.json.encode(msgspec.json.schema(Config)), indent=2).decode() + "\n"
+
+
+def reference() -> str:
+    """The documentation page: every key with its meaning, its range and its default."""
+    lines: list[str] = []
+    table = ""
+    for option in options():
+        parent, _, key = option.path.rpartition(".")
+        if parent != table:
+            table = parent
+            lines += ["", f"[{parent}]"]
+        lines += [f"# {option.description} ({option.kind})", f"{key} = {value_text(option.default)}"]
+    return REFERENCE_HEAD + "```toml\n" + "\n".join(lines) + "\n```\n"
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_bytes().decode()
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such file (name an existing one, or leave --config out for defaults)") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: not UTF-8 text at byte {error.start}") from None
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+
+
+def _lay_over(tree: dict[str, Any], override: str) -> None:
+    path, equals, text = override.partition("=")
+    if not equals or not path.strip():
+        raise ConfigError(f"--set {override}: expected KEY=VALUE, for example --set modbus.port=1502")
+    try:
+        value: object = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text  # a bare word is a string, so that a shell needs no second quotes
+    *parents, key = path.strip().split(".")
+    for parent in parents:
+        child = tree.setdefault(parent, {})
+        if not isinstance(child, dict):
+            raise ConfigError(f"--set {override}: `{parent}` is a value, not a table of keys")
+        tree = child
+    tree[key] = value
+
+
+def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
+    plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    if prefix:
+        lines += ["", f"[{prefix}]"]
+    lines += [f"{key} = {value_text(value)}" for key, value in plain.items()]
+    for key, value in table.items():
+        if key not in plain:
+            _dump_table(value, f"{prefix}.{key}".lstrip("."), lines)

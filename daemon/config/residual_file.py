@@ -1,0 +1,107 @@
+"""Residual maps as files beside the survey: arrays with a version, a checksum, and the survey they belong to.
+
+``lights.toml`` has its map in ``lights.residuals.npz``. A map is only good with the survey it was learned with; one
+that does not belong to it, is damaged, or is of another version is refused by name and the robot drives without.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from daemon.config.survey_loader import dump
+from daemon.system.atomic_file import write_whole
+from estimator.light_filter.residual_map import ResidualMap
+from estimator.light_filter.survey import Survey
+
+VERSION: Final = 1
+_DAMAGE: Final = (
+    *(OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+"""What zip and numpy raise for bytes that are not what they should be."""
+_ARRAYS: Final = ("lamp_ids", "grid", "mean", "sigma", "noise")
+
+
+class ResidualError(Exception):
+    """The map cannot be used or written; the text says why and what to do."""
+
+
+def write_residuals(path: Path, residuals: ResidualMap, survey: Survey) -> None:
+    """Write a map whole or not at all; raises `ResidualError`."""
+    arrays = {
+        "lamp_ids": np.array(residuals.lamp_ids, dtype=np.int64),
+        "grid": residuals.grid,
+        "mean": residuals.mean,
+        "sigma": residuals.sigma,
+        "noise": np.array([residuals.noise]),
+    }
+    file = io.BytesIO()
+    facts = {"version": np.array([VERSION]), "survey": np.array(digest(survey)), "check": np.array(_check(arrays))}
+    np.savez_compressed(file, allow_pickle=False, **arrays, **facts)
+    try:
+        write_whole(path, file.getvalue())
+    except OSError as error:
+        raise ResidualError(f"cannot write {path}: {error.strerror}; free space or name another folder") from error
+
+
+def read_residuals(path: Path, survey: Survey) -> ResidualMap | None:
+    """The map beside a survey; None where there is none.
+
+    Raises:
+        ResidualError: damaged, of another version, or learned with another survey.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ResidualError(f"{path}: not a residual map ({error}); {_AGAIN}") from error
+    return unpack(content, survey, str(path))
+
+
+def unpack(content: bytes, survey: Survey, path: str) -> ResidualMap:
+    """A map from a file's content; ``path`` names it in errors.
+
+    Raises:
+        ResidualError: see :func:`read_residuals`.
+    """
+    try:
+        # numpy leaves a file open that it cannot make sense of
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            kept = {name: file[name] for name in (*_ARRAYS, "version", "survey", "check")}
+    except _DAMAGE as error:
+        raise ResidualError(f"{path}: not a residual map ({error}); {_AGAIN}") from error
+    if kept["version"].tolist() != [VERSION]:
+        raise ResidualError(f"{path}: of version {kept['version'].tolist()}, this is {VERSION}; {_AGAIN}")
+    arrays = {name: kept[name] for name in _ARRAYS}
+    if str(kept["check"]) != _check(arrays):
+        raise ResidualError(f"{path}: damaged (its checksum does not fit); {_AGAIN}")
+    if str(kept["survey"]) != digest(survey):
+        raise ResidualError(f"{path}: was learned with another survey than the one beside it; {_AGAIN}")
+    grid, mean, sigma = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("grid", "mean", "sigma"))
+    return ResidualMap(tuple(arrays["lamp_ids"].tolist()), grid, mean, sigma, float(arrays["noise"][0]))
+
+
+_AGAIN: Final = "delete it, or calibrate again"
+
+
+def digest(survey: Survey) -> str:
+    """Of what the survey says, comments and layout apart."""
+    return hashlib.sha256(dump(survey).encode()).hexdigest()
+
+
+def _check(arrays: dict[str, np.ndarray]) -> str:
+    total = hashlib.sha256()
+    for name in _ARRAYS:
+        array = np.ascontiguousarray(arrays[name])
+        total.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()

@@ -1,0 +1,237 @@
+"""From device units to SI: the only place where steps, range units and foreign clocks become metres, frames and t_mono.
+
+What a device reports stays three-valued on its way: a distance, nothing up to a bound, or no statement at all.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from daemon.config.schema import LidarConfig
+from estimator.cdma.air_interface import Profile
+from estimator.measurements import Array, Beam, Imu, Odometry, SampleBlock, Scan
+from estimator.numerics import se2
+from hal.adc import Blemish, RawSamples
+from hal.imu import RawImu
+from hal.lidar import VALID, LidarGeometry, RawScan
+from hal.odometry import RawOdometry
+
+
+@dataclass(frozen=True, slots=True)
+class RangeFacts:
+    """What a data sheet says about a model's ranges and the device itself does not.
+
+    Attributes:
+        sigma_m: one-sigma repeatability over the range that matters indoors.
+        free_m: range up to which even a dark surface (10 % diffuse reflectance) returns an echo, so that "no return"
+            says that nothing is there; 0 where the data sheet does not promise it.
+    """
+
+    sigma_m: float
+    free_m: float = 0.0
+
+
+FACTS: Final[tuple[tuple[str, RangeFacts], ...]] = (
+    (r"UST-20LX", RangeFacts(0.03, 8.0)),
+    (r"UST-", RangeFacts(0.03, 4.0)),
+    (r"UTM-30LX|UXM-30LX", RangeFacts(0.01)),
+    (r"URG-04LX|UBG-04LX", RangeFacts(0.01)),
+    (r"UHG-08LX", RangeFacts(0.02)),
+)
+"""By model name as the device reports it; HOKUYO data sheets, "repeated accuracy" and "detection range"."""
+UNKNOWN_MODEL: Final = RangeFacts(0.02)
+
+
+def range_facts(model: str) -> RangeFacts:
+    """Facts of a model, cautious ones for a model that nobody has described."""
+    return next((facts for pattern, facts in FACTS if re.search(pattern, model)), UNKNOWN_MODEL)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sweep:
+    """What is the same for every scan of one geometry."""
+
+    bearing_rad: Array
+    unmasked: npt.NDArray[np.bool_]
+    duration_s: float
+    facts: RangeFacts
+
+
+class ScanBridge:
+    """Turns raw scans into SI scans; holds nothing but arrays that follow from configuration and geometry."""
+
+    def __init__(self, config: LidarConfig) -> None:
+        mount = config.mount
+        self._config = config
+        self._sweeps: dict[tuple[LidarGeometry, int, int, int], _Sweep] = {}
+        self.T_base_lidar = np.array((mount.x, mount.y, math.radians(mount.yaw)))
+        """Mount of the lidar on the robot; a log's own mount may be put here before the first scan."""
+
+    def scan(self, raw: RawScan) -> Scan:
+        """The same scan in SI units: mount, inversion, mask and the meaning of codes applied."""
+        sweep = self._sweep(raw)
+        unit = raw.geometry.range_unit_m
+        range_m: Array = raw.ranges * np.float64(unit)
+        hit = (raw.code == VALID) & sweep.unmasked
+        hit &= range_m >= self._config.mask.near
+        beam = hit.view(np.uint8)  # HIT or NONE
+        if sweep.facts.free_m > 0.0:
+            free = (raw.code > raw.geometry.dmax) & sweep.unmasked
+            beam[free] = Beam.FREE
+            range_m[free] = sweep.facts.free_m
+        return Scan(
+            t_begin=raw.t_mono,
+            t_end=raw.t_mono + sweep.duration_s,
+            seq=raw.seq,
+            T_base_lidar=self.T_base_lidar,
+            bearing_rad=sweep.bearing_rad,
+            range_m=range_m,
+            beam=beam,
+            sigma_m=sweep.facts.sigma_m,
+            intensity=None if raw.intensity is None else raw.intensity.astype(np.float64),
+        )
+
+    def _sweep(self, raw: RawScan) -> _Sweep:
+        key = (raw.geometry, raw.first_step, raw.stride, len(raw.ranges))
+        if key not in self._sweeps:
+            self._sweeps = {key: self._make_sweep(*key)}
+        return self._sweeps[key]
+
+    def _make_sweep(self, geometry: LidarGeometry, first_step: int, stride: int, count: int) -> _Sweep:
+        bearing = geometry.bearings(first_step, stride, count)
+        unmasked = np.ones(count, dtype=bool)
+        for begin, end in self._config.mask.sectors:
+            unmasked &= ~in_sector(np.degrees(bearing), begin, end)
+        if self._config.mount.inverted:
+            bearing = -bearing  # turned over about its own front axis
+        duration = geometry.beam_dt_s * stride * max(0, count - 1)
+        return _Sweep(bearing, unmasked, duration, range_facts(geometry.model))
+
+
+def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bool_]:
+    """Which bearings lie in the sector counter-clockwise from ``begin`` to ``end``, ends included; all in degrees."""
+    if abs(end - begin) >= 360.0:
+        return np.ones(len(bearing_deg), dtype=bool)
+    slack = 1e-9  # a bearing equal to an end must not be lost to rounding
+    return np.asarray((bearing_deg - begin + slack) % 360.0 <= (end - begin) % 360.0 + 2.0 * slack)
+
+
+class OdometryBridge:
+    """Turns cumulative odometry into increments of the base, and notices when its sender starts anew.
+
+    Stamps are already on our clock (`RawOdometry.t_mono`); one from the future is cut to its arrival.
+    """
+
+    FASTEST_M_S: Final = 5.0
+    FASTEST_RAD_S: Final = 10.0
+    """Faster than any indoor robot; what exceeds it plus the floor is a jump of the sender, not a motion."""
+    FLOOR_M: Final = 0.3
+    FLOOR_RAD: Final = 0.6
+    LONGEST_S: Final = 2.0
+    """Silence beyond this allows no more motion: a sender that restarts after a pause must still be noticed."""
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self.invalid = 0
+        self._last: tuple[float, Array] | None = None
+
+    def increment(self, raw: RawOdometry) -> Odometry | None:
+        """The motion since the last reading; None for the first one, and after a jump."""
+        if not all(map(math.isfinite, (raw.t_mono, raw.x, raw.y, raw.yaw))):
+            self.invalid += 1
+            return None
+        pose = np.array((raw.x, raw.y, raw.yaw))
+        t_end = min(raw.t_mono, raw.t_rx)
+        if self._last is None:
+            self._last = (t_end, pose)
+            return None
+        t_begin, before = self._last
+        t_end = max(t_begin, t_end)  # stamps may run backwards; the motion is real all the same
+        self._last = (t_end, pose)
+        delta = se2.between(before, pose)
+        if self._jumped(delta, t_end - t_begin):
+            self.jumps += 1
+            return None
+        return Odometry(t_begin, t_end, delta)
+
+    def _jumped(self, delta: Array, seconds: float) -> bool:
+        seconds = min(seconds, self.LONGEST_S)
+        too_far = math.hypot(delta[0], delta[1]) > self.FLOOR_M + self.FASTEST_M_S * seconds
+        return too_far or abs(delta[2]) > self.FLOOR_RAD + self.FASTEST_RAD_S * seconds
+
+
+class ImuBridge:
+    """Turns yaw rates into angles turned between two readings (trapezoid rule)."""
+
+    LONGEST_S: Final = 0.2
+    """A longer gap between readings is no turn that anyone has measured."""
+
+    def __init__(self) -> None:
+        self.invalid = 0
+        self._last: tuple[float, float] | None = None
+
+    def turn(self, raw: RawImu) -> Imu | None:
+        """The angle turned since the last reading; None for the first one, and after a gap."""
+        if not (math.isfinite(raw.yaw_rate) and math.isfinite(raw.t_mono)):
+            self.invalid += 1
+            return None
+        now = min(raw.t_mono, raw.t_rx)
+        last, self._last = self._last, (now, raw.yaw_rate)
+        if last is None or not 0.0 < now - last[0] <= self.LONGEST_S:
+            return None
+        return Imu(last[0], now, 0.5 * (last[1] + raw.yaw_rate) * (now - last[0]))
+
+
+UNFIT: Final = Blemish.SHORT | Blemish.MISALIGNED | Blemish.STUCK
+"""Blocks with one of these are not what the light was; all else is for the decoder to judge."""
+
+MEASURED: Final = 2e-3
+"""How well a driver measures its rate, relative: within this beyond the decoder's reach the decoder decides."""
+
+
+class SampleBridge:
+    """Turns a converter's blocks into blocks on the nominal rate of the air interface, each with its own time base.
+
+    The decoder looks for the sample clock about the nominal rate, so that is what every block is given; a converter
+    beyond the decoder's reach keeps its own rate, and :attr:`off_rate` says so.
+
+    Attributes:
+        unfit, dead, stretched: blocks dropped for their words, those of them that hold one word only, and blocks whose
+            samples may not be evenly spaced.
+        rate_hz: conversions per second of the latest block as measured, 0 before the first.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        self.unfit = self.dead = self.stretched = 0
+        self.rate_hz = 0.0
+        self._profile = profile
+
+    @property
+    def off_rate(self) -> bool:
+        """Whether the converter is clocked so differently that no lamp can be decoded."""
+        return self.rate_hz > 0.0 and not self._reachable(self.rate_hz)
+
+    def block(self, raw: RawSamples) -> SampleBlock | None:
+        """The same block as the decoder takes it; None for words that the light never was."""
+        if raw.blemish & UNFIT or raw.words.size == 0:
+            self.unfit += 1
+            self.dead += Blemish.STUCK in raw.blemish
+            return None
+        self.stretched += Blemish.STRETCHED in raw.blemish
+        self.rate_hz = raw.rate_hz
+        return SampleBlock(
+            t_begin=raw.t_first,
+            t_end=raw.t_first + raw.words.size / raw.rate_hz + raw.slack_s,
+            words=raw.words.astype(np.float64),
+            rate=self._profile.sample_rate if self._reachable(raw.rate_hz) else raw.rate_hz,
+        )
+
+    def _reachable(self, rate_hz: float) -> bool:
+        off = abs(rate_hz / self._profile.sample_rate - 1.0)
+        return off <= 1e-6 * self._profile.clock_ppm + MEASURED

@@ -1,0 +1,1 @@
+"""What is wrong with an installation, and why a recorded moment was as it was."""

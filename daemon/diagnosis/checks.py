@@ -1,0 +1,379 @@
+"""Every check: what is asked, and what follows from the answer. In the order in which one would mend things."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Final
+
+from daemon.cli.check import Maps, implausible, look_at_maps
+from daemon.cli.probe import is_bus
+from daemon.config.endpoints import ANYBODY, AUTO, parse_endpoint, subscription_port
+from daemon.config.loader import naming
+from daemon.config.paths import can_be_made, maps_folder, runtime_folder, state_folder, stream_path
+from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError, read_survey
+from daemon.diagnosis.host import Heard, Host, Mute, standing
+from daemon.snapshot import LinkUse, State
+from hal.net.inet import refusal
+
+FREE_BYTES: Final = 200 << 20
+"""A map of a large building, twice, and some recording."""
+FIRST_UTC: Final = 1_735_689_600.0
+"""2025: a computer whose calendar says less has no clock of its own and has not been told the time."""
+GROUPS: Final = {"i2c": "i2c", "tty": "dialout"}
+
+
+class Level(IntEnum):
+    """How bad it is."""
+
+    GOOD = 0
+    REMARK = 1
+    FIX = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What one check has found: about what, how bad, what, and what to do (empty where there is nothing to do)."""
+
+    about: str
+    level: Level
+    text: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is looked at.
+
+    Attributes:
+        settings: the configuration. file: where it is from, None: built-in. host: the computer.
+        heard: what the running daemon tells; `Mute`: it is there and is not heard; a text: why there is none.
+    """
+
+    settings: Config
+    file: Path | None
+    host: Host
+    heard: Heard | Mute | str
+
+    @property
+    def runs(self) -> bool:
+        """Whether a daemon of this name is running: its devices and ports are in use then."""
+        return isinstance(self.heard, Heard | Mute)
+
+
+Check = Callable[[Case], Iterator[Finding]]
+
+
+def good(about: str, text: str) -> Finding:
+    """All is well."""
+    return Finding(about, Level.GOOD, text)
+
+
+def remark(about: str, text: str, remedy: str = "") -> Finding:
+    """It works, and it is worth knowing."""
+    return Finding(about, Level.REMARK, text, remedy)
+
+
+def fix(about: str, text: str, remedy: str) -> Finding:
+    """It does not work as it is."""
+    return Finding(about, Level.FIX, text, remedy)
+
+
+def configuration(case: Case) -> Iterator[Finding]:
+    """A file that cannot be read ends the doctor before this."""
+    about = "configuration"
+    if case.file is None:
+        yield remark(about, "none named: built-in values are looked at", "name the daemon's: --config FILE")
+    else:
+        yield good(about, str(case.file))
+    for said in implausible(case.settings.lidar.mount):
+        yield remark(about, said, "correct it, or leave it if it is so")
+
+
+def clock(case: Case) -> Iterator[Finding]:
+    """Poses carry UTC; the estimate itself does not need it."""
+    if case.host.utc() < FIRST_UTC:
+        yield fix(
+            "clock", "the calendar says a year before 2025", "set it, or start a time service: timedatectl set-ntp true"
+        )
+    elif case.host.synchronised() is False:
+        yield remark(
+            "clock", "follows no time server: stamps in UTC drift, poses do not", "timedatectl set-ntp true, or chrony"
+        )
+    else:
+        yield good("clock", "is set" + (" and follows a time server" if case.host.synchronised() else ""))
+
+
+def cache(case: Case) -> Iterator[Finding]:
+    """Compiled kernels."""
+    try:
+        warm = case.host.warm(case.settings.photodiode.fitted)
+    except (OSError, RuntimeError) as error:
+        yield fix("kernels", str(error), "give the daemon a folder of its own to write into")
+        return
+    if warm:
+        yield good("kernels", "are compiled")
+    else:
+        text = "of this version are not compiled for this user: the first start takes a minute or two"
+        yield remark("kernels", text, "run once: lumiloop warm")
+
+
+def disk(case: Case) -> Iterator[Finding]:
+    """Room for maps and recordings."""
+    for folder in filter(can_be_made, {_maps(case.settings) or state_folder(), state_folder()}):
+        free = case.host.free_bytes(folder)
+        if free < FREE_BYTES:
+            text = f"{free >> 20} MB are free where {folder} is: maps cannot be saved when it is full"
+            yield fix("disk", text, f"free some space there, or set map.folder; {FREE_BYTES >> 20} MB are enough")
+            return
+    yield good("disk", "there is room")
+
+
+def lidar(case: Case) -> Iterator[Finding]:
+    """The laser: there, ours to open, and a HOKUYO."""
+    if not case.settings.lidar.fitted:
+        yield good("lidar", "none is configured")
+        return
+    if case.runs:
+        return  # it is in use; the daemon's own faults tell
+    device = case.settings.lidar.place.device
+    named = [device] if device != AUTO else case.host.lidars()
+    if not named:
+        text = "no serial device that may be a HOKUYO is plugged in"
+        yield fix(
+            "lidar", text, 'plug it in and give it power; an Ethernet model: lidar.device = "tcp://ADDRESS:10940"'
+        )
+    for name in named:
+        finding = _unusable("lidar", name, case.host) or _lidar_at(name, case)
+        yield finding
+        if finding.level is Level.GOOD:
+            return
+
+
+def _lidar_at(name: str, case: Case) -> Finding:
+    found = case.host.lidar_at(name)
+    if found.error is not None:
+        return fix("lidar", f"{found.device}: {found.error.problem}", found.error.remedy)
+    wanted = case.settings.lidar.place.serial
+    if wanted and found.geometry is not None and found.geometry.serial != wanted:
+        text = f"{name}: serial {found.geometry.serial}, configured is {wanted}"
+        return fix("lidar", text, f'plug in that one, or set lidar.device = "auto:{found.geometry.serial}"')
+    return good("lidar", str(found))
+
+
+def photodiode(case: Case) -> Iterator[Finding]:
+    """Its bus, and its converter on it."""
+    settings = case.settings.photodiode
+    if not settings.fitted:
+        yield good("photodiode", "none is configured")
+        return
+    if case.runs:
+        return
+    if settings.bus.startswith("/") and (finding := _unusable("photodiode", settings.bus, case.host)):
+        yield finding
+        return
+    found = case.host.chips_on(settings.bus)
+    name, _, address = settings.converter.partition("@")
+    here = next((chip for chip in found.chips if chip.address == int(address, 0)), None)
+    if found.error is not None:
+        yield fix("photodiode", f"{found.bus}: {found.error.problem}", found.error.remedy)
+    elif here is None:
+        others = ", ".join(map(str, found.chips)) or "nothing"
+        remedy = "check power, SDA and SCL, or set photodiode.converter to what is there"
+        yield fix("photodiode", f"{settings.bus}: no {name} at {address}; there is {others}", remedy)
+    elif not here.usable or name.lower() not in here.name.lower():
+        yield fix(
+            "photodiode", f"{settings.bus}: {here}, configured is {name}", "set photodiode.converter to what is there"
+        )
+    else:
+        yield good("photodiode", f"{settings.bus}: {here}")
+
+
+def _unusable(about: str, device: str, host: Host) -> Finding | None:
+    """Why a device's file cannot be opened; None: it can, or has no file."""
+    if not device.startswith("/"):
+        return None
+    if not host.exists(device):
+        what = "the bus may have to be enabled first" if is_bus(device) else "plug it in, or name another"
+        return fix(about, f"{device}: not there", f"{what}; `lumiloop probe` finds what there is")
+    if not host.usable(device):
+        group = GROUPS["i2c" if is_bus(device) else "tty"]
+        remedy = f"sudo usermod -aG {group} {host.user()}, then log in again"
+        return fix(about, f"{device}: may not be opened by {host.user()}", remedy)
+    return None
+
+
+def ports(case: Case) -> Iterator[Finding]:
+    """Where servers are to listen."""
+    settings = case.settings
+    wanted: list[tuple[str, socket.SocketKind, int]] = []
+    if settings.modbus.port:
+        wanted += [("modbus.port", socket.SOCK_STREAM, settings.modbus.port)]
+        wanted += [("modbus.port", socket.SOCK_DGRAM, settings.modbus.port)]
+    if settings.odometry.port:
+        wanted.append(("odometry.port", socket.SOCK_DGRAM, settings.odometry.port))
+    if port := subscription_port(settings.pose.receivers):
+        wanted.append(("pose.receivers", socket.SOCK_DGRAM, port))
+    if case.runs or not wanted:
+        return
+    bad = False
+    for key, kind, port in wanted:
+        if why := case.host.taken(kind, settings.bind, port):
+            bad = True
+            name = "TCP" if kind is socket.SOCK_STREAM else "UDP"
+            refused = refusal(name, key, port, why)
+            others = why.errno == errno.EADDRINUSE
+            remedy = f"`ss -lnp` says who has {port}; or set another {key}" if others else refused.remedy
+            yield fix("ports", f"{key}: {name} {settings.bind}:{port}: {refused.problem}", remedy)
+    if not bad:
+        yield good("ports", ", ".join(sorted({f"{key} {port}" for key, _, port in wanted})) + " can be had")
+
+
+def rtu(case: Case) -> Iterator[Finding]:
+    """The serial line for Modbus."""
+    line = case.settings.modbus.line
+    if line is not None and not case.runs:
+        yield _unusable("modbus", line.path, case.host) or good("modbus", f"{line.path} can be opened")
+
+
+def receivers(case: Case) -> Iterator[Finding]:
+    """Hosts that pose datagrams are sent to."""
+    for receiver in case.settings.pose.receivers:
+        host, _ = parse_endpoint(receiver)
+        if host != ANYBODY and (why := case.host.resolved(host)):
+            remedy = "correct the name in pose.receivers, or write the address; is the network up?"
+            yield fix("receivers", f"{receiver}: {why}", remedy)
+
+
+def maps(case: Case) -> Iterator[Finding]:
+    """The folder of maps, and the map to begin with."""
+    settings = case.settings
+    if not settings.map.kept:
+        yield remark("maps", "are not kept: `map.folder` is none")
+        return
+    found, text = look_at_maps(settings)
+    if found is Maps.TAKEN and not case.runs:
+        yield fix("maps", text, "end it, or name another folder in map.folder")
+    elif found in (Maps.BROKEN, Maps.FROZEN):
+        yield fix("maps", text, "make the folder yours, or name another in map.folder")
+    elif settings.map.localise and found is not Maps.READY:
+        yield fix("maps", f"{text}; map.localise asks for one", "map first, or set map.localise = false")
+    else:
+        yield good("maps", text)
+
+
+def _maps(settings: Config) -> Path | None:
+    return maps_folder(settings.map.folder) if settings.map.kept else None
+
+
+def survey(case: Case) -> Iterator[Finding]:
+    """The lamps' file."""
+    from daemon.devices.photodiode import profile_of
+
+    settings = case.settings
+    if not settings.lights.survey:
+        if settings.photodiode.fitted:
+            yield remark(
+                "survey", "none: lamps that do not send their own place are of no use", "see `lumiloop survey`"
+            )
+        return
+    path = Path(settings.lights.survey)
+    try:
+        found = read_survey(path, profile_of(settings.photodiode))
+    except SurveyError as error:
+        named = naming(case.file, "lights.survey", path)
+        there = os.path.exists(path)  # noqa: PTH110  Path.exists raises where no file can have that name
+        remedy = "mend it" if there else "put it there, or name another"
+        yield fix("survey", f"{error} ({named})", f"{remedy}; `lumiloop check` reads it again")
+        return
+    unused = "" if settings.photodiode.fitted else ", not used: photodiode.bus is empty"
+    yield good("survey", f"{settings.lights.survey}: {len(found.lamps)} lamps{unused}")
+
+
+def daemon(case: Case) -> Iterator[Finding]:
+    """What the running daemon says itself: state, and all faults with their remedies."""
+    heard = case.heard
+    if isinstance(heard, str):
+        yield remark(
+            "daemon", f"does not run, or not as `name` {case.settings.name} ({heard})", "see what its log says"
+        )
+        return
+    if isinstance(heard, Mute):
+        yield fix("daemon", heard.text, heard.remedy)
+        return
+    present = () if heard.faults is None else heard.faults.present
+    for fault in present:
+        yield fix("daemon", f"fault {fault.fault}: {fault.meaning}", fault.remedy)
+    if heard.pose is None:
+        yield fix("daemon", f"{heard.name} runs, and tells no pose", "it is starting, or it stands; see its log")
+    elif heard.pose.state in (State.TRACKING, State.MAPPING):
+        yield good("daemon", f"{heard.name} runs: {heard.pose.state_name}")
+    elif not present:
+        yield remark("daemon", f"{heard.pose.state_name}: {heard.pose.meaning}", heard.pose.remedy)
+
+
+_ODD: Final = {
+    LinkUse.UNSURVEYED: ("is received, and no lamp of this code is in the survey", "add it: `lumiloop survey`"),
+    LinkUse.MISSING: ("should be received here and is not", "switch it on, or exchange it"),
+    LinkUse.REJECTED: (
+        "does not shine as surveyed",
+        "it was moved or exchanged: survey it anew, or its code is in use twice",
+    ),
+    LinkUse.TWIN: ("is received from two lamps", "give one of them another code"),
+}
+
+
+def lamps(case: Case) -> Iterator[Finding]:
+    """Lights seen against the survey; needs the daemon."""
+    if not case.settings.photodiode.fitted:
+        return
+    if not isinstance(case.heard, Heard):
+        yield remark("lamps", "what is seen of them is told by a running daemon alone", "start it and ask again")
+        return
+    seen = case.heard.lamps
+    used = sum(use == LinkUse.ACCEPTED for use in seen.values())
+    received = sum(use != LinkUse.MISSING for use in seen.values())
+    if not received:
+        yield fix("lamps", "none is received", "is it dark here, the photodiode covered, or the air interface another?")
+    lasts = standing(case.heard)
+    for (code, lamp_id), use in sorted(seen.items(), key=lambda one: (one[0][0], one[0][1] or 0)):
+        if use in _ODD:
+            text, remedy = _ODD[LinkUse(use)]
+            named = f"code {code}{'' if lamp_id is None else f' (lamp {lamp_id})'}"
+            if lasts(use):
+                yield fix("lamps", f"{named} {text}", remedy)
+            else:
+                yield remark("lamps", f"{named} {text} at this moment", f"ask again; if it stays so: {remedy}")
+    if received:
+        yield good("lamps", f"{received} in view, {used} used")
+
+
+def realtime(case: Case) -> Iterator[Finding]:
+    """The right to go before others."""
+    if case.runs:
+        return
+    if case.host.realtime():
+        yield good("real time", "may be had")
+    else:
+        text = f"{case.host.user()} may not take a real-time priority: cycles may be late on a busy computer"
+        yield remark("real time", text, "the systemd service may (LimitRTPRIO=50)")
+
+
+def sockets(case: Case) -> Iterator[Finding]:
+    """The folder of the local stream."""
+    folder = runtime_folder()
+    if not case.runs and case.host.exists(str(folder)) and not case.host.usable(str(folder)):
+        remedy = "start it as the user whose folder it is, or set RUNTIME_DIRECTORY"
+        yield fix("stream", f"{stream_path(case.settings.name)} cannot be made by {case.host.user()}", remedy)
+
+
+CHECKS: Final[tuple[Check, ...]] = (
+    *(configuration, survey, disk, cache, lidar, photodiode),
+    *(ports, rtu, receivers, maps, sockets, daemon, lamps, clock, realtime),
+)

@@ -1,0 +1,204 @@
+"""What a check may ask: of the computer, of its devices, and of the daemon, if one runs. Tests have their own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import resource
+import shutil
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from daemon.health.faults import Fault
+from daemon.snapshot import LinkUse
+from hal.bus import i2c_linux
+from hal.hokuyo import discover
+from hal.photodiode.probe import BusFinding, probe_bus
+from hal.port.opening import open_bus, open_port
+from hal.probe import Finding, identify_at
+from taps.stream.client import Stream
+from taps.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
+
+LISTEN_S: Final = 3.0
+LISTENERS: Final = "lumiloop-stream"
+"""The group that may listen to the service."""
+TIME_ERROR: Final = 5
+"""adjtimex(2): the clock is not synchronised."""
+_TIMEX_BYTES: Final = 512  # more than struct timex on any architecture
+
+
+@dataclass(slots=True)
+class Heard:
+    """What a running daemon has told: latest pose, faults, and every lamp with what it was last used for.
+
+    ``lamps``: (code, lamp ID or None) to the use, as `daemon.snapshot.LinkUse` numbers it.
+    """
+
+    name: str = ""
+    pid: int = 0
+    pose: Pose | None = None
+    faults: Faults | None = None
+    lights: Lights | None = None
+    lamps: dict[tuple[int, int | None], int] = field(default_factory=dict)
+
+
+SAID_AS: Final[dict[int, int]] = {LinkUse.MISSING: Fault.LAMP_DEAD, LinkUse.REJECTED: Fault.LAMP_MOVED}
+"""The fault that a running daemon has when a lamp has been so for long (`daemon.integrity.lamp_monitor`)."""
+
+
+def standing(heard: Heard) -> Callable[[int], bool]:
+    """Whether what a lamp is used for is more than a passing shadow: dead or moved only where the faults say so."""
+    present = set() if heard.faults is None else {one.fault for one in heard.faults.present}
+    return lambda use: use not in SAID_AS or SAID_AS[use] in present
+
+
+@dataclass(frozen=True, slots=True)
+class Mute:
+    """A daemon that is there and is not heard: why, and what to do."""
+
+    text: str
+    remedy: str
+
+
+class Host:
+    """The computer that the program runs on."""
+
+    def utc(self) -> float:
+        """Seconds since the Unix epoch, by the calendar of the computer."""
+        return time.time()
+
+    def synchronised(self) -> bool | None:
+        """Whether the calendar follows a time server; None where the system does not say."""
+        try:
+            state = int(ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
+        except (OSError, AttributeError):
+            return None
+        return None if state < 0 else state != TIME_ERROR
+
+    def user(self) -> str:
+        """Who we are."""
+        import pwd
+
+        try:
+            return pwd.getpwuid(os.geteuid()).pw_name
+        except KeyError:
+            return str(os.geteuid())
+
+    def exists(self, path: str) -> bool:
+        """Whether there is something at a path."""
+        return Path(path).exists()
+
+    def usable(self, path: str) -> bool:
+        """Whether it may be read and written by us."""
+        return os.access(path, os.R_OK | os.W_OK)
+
+    def lidars(self) -> list[str]:
+        """Ports at which a HOKUYO may be."""
+        return discover.candidates()
+
+    def buses(self) -> list[str]:
+        """I2C buses of this computer."""
+        return list(i2c_linux.buses())
+
+    def lidar_at(self, device: str) -> Finding:
+        """Who is at a port."""
+        return asyncio.run(identify_at(open_port, device))
+
+    def chips_on(self, bus: str) -> BusFinding:
+        """What answers on a bus."""
+        return asyncio.run(probe_bus(open_bus, bus))
+
+    def free_bytes(self, folder: Path) -> int:
+        """Room on the disk that a folder, or what there is of the way to it, is on."""
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        return shutil.disk_usage(folder).free
+
+    def resolved(self, host: str) -> str:
+        """Why a name stands for no address; empty: it does, or is one."""
+        try:
+            socket.getaddrinfo(host, None)
+        except OSError as error:
+            return error.strerror or str(error)
+        return ""
+
+    def taken(self, kind: socket.SocketKind, host: str, port: int) -> OSError | None:
+        """Why a server could not listen there; None: it could."""
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, kind) as sock:
+            if kind is socket.SOCK_STREAM:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                sock.bind((host, port))
+            except OSError as error:
+                return error
+        return None
+
+    def warm(self, lights: bool) -> bool:
+        """Whether the kernels of this version have been compiled here.
+
+        Raises:
+            OSError, RuntimeError: there is nowhere to keep them.
+        """
+        from daemon.runtime.warmup import is_marked
+
+        return is_marked("warm-lights" if lights else "warm")
+
+    def realtime(self) -> bool:
+        """Whether we may take a real-time priority."""
+        return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
+
+    def listen(self, path: Path) -> Heard | Mute | str:
+        """What a running daemon tells for some seconds; a text: why there is none."""
+        heard = asyncio.run(_listen(path))
+        return heard if isinstance(heard, Heard) else self._mute(path, heard) or heard
+
+    def _mute(self, path: Path, why: str) -> Mute | None:
+        """The daemon at a path that has told nothing; None: there is none."""
+        try:
+            _reach(path)
+        except PermissionError:
+            text = f"{path}: {self.user()} may not listen there, so it is not known how it is"
+            return Mute(text, f"sudo usermod -aG {LISTENERS} {self.user()}, then log in again; or ask as root")
+        except OSError:
+            return None
+        text = f"{path}: a daemon is there and says nothing of use: {why}"
+        return Mute(text, "it stands, or is of another version; see its log")
+
+
+def _reach(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as sock:
+        sock.settimeout(LISTEN_S)
+        sock.connect(str(path))
+
+
+async def _listen(path: Path) -> Heard | str:
+    heard, why = Heard(), ""
+    stream = Stream(path, ("pose", "faults", "lights", "state"), patient=False)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LISTEN_S), contextlib.aclosing(stream.frames()) as frames:
+            try:
+                async for frame in frames:
+                    match frame:
+                        case Hello():
+                            heard.name, heard.pid = frame.name, frame.pid
+                        case Pose():
+                            heard.pose = frame
+                        case Faults():
+                            heard.faults = frame
+                        case Lights():
+                            heard.lights = frame
+                            heard.lamps |= {(link.code, link.lamp_id): link.use for link in frame.links}
+                        case StateChange():
+                            continue
+                        case _:
+                            why = getattr(frame, "text", "")
+            except NotTheStream as error:
+                why = str(error)
+    return heard if heard.pid else why or "nobody answers"

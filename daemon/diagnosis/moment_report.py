@@ -1,0 +1,309 @@
+"""What `lumiloop why` says of a moment: state and reason, who contradicts whom, axes, lamps, and what led there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from daemon.diagnosis.moment import SECOND_S, Moment, chosen, clock, end_of, faults_changed, of_day
+from daemon.health.faults import FAULTS, Fault
+from daemon.health.reasons import REASONS, Reason
+from daemon.publish.meanings import USES
+from daemon.snapshot import LightLink, LinkUse, Snapshot, State
+from estimator.measurements import Array
+from estimator.numerics import se2
+
+AXES: Final = ("x", "y", "heading")
+GAP: Final = 16.27
+"""Squared Mahalanobis distance of three components that is beyond chance (1 in 1000)."""
+GONE: Final = (Reason.LIDAR_SILENT, Reason.LIDAR_UNREACHABLE)
+"""What is published of a laser that is silent, or not steady again, whoever holds the pose meanwhile."""
+MOST: Final = 12
+"""Changes that are listed; beyond that those of state and faults, and of all others the latest."""
+AGAINST: Final = (LinkUse.OCCLUDED, LinkUse.REJECTED)
+"""What is received of these lamps speaks against the place, or did a moment ago."""
+FITS: Final = 0.2
+"""Deviation (ln) below which what is received fits."""
+
+
+def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: bool = False, made: str = "") -> str:
+    """The text of a time, which lasts from ``utc`` on for ``wide``, s (:func:`daemon.diagnosis.moment.chosen`).
+
+    ``second``: it is a whole one, of which the first change is told. ``made``: lines on what the recording was made
+    with, and on its clock, where there is something to say of it.
+    """
+    k, last, changed = chosen(told, utc, second, wide)
+    one, begun, apart = told[k], clock(utc), told[k].utc - utc
+    when = begun
+    if second:
+        begun, meant = _named(utc, wide)
+        when = f"{begun}, {meant}: {_change(one.utc - end_of(utc, wide), changed)}"
+    if apart > SECOND_S and changed is None:
+        when = f"{begun}, no cycle had run yet; the first, {apart:.0f} s later"
+    elif apart < -SECOND_S:
+        when = f"{begun}, no cycle ran then; the last before it, {-apart:.0f} s earlier"
+    lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *([made] if made else []), *_state(told, k)]
+    lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
+    lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
+    if one.snapshot.light is not None:
+        lines += ["", "lamps", *(f"  {line}" for line in _lamps(told, k))]
+    first = f"{max(0.0, utc - told[0].utc):.0f} s before"
+    lines += ["", f"what changed in the {first}{' and in this second, or just after it' if second else ''}"]
+    lines += [f"  {line}" for line in _listed(list(_changes(told[: last + 1])))] or ["  nothing"]
+    return "\n".join(lines) + "\n"
+
+
+def _named(utc: float, wide: float) -> tuple[str, str]:
+    """How a second is written that begins then and lasts ``wide``, s, and what it is."""
+    if utc.is_integer():
+        return clock(utc, whole=True), "the whole second"
+    return clock(utc), "the second from then" if wide >= SECOND_S else "the rest of that second"
+
+
+def _change(after_s: float, changed: int | None) -> str:
+    """What of a whole second is told; ``after_s``: from its end, negative within it."""
+    if changed is None:
+        return "nothing changes"
+    if after_s < 0.0:
+        return "state, reason or faults first change in it"
+    return f"nothing changes in it, but {after_s:.2f} s after it state, reason or faults do"
+
+
+def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
+    one = told[k]
+    since = _since(told, k, lambda moment: (moment.state, moment.reason))
+    yield f"{one.state.name} since {since}: {_because(one.reason)}{_in_brackets(REASONS[one.reason][1])}"
+    for fault in one.faults:
+        text, remedy = _fault(fault)
+        yield f"fault {fault} since {_since(told, k, partial(_has, fault))}: {text}{_in_brackets(remedy)}"
+    again = one.snapshot.state, Reason(one.snapshot.reason)
+    if one.told is not None and one.told not in Reason._value2member_map_:
+        yield f"(reason {one.told} was published, which is not known here: newer software's; told is the replay's)"
+    if again != (one.state, one.reason):
+        yield f"(this was published; the replay itself says {again[0].name}: {_because(again[1])})"
+    if one.told is None:
+        yield "(published reason and faults were not recorded then: the reason is the replay's, faults are not known)"
+    if one.snapshot.pose is not None:
+        x, y, yaw = one.snapshot.pose
+        said = f"pose {x:.3f} {y:.3f} m, {math.degrees(yaw):.1f} deg"
+        if one.snapshot.covariance is not None:
+            xx, _, yy, *_, tt = one.snapshot.covariance
+            said += f"; sigma {math.sqrt(max(xx, yy)):.3f} m, {math.degrees(math.sqrt(tt)):.2f} deg"
+        trust = one.snapshot.trust
+        if trust.horizontal_m is not None:
+            rests = [name for name in ("laser", "light", "wheels") if getattr(trust, name)]
+            said += f"; not wrong by more than {trust.horizontal_m:.2f} m, which rests on {', '.join(rests)}"
+        yield said
+    if one.snapshot.trust.places is not None:
+        yield f"the place in the map is looked for: {one.snapshot.trust.places} fit"
+
+
+def _because(reason: Reason) -> str:
+    """A reason with the number under which it is published."""
+    return f"reason {int(reason)}, {REASONS[reason][0]}" if reason else REASONS[reason][0]
+
+
+def _in_brackets(remedy: str) -> str:
+    return f" ({remedy})" if remedy else ""
+
+
+def _fault(number: int) -> tuple[str, str]:
+    """What a fault means and what a person can do; newer software may have recorded one that is not known here."""
+    return FAULTS[Fault(number)] if number in Fault._value2member_map_ else ("not known here", "")
+
+
+def _has(fault: int, one: Moment) -> bool:
+    return fault in one.faults
+
+
+def _since(told: Sequence[Moment], k: int, what: Callable[[Moment], object]) -> str:
+    """When something became what it is at ``k``."""
+    now = what(told[k])
+    begin = k
+    while begin > 0 and what(told[begin - 1]) == now:
+        begin -= 1
+    return f"before {of_day(told[0].utc)}" if begin == 0 else of_day(told[begin].utc)
+
+
+def _witnesses(told: Sequence[Moment], k: int) -> Iterator[str]:
+    yield _laser(told, k)
+    yield _wheels(told[k])
+    if told[k].snapshot.light is not None:
+        yield _light(told[k])
+
+
+def laser_dissents(one: Moment) -> bool:
+    """Whether the scan of this cycle came to nothing."""
+    match = None if one.result is None else one.result.match
+    return one.scan is not None and one.fresh and match is not None and not match.ok
+
+
+def _laser(told: Sequence[Moment], k: int) -> str:
+    latest = next((one for one in reversed(told[: k + 1]) if one.scan is not None and one.fresh), None)
+    if latest is None or latest.result is None or latest.result.match is None:
+        return "laser   no scan in all that time"
+    match, ago = latest.result.match, told[k].utc - latest.utc
+    when = f", {ago:.2f} s ago" if ago > 0.3 else ""
+    gone = told[k].state is State.NO_LIDAR or told[k].reason in GONE
+    silent = latest is not told[k] and told[k].snapshot.lidar_ok is False
+    before = f"silent for {ago:.{1 if ago >= 1.0 else 2}f} s; before: "
+    if not match.ok:
+        said = f"came to nothing: {match.reason.value} ({match.queries} points)"
+        return f"laser   {before}a scan {said}" if silent else f"laser   DISSENTS: the scan{when} {said}"
+    x, y, yaw = match.correction.tolist()
+    moved = f"moved the prediction by {1e3 * math.hypot(x, y):.0f} mm, {math.degrees(yaw):.2f} deg"
+    fit = f"{match.inliers} of {match.queries} points fit, residual {1e3 * match.residual_m:.0f} mm"
+    word = before if silent else f"speaks{' again, not steadily yet' if gone else when}: "
+    return f"laser   {word}{fit}, {moved}"
+
+
+def _wheels(one: Moment) -> str:
+    said = one.wheels
+    if one.snapshot.odometry_ok is None:
+        return "wheels  there is no odometry"
+    if one.snapshot.odometry_ok is False:
+        return "wheels  silent"
+    if said is None:
+        return "wheels  cannot be compared with the laser: two seconds of both, and of all axes, are wanted"
+    told, seen = _motion(said.wheels), _motion(said.laser)
+    away_m, away_rad = said.apart
+    apart = f"{away_m:.2f} m, {math.degrees(away_rad):.1f} deg apart"
+    word = "agree with the laser" if said.agree else "DISSENT"
+    return f"wheels  {word}: in {said.seconds:.1f} s they told {told}, the laser {seen}; {apart}"
+
+
+def _motion(T: Array) -> str:
+    x, y, yaw = T.tolist()
+    return f"{math.hypot(x, y):.2f} m, {math.degrees(yaw):.1f} deg"
+
+
+def light_apart(one: Moment) -> tuple[float, float] | None:
+    """How far the place that light alone tells is from the pose, m and rad; None where it tells none."""
+    light, pose = one.snapshot.light, one.snapshot.pose
+    if light is None or light.pose is None or pose is None:
+        return None
+    x, y, yaw = se2.between(np.array(pose), np.array(light.pose)).tolist()
+    return math.hypot(x, y), abs(yaw)
+
+
+def _light(one: Moment) -> str:
+    light = one.snapshot.light
+    assert light is not None
+    if one.snapshot.adc_ok is False:
+        return "light   silent: no samples come"
+    away, gap = light_apart(one), one.snapshot.trust.gap
+    if away is None:
+        return f"light   tells no place ({light.fix.name}, {light.used} lamps used)"
+    far = f"its place is {away[0]:.2f} m, {math.degrees(away[1]):.1f} deg from the pose"
+    against = sum(link.use in AGAINST for link in light.links)
+    used = f"{light.fix.name}, {light.used} lamps used" + (f", {against} speak against the place" if against else "")
+    if gap is None:
+        return f"light   {used}; {far}"
+    word = "DISSENTS" if gap > GAP or against > light.used else "agrees"
+    return f"light   {word}: {far}, {math.sqrt(gap):.1f} deviations; {used}"
+
+
+def _axes(told: Sequence[Moment], k: int) -> Iterator[str]:
+    for axis, name in enumerate(AXES):
+        since = _since(told, k, partial(_known, axis))
+        yield f"{name:8}{'known' if told[k].snapshot.known[axis] else 'UNKNOWN'} since {since}"
+    result = told[k].result
+    match = None if result is None else result.match
+    if match is not None and match.ok and len(blind := match.blind_directions()):
+        said = "; ".join(_direction(row) for row in blind.tolist())
+        yield f"this scan says nothing {said} (odom frame)"
+
+
+def _known(axis: int, one: Moment) -> bool:
+    return one.snapshot.known[axis]
+
+
+def _direction(row: list[float]) -> str:
+    x, y, turn = row
+    if abs(turn) > 0.7:
+        return "of the heading"
+    return f"along {math.degrees(math.atan2(y, x)) % 180.0:.0f} deg"
+
+
+def _lamps(told: Sequence[Moment], k: int) -> Iterator[str]:
+    light = told[k].snapshot.light
+    assert light is not None
+    if not light.links:
+        yield "none is received"
+    for use in LinkUse:
+        links = [link for link in light.links if link.use is use]
+        if links:
+            said = ", ".join(map(_link, links))
+            yield f"{len(links)} {use.name}: {USES[use]}: {said}"
+
+
+def _link(link: LightLink) -> str:
+    name = f"code {link.code}" if link.lamp_id is None else f"lamp {link.lamp_id}"
+    if link.residual is None:
+        return name
+    again = "; fits again, and is used when it goes on so" if link.use in AGAINST and abs(link.residual) < FITS else ""
+    return f"{name} ({math.exp(link.residual):.2f} of expected{again})"
+
+
+def _listed(changes: list[tuple[bool, str]]) -> Iterator[str]:
+    """The changes that there is room for; what the lamps do in the meantime must not hide a fault."""
+    minor = [k for k, (grave, _) in enumerate(changes) if not grave]
+    out = set(minor[: max(0, len(changes) - MOST)])
+    if out:
+        yield f"... {len(out)} more, of axes, witnesses, lamps"
+    yield from (text for k, (_, text) in enumerate(changes) if k not in out)
+
+
+def _changes(told: Sequence[Moment]) -> Iterator[tuple[bool, str]]:
+    """One line for everything that became otherwise, oldest first, and whether it was published as state or fault."""
+    for before, one in pairwise(told):
+        for text in _published(before, one):
+            yield True, f"{of_day(one.utc)}  {text}"
+        for text in _changed(before, one):
+            yield False, f"{of_day(one.utc)}  {text}"
+
+
+def _published(before: Moment, one: Moment) -> Iterator[str]:
+    yield from (f"order {order}" for order in one.orders)
+    if (before.state, before.reason) != (one.state, one.reason):
+        yield f"{one.state.name}: {_because(one.reason)}"
+    for sign, fault in faults_changed(before, one):
+        yield f"fault {fault} {'comes' if sign == '+' else 'is over'}: {_fault(fault)[0]}"
+
+
+def _changed(before: Moment, one: Moment) -> Iterator[str]:
+    old, new = before.snapshot, one.snapshot
+    for axis, name in enumerate(AXES):
+        if old.known[axis] != new.known[axis]:
+            yield f"{name} {'known' if new.known[axis] else 'unknown'}"
+    agreed, agrees = (None if m.wheels is None else m.wheels.agree for m in (before, one))
+    if agrees is False and agreed is not False:
+        yield "the wheels begin to dissent"
+    if laser_dissents(one) and not laser_dissents(before):
+        assert one.result is not None
+        assert one.result.match is not None
+        yield f"a scan comes to nothing: {one.result.match.reason.value}"
+    if new.loop_counter != old.loop_counter:
+        yield f"a loop is closed, keyframe {new.loop_new} on {new.loop_old}"
+    if new.jumps != old.jumps and new.pose is not None and old.pose is not None:
+        yield f"the pose jumps by {math.dist(new.pose[:2], old.pose[:2]):.2f} m"
+    if one.dropped:
+        yield f"{one.dropped} scans came too fast and were left out"
+    yield from _lamps_changed(old, new)
+
+
+def _lamps_changed(old: Snapshot, new: Snapshot) -> Iterator[str]:
+    if old.light is None or new.light is None or old.light.links is new.light.links:
+        return
+    if old.light.fix is not new.light.fix:
+        yield f"light: {new.light.fix.name}"
+    was = {link.lamp_id: link.use for link in old.light.links if link.lamp_id is not None}
+    for link in new.light.links:
+        use = None if link.lamp_id is None else was.get(link.lamp_id)
+        if use is not None and use is not link.use:
+            yield f"lamp {link.lamp_id}: {use.name} -> {link.use.name}"

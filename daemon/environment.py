@@ -1,0 +1,102 @@
+"""What the daemon meets outside itself: clock, ports and buses, drivers, worker, estimator, stored map."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from daemon.config.endpoints import parse_lidar
+from daemon.config.schema import LidarConfig
+from daemon.devices.photodiode import AdcMaker, make_adc
+from daemon.devices.sample_clock import SampleClock
+from daemon.maps.store import Start, Store
+from daemon.runtime.budget import Budget, MeasuredBudget
+from daemon.runtime.cycle import Sink
+from daemon.runtime.light_setup import Lights
+from daemon.runtime.warmup import warm_up
+from daemon.runtime.worker import ThreadWorker, Worker
+from hal.bus.i2c import BusOpener
+from hal.clock import Clock
+from hal.lidar import Lidar, LidarGeometry, LidarStatus, RawScan
+from hal.port.opening import open_bus, open_port
+from hal.port.port import PortOpener
+
+
+class LidarMaker(Protocol):
+    """Makes a lidar driver from its configuration."""
+
+    def __call__(self, config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
+        """A driver that is not running yet."""
+        ...
+
+
+def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
+    """The driver that the device string names; HOKUYO's where it names none.
+
+    Raises:
+        DeviceRefused: there is no such driver.
+    """
+    from hal.registry import lidar_factory, split
+
+    name, device = split(config.device)
+    place = parse_lidar(device)
+    return lidar_factory(name)(
+        place.device, clock=clock, opener=opener, serial=place.serial, baud=place.baud, intensity=config.intensity
+    )
+
+
+class NoLidar:
+    """Stands in the lidar's place where there is none (`hal.lidar.Lidar`)."""
+
+    def __init__(self) -> None:
+        self._status = LidarStatus(dialect="no lidar")
+
+    @property
+    def geometry(self) -> LidarGeometry | None:
+        """There is none."""
+        return None
+
+    @property
+    def status(self) -> LidarStatus:
+        """Closed, and without an error."""
+        return self._status
+
+    async def run(self, on_scan: Callable[[RawScan], None]) -> None:
+        """Nothing comes."""
+        await asyncio.Event().wait()
+
+
+@dataclass(slots=True)
+class World:
+    """What the daemon meets outside itself. A test replaces any of it; the defaults are the real thing.
+
+    Attributes:
+        stopwatch: measures stages and budget; None: nothing is measured. sinks: get every snapshot too.
+        warm_up: loads the estimator. draw_map_id: identity of a new map frame.
+        lights: survey and sample clock; None: as configured, and a sample clock that is to be found.
+        sample_clock: keeps the sample clock; None: it is not kept.
+        store: keeps maps; None: they are not kept. start: the map that the run begins with.
+        stream: path of the local stream; None: there is none.
+    """
+
+    clock: Clock
+    opener: PortOpener = open_port
+    make_lidar: LidarMaker = make_lidar
+    make_worker: Callable[[], Worker] = ThreadWorker
+    make_budget: Callable[[], Budget] = MeasuredBudget
+    stopwatch: Callable[[], float] | None = time.perf_counter
+    warm_up: Callable[[], Awaitable[object]] = warm_up
+    sinks: tuple[Sink, ...] = ()
+    draw_map_id: Callable[[], int] = lambda: 1 + secrets.randbelow(2**32 - 1)
+    buses: BusOpener = open_bus
+    make_adc: AdcMaker = make_adc
+    lights: Lights | None = None
+    sample_clock: SampleClock | None = None
+    store: Store | None = None
+    start: Start | None = None
+    stream: Path | None = None

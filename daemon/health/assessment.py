@@ -1,0 +1,233 @@
+"""Which faults are present, from counters and facts sampled once a second."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from daemon.health.faults import FAULTS, Fault
+from hal.adc import BusStuck, ChipMissing, Clipping, Dark, Dazzled, NoSignal, WrongChip
+from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, HalError
+from hal.lidar import Link
+
+WINDOW_S: Final = 10.0
+"""Rates are judged over the latest vitals that are at least this far apart, or all there are."""
+STALLED_PERIODS: Final = 2.0
+"""Scan periods by which the loop may be late: the next one would be taken for a silent lidar."""
+FEW: Final = 2
+"""Events that are no rate yet: shortly after the start a single one would be a large part of all."""
+REPLAYED: Final = frozenset(
+    (
+        *(Fault.NO_LAMPS, Fault.SURVEY_CONTRADICTED, Fault.TWIN_LAMPS, Fault.LAMP_MOVED, Fault.LAMP_DEAD),
+        *(Fault.LIDAR_MISFIT, Fault.ODOMETRY_SILENT, Fault.ODOMETRY_DISAGREES, Fault.PROTECTION_ALERT),
+    )
+)
+"""What the data alone say, moment by moment: a replay has them again. All others are said by drivers, by the computer,
+or are rates of what was lost before it was recorded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vitals:
+    """Counters and facts of one moment (``t_mono``); counters run from the start of the process.
+
+    Attributes:
+        link, error: of the lidar driver. silent: no valid scan for three scan periods.
+        scans, missed, invalid: the driver's counters. period: scan period in seconds.
+        late: counter of scans that arrived late. lag: seconds by which they are stamped later than the wheels' turns,
+            0: none is known. misfit: what they say is at odds with the map.
+        odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the laser.
+        readings, readings_missed, readings_old: counters of odometry readings that came, were lost, and came late.
+        readings_seldom: they come more seldom than before.
+        adc: whether blocks of samples arrive, None where there is no photodiode. adc_link, adc_error: of its driver.
+        blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked beyond the decoder's reach.
+        lamps: what is wrong with lamps and survey.
+        cycles, overruns, jobs_failed: counters; short: of cycles without map work or laser for lack of time.
+        lateness: worst lateness of the loop lately, seconds.
+        alert: the bound on the position error is above the limit that is set, and this has been said.
+        failed: names of parts that are down at the moment.
+    """
+
+    t_mono: float
+    link: Link = Link.CLOSED
+    error: HalError | None = None
+    silent: bool = False
+    scans: int = 0
+    missed: int = 0
+    invalid: int = 0
+    period: float = 0.1
+    odometry: bool | None = None
+    odometry_jumps: int = 0
+    disagree: bool = False
+    late: int = 0
+    misfit: bool = False
+    lag: float = 0.0
+    readings: int = 0
+    readings_missed: int = 0
+    readings_old: int = 0
+    readings_seldom: bool = False
+    adc: bool | None = None
+    adc_link: Link = Link.CLOSED
+    adc_error: HalError | None = None
+    blocks: int = 0
+    lost: int = 0
+    unfit: int = 0
+    stalled: int = 0
+    off_rate: bool = False
+    lamps: frozenset[Fault] = frozenset()
+    cycles: int = 0
+    overruns: int = 0
+    short: int = 0
+    jobs_failed: int = 0
+    lateness: float = 0.0
+    alert: bool = False
+    failed: frozenset[str] = frozenset()
+
+
+def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
+    """Faults that are present, gravest first; ``before`` are vitals of about :data:`WINDOW_S` ago."""
+    found = [*_lidar(now, before), *_odometry(now, before), *_computer(now, before), *_outputs(now)]
+    if now.adc is not None:
+        found += [*_photodiode(now, before), *now.lamps]
+    return tuple(sorted(found))
+
+
+def describe(fault: Fault, now: Vitals | None = None) -> str:
+    """One line for a log: number, meaning, remedy, and what the device's driver or the data say of it ``now``."""
+    text, remedy = FAULTS[fault]
+    own = now is not None and fault is Fault.LIDAR_REFUSED and now.error is not None and now.error.remedy
+    if own:  # the table's is for serial ports and networks, the driver knows which it is
+        remedy = ""
+    line = f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
+    return f"{line}: {words}" if now is not None and (words := _words(fault, now)) else line
+
+
+def _words(fault: Fault, now: Vitals) -> str:
+    """The driver's error that a fault stands for, the parts that are down, or the lag, if it stands for one."""
+    if now.error is not None and fault is _noun(now.error):
+        return str(now.error)
+    if now.adc_error is not None and fault is _adc_noun(now.adc_error):
+        return str(now.adc_error)
+    if fault in (Fault.PUBLISHER_FAILED, Fault.PART_FAILED):
+        return ", ".join(sorted(_publishers(now) if fault is Fault.PUBLISHER_FAILED else _others(now)))
+    late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
+    return f"scans are {now.lag:+.2f} s late against the wheels" if now.lag and late else ""
+
+
+def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
+    down = now.link is not Link.STREAMING or now.silent
+    if down and now.error is not None:
+        yield _noun(now.error)
+    elif now.silent:
+        yield Fault.LIDAR_SILENT
+    scans, missed, invalid = now.scans - before.scans, now.missed - before.missed, now.invalid - before.invalid
+    if invalid > FEW + 0.05 * (scans + invalid):
+        yield Fault.LIDAR_GARBLED
+    if not down and missed > FEW + 0.02 * (scans + missed):
+        yield Fault.LIDAR_GAPS
+    if now.late - before.late > FEW + 0.05 * scans or (now.lag > 0.0 and not down):
+        yield Fault.LIDAR_LATE
+    if now.misfit:
+        yield Fault.LIDAR_MISFIT
+
+
+def _noun(error: HalError) -> Fault:
+    nouns = {DeviceMissing: Fault.LIDAR_MISSING, DeviceRefused: Fault.LIDAR_REFUSED, DeviceFault: Fault.LIDAR_BROKEN}
+    return next((fault for noun, fault in nouns.items() if isinstance(error, noun)), Fault.LIDAR_SILENT)
+
+
+ADC_NOUNS: Final[tuple[tuple[type[HalError], Fault], ...]] = (
+    (ChipMissing, Fault.ADC_MISSING),
+    (WrongChip, Fault.ADC_WRONG),
+    (BusStuck, Fault.ADC_BUS_STUCK),
+    (Dark, Fault.DARK),
+    (Dazzled, Fault.DAZZLED),
+    (NoSignal, Fault.NO_SIGNAL),
+    (Clipping, Fault.CLIPPED),
+    (DeviceMissing, Fault.ADC_BUS_MISSING),
+    (DeviceRefused, Fault.ADC_BUS_REFUSED),
+    (DataInvalid, Fault.ADC_GARBLED),
+    (HalError, Fault.ADC_BUS_FAULTY),
+)
+"""What a converter's driver says, by kind: the first that fits."""
+
+
+def _adc_noun(error: HalError) -> Fault:
+    return next(fault for noun, fault in ADC_NOUNS if isinstance(error, noun))
+
+
+def _photodiode(now: Vitals, before: Vitals) -> Iterable[Fault]:
+    if now.adc_error is not None:
+        yield _adc_noun(now.adc_error)
+    elif not (now.adc or before.adc) and now.adc_link is Link.STREAMING and 0 < before.cycles < now.cycles:
+        yield Fault.ADC_SILENT
+    blocks, lost = now.blocks - before.blocks, now.lost - before.lost
+    unfit, stalled = now.unfit - before.unfit, now.stalled - before.stalled
+    if unfit > FEW + 0.05 * blocks and not isinstance(now.adc_error, NoSignal | DataInvalid):
+        yield Fault.ADC_GARBLED
+    if now.off_rate:
+        yield Fault.ADC_RATE
+    if stalled > FEW + 0.1 * blocks:
+        yield Fault.ADC_STALLS
+    if now.adc and lost > FEW + 0.02 * (blocks + lost):
+        yield Fault.ADC_GAPS
+
+
+def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
+    if now.odometry is False and now.cycles > 0:  # readings count from the first cycle on
+        yield Fault.ODOMETRY_SILENT
+    if now.odometry_jumps > before.odometry_jumps:
+        yield Fault.ODOMETRY_JUMPS
+    if now.disagree:
+        yield Fault.ODOMETRY_DISAGREES
+    readings, missed = now.readings - before.readings, now.readings_missed - before.readings_missed
+    old = now.readings_old - before.readings_old
+    bad = missed > FEW + 0.05 * (readings + missed) or old > FEW + 0.05 * readings or now.readings_seldom
+    if now.odometry and (bad or now.lag < 0.0):
+        yield Fault.ODOMETRY_GAPS
+    if now.alert:
+        yield Fault.PROTECTION_ALERT
+
+
+def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
+    if now.cycles and now.lateness > STALLED_PERIODS * now.period:  # while kernels are compiled it may well be late
+        yield Fault.LOOP_STALLED
+    if now.overruns - before.overruns > FEW + 0.05 * (now.cycles - before.cycles):
+        yield Fault.OVERRUNS
+    if now.short - before.short > FEW + 0.05 * (now.cycles - before.cycles):
+        yield Fault.OVERLOADED
+    if now.jobs_failed > before.jobs_failed:
+        yield Fault.WORKER_FAILED
+
+
+STORE: Final = {
+    "map": Fault.MAP_NOT_SAVED,
+    "stored map": Fault.MAP_REFUSED,
+    "last pose": Fault.POSE_NOT_KEPT,
+    "flight recorder": Fault.FLIGHT_RECORDER_FAILED,
+    "thread": Fault.THREAD_HANGS,
+}
+"""Parts that keep things, and threads, by name, and what it means that they are down."""
+PUBLISHERS: Final = frozenset(["modbus", "modbus serial", "pose", "pose subscriptions", "stream", "publisher"])
+"""Parts that publish, by name, and what the cycle says of those that it calls."""
+
+
+def _outputs(now: Vitals) -> Iterable[Fault]:
+    if "recorder" in now.failed:
+        yield Fault.RECORDER_FAILED
+    for part, fault in STORE.items():
+        if part in now.failed:
+            yield fault
+    if _publishers(now):
+        yield Fault.PUBLISHER_FAILED
+    if _others(now):
+        yield Fault.PART_FAILED
+
+
+def _publishers(now: Vitals) -> frozenset[str]:
+    return now.failed & PUBLISHERS
+
+
+def _others(now: Vitals) -> frozenset[str]:
+    """Parts that are down and have no fault of their own."""
+    return now.failed - {"recorder", *STORE} - PUBLISHERS

@@ -1,0 +1,286 @@
+"""Turns what a cycle has seen (step result, device status, odometry) into evidence for the state machine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from daemon.health.reasons import Reason as Cause
+from daemon.integrity.evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
+from daemon.integrity.motion_consistency import Witnesses
+from estimator import result as light
+from estimator.measurements import Array, Command, LightEpoch, Odometry, Order, Record, SampleBlock
+from estimator.numerics import se2
+from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
+from hal.lidar import LidarStatus, Link
+
+ENOUGH_INLIERS: Final = 0.4
+"""Part of the beams that has to find its place in the map for a match to count as good."""
+OPENING_S: Final = 10.0
+"""A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
+ODOMETRY_SILENT_S: Final = 1.0
+"""Odometry that has not arrived for this long is silent."""
+LIGHT_SILENT_S: Final = 1.0
+"""Samples that have not arrived for this long are missing; blocks come twenty times a second."""
+GUESS_S: Final = 0.5
+"""A velocity carries the pose along an axis that nothing shows for this long; after that the pose is a guess there."""
+TELLING: Final = (LoopReason.PLACED, LoopReason.LIT)
+"""Loops that tell the place of a robot that may have been carried off."""
+SEVERAL: Final = 3
+"""Lamps by which light can find a place anew."""
+EARLY: Final = 0.01
+"""Part of a scan period by which a timer may be early and still stand for the whole period."""
+
+
+class Observer:
+    """Watches the cycles go by. Its memory: witnesses, when devices last spoke, what was known when all was known.
+
+    Attributes:
+        unused: why the laser is left out though it is there, set by the cycle; None: it is used.
+    """
+
+    def __init__(self, t_mono: float, odometry: bool, lidar: bool = True, lights: bool = False) -> None:
+        """Start watching; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
+        self.witnesses = Witnesses()
+        self.unused: Cause | None = None
+        self._lidar, self._lights = lidar, lights
+        self._t_samples = t_mono
+        self._jumps = 0
+        self._odd = self._placed = False
+        self._t_misplaced: float | None = None
+        self._known = (False, False, False)
+        self._t_start = t_mono
+        self._odometry = odometry
+        self._t_scan: float | None = None
+        self._t_odometry = t_mono
+        self._P_complete: Array | None = None
+        self._mapped = False
+        self._unreachable = False
+        self._t_shown = [t_mono] * 3
+        self._guessed = [False] * 3
+        self._anew = 0
+        self._begun = False
+        self._remembered: Array | None = None
+
+    def odometry_ok(self, t_mono: float, latest: float | None = None) -> bool | None:
+        """Whether odometry is arriving; None where none is configured.
+
+        ``latest``: when the latest reading arrived, which no cycle may have taken yet.
+        """
+        latest = self._t_odometry if latest is None else max(self._t_odometry, latest)
+        return t_mono - latest <= ODOMETRY_SILENT_S if self._odometry else None
+
+    def silence(self, t_mono: float, period: float) -> float | None:
+        """Scan periods since the last scan was taken; None before the first."""
+        return None if self._t_scan is None else (t_mono - self._t_scan) / period
+
+    def on_scan(self, t_rx: float) -> None:
+        """A valid scan has arrived."""
+        self._t_scan = t_rx
+        self._unreachable = False
+
+    def on_odometry(self, t_rx: float) -> None:
+        """A valid odometry reading has arrived."""
+        self._odometry = True
+        self._t_odometry = t_rx
+
+    def evidence(
+        self, t_mono: float, period: float, status: LidarStatus, records: tuple[Record, ...], result: StepResult | None
+    ) -> Evidence:
+        """What one cycle adds; call it once per cycle with everything the cycle consumed."""
+        for record in records:
+            if isinstance(record, Odometry):
+                self.witnesses.on_odometry(record)
+            elif isinstance(record, SampleBlock | LightEpoch):
+                self._t_samples = t_mono
+        ordered = self._take_orders(records)
+        match = self._match(result)
+        if match is not None and result is not None:
+            match = self._without_guesses(match, result, t_mono, ordered)
+        if result is not None and result.placed:
+            sigma_m, sigma_rad = _growth(result.covariance, np.zeros((3, 3)))
+        else:
+            sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
+        silence = self.silence(t_mono, period)
+        late = self._t_scan is None and t_mono - self._t_start > OPENING_S
+        self._unreachable |= status.link is Link.WAITING or late  # until a scan: an attempt more is no news
+        return Evidence(
+            t_mono=t_mono,
+            silence=None if silence is None else silence + EARLY * SILENT_PERIODS,
+            unreachable=self._unreachable,
+            match=match,
+            mapped=self._mapped,
+            sigma_m=sigma_m,
+            sigma_rad=sigma_rad,
+            odometry=self.odometry_ok(t_mono),
+            agree=self.witnesses.agree(),
+            guessed=any(self._guessed),
+            places=_places(result),
+            ordered=ordered,
+            lidar=self._lidar,
+            light=self._light(t_mono, result) if self._lights else None,
+            unused=self.unused,
+            recalled=self._recalled(result),
+        )
+
+    def _take_orders(self, records: tuple[Record, ...]) -> bool:
+        """Whether a person has ordered something; where the robot was last is remembered until it is found."""
+        commands = [record for record in records if isinstance(record, Command)]
+        for command in commands:
+            self._remembered = command.T_map_base if command.order is Order.REMEMBERED else None
+        return any(command.order is not Order.REMEMBERED for command in commands)
+
+    def _recalled(self, result: StepResult | None) -> bool:
+        """Whether the robot has just been found in the whole map, and where the run before has left it."""
+        remembered = self._remembered
+        if result is None or result.loop is None or result.loop.reason is not LoopReason.PLACED or remembered is None:
+            return False
+        from estimator.relocalisation.hypothesis_tracking import near  # the estimator has been loaded, by the warm-up
+
+        self._remembered = None
+        T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
+        return near(remembered, T_map_base)
+
+    def _light(self, t_mono: float, result: StepResult | None) -> Light:
+        """What light says in this cycle; a cycle without a step repeats nothing but the silence."""
+        alive = t_mono - self._t_samples <= LIGHT_SILENT_S
+        if result is None or result.lights is None:
+            return Light(alive, placed=self._placed, known=self._known)
+        lights, gap = result.lights, result.gap
+        against = result.misplaced or (_contradicts(lights) and lights.fix is not Fix.NONE)
+        self._placed, self._known = result.placed, _axes(result.known_axes)
+        moved = result.jumps > self._jumps and self._odd
+        self._jumps = result.jumps
+        self._odd = against or (gap is not None and gap > SURPRISE)
+        return Light(
+            alive=alive,
+            used=alive and lights.fix is Fix.GOOD and bool(lights.accepted),
+            fits=alive and not self._odd and gap is not None and _nearly(lights),
+            placed=result.placed,
+            lost=lights.fix is Fix.LOST,
+            agrees=None if not alive or (gap is None and not against) else not self._odd,
+            moved=moved,
+            elsewhere=alive and self._elsewhere(result.misplaced, lights.t_mono),
+            apart=alive and result.apart,
+            known=self._known,
+        )
+
+    def _elsewhere(self, misplaced: bool, t_epoch: float) -> bool:
+        """Whether a second epoch in a row has what cannot be received at the pose: who walks by adds no light."""
+        if not misplaced:
+            self._t_misplaced = None
+        elif self._t_misplaced is None:
+            self._t_misplaced = t_epoch
+        return self._t_misplaced is not None and t_epoch > self._t_misplaced
+
+    def _match(self, result: StepResult | None) -> Match | None:
+        if result is None or result.match is None:
+            return None
+        found = result.match
+        if found.reason is Reason.PASSED_OVER:
+            return None
+        self._mapped = found.reason is not Reason.NO_MAP
+        if not self._mapped:
+            return None
+        off_m, off_rad = math.hypot(*found.correction[:2].tolist()), abs(float(found.correction[2]))
+        match = Match(good(found), _axes(result.known_axes), off_m, off_rad)
+        laser = found.known_axes if result.placed else result.known_axes  # what light has shown is no echo of the laser
+        self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
+        return match
+
+    def _without_guesses(self, match: Match, result: StepResult, t_mono: float, ordered: bool) -> Match:
+        """The match with the axes taken back along which the map itself was laid upon a guess.
+
+        Without odometry, along an axis that no match shows, the pose is only carried on by its last velocity. A
+        keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
+        is the place in the surroundings, not in the map. A loop closure ends that, an order, and light that agrees.
+        The same is true, along every axis, of a map that was begun anew because nothing fitted the old one: the robot
+        may have been carried off, so that a loop found near where it is taken to be tells nothing. That ends with a
+        place that was looked for everywhere, or that light confirms.
+        """
+        told = ordered or _lit(result)
+        if told or (result.loop is not None and (not self._begun or result.loop.reason in TELLING)):
+            self._guessed, self._begun = [False] * 3, False
+            self._t_shown = [t_mono] * 3
+        if result.anew > self._anew:
+            self._guessed, self._begun = [True] * 3, True
+        self._anew = result.anew
+        for axis, known in enumerate(match.known):
+            if (match.good and known) or self.odometry_ok(t_mono):
+                self._t_shown[axis] = t_mono
+            elif result.keyframe >= 0 and t_mono - self._t_shown[axis] > GUESS_S:
+                self._guessed[axis] = True
+        if not any(self._guessed):
+            return match
+        x, y, yaw = (known and not guess for known, guess in zip(match.known, self._guessed, strict=True))
+        return replace(match, known=(x, y, yaw))
+
+    def _sigma(
+        self, match: Match | None, result: StepResult | None, ordered: bool, odometry: bool | None
+    ) -> tuple[float, float]:
+        """Uncertainty gained by motion that nothing has witnessed: larger axis in m, heading in rad.
+
+        Not the covariance itself: that of a pose in the map grows with the way from the start, while the place in the
+        surroundings is as good as ever. What grows between two complete matches is drift where odometry bridged it.
+        Without odometry it is a guess, and a guess stays one when later scans fit a map that was laid upon it: then
+        the uncertainty is only gone when the estimate itself has become certain again.
+        """
+        if result is None:
+            return 0.0, 0.0
+        P = result.covariance
+        if self._P_complete is None or ordered or not self._mapped:
+            self._P_complete = P
+        sigma_m, sigma_rad = _growth(P, self._P_complete)
+        complete = match is not None and match.good and all(match.known)
+        if complete and (odometry or (sigma_m <= VAGUE_M and sigma_rad <= VAGUE_RAD)):
+            self._P_complete = P
+            return 0.0, 0.0
+        return sigma_m, sigma_rad
+
+
+def _lit(result: StepResult) -> bool:
+    """Whether light tells a place and the pose agrees."""
+    agrees = result.placed and result.gap is not None and result.gap <= SURPRISE
+    return agrees and result.lights is not None and result.lights.fix is Fix.GOOD
+
+
+def _nearly(lights: light.LightsResult) -> bool:
+    """Whether light has a place that it is not sure of yet, by several lamps and no vaguer than a pose may be."""
+    spread = float(lights.covariance[0, 0] + lights.covariance[1, 1])
+    return lights.fix is Fix.STARTING and len(lights.accepted) >= SEVERAL and spread < 2.0 * VAGUE_M**2
+
+
+def _axes(known: Array) -> tuple[bool, bool, bool]:
+    x, y, yaw = known.tolist()
+    return bool(x), bool(y), bool(yaw)
+
+
+def _contradicts(lights: light.LightsResult) -> bool:
+    """Whether of the lamps more are received that cannot be so at the place light is held to have told, than fit it."""
+    fitting = len(lights.accepted) + sum(link.waiting for link in lights.links)
+    return sum(link.against for link in lights.links) > fitting
+
+
+def _places(result: StepResult | None) -> int | None:
+    """How many places fit: of the map, or light says that there are several, as long as it has not told which."""
+    if result is not None and result.places is not None:
+        return result.places
+    if result is None or result.lights is None or result.placed:
+        return None
+    return 2 if result.lights.fix is Fix.AMBIGUOUS else None
+
+
+def _growth(P: Array, before: Array) -> tuple[float, float]:
+    """One-sigma of what a 3x3 covariance has gained: larger axis in m, heading in rad."""
+    (xx, xy, _), (_, yy, _), (_, _, tt) = (P - before).tolist()
+    largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+    return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, tt))
+
+
+def good(match: MatchResult) -> bool:
+    """Whether a match is a result that enough of the scan took part in."""
+    finite = all(map(math.isfinite, match.T_odom_base.tolist()))
+    return match.ok and match.inliers >= ENOUGH_INLIERS * match.queries and finite

@@ -1,0 +1,333 @@
+"""Saves the map while the robot drives: on a schedule, when asked, and at the stop.
+
+The loop's thread only gathers references (`estimator.mapping.map_snapshot.image_of`). Packing and writing is for a
+thread of its own, which lets the loop in between slices of a fraction of a millisecond: Python's lock is held by one of
+them at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon.maps.container import BadMap
+from daemon.maps.start_trial import PROOF_S
+from daemon.maps.store import Start, Store, said
+from daemon.system.versions import release
+from hal.blocking_calls import beside
+from hal.clock import Clock
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from estimator.mapping.map_snapshot import MapImage
+    from estimator.state import State
+
+log = logging.getLogger(__name__)
+
+BEAT_S: Final = 1.0
+FIRST_S: Final = 60.0
+"""A map that has grown for a minute is worth keeping."""
+EVERY_S: Final = 300.0
+"""And every five minutes: what a power cut costs is mapped again on the next pass, and memory cards wear."""
+RETRY_S: Final = 60.0
+LOOK_S: Final = 10.0
+"""A folder that could not be taken at the start is tried so often, whether there is something to be saved or not."""
+BREATH_S: Final = 0.0005
+"""Pause between two slices of packing."""
+STOP_S: Final = 4.0
+"""What the save at the stop may take; the service manager waits for ten seconds."""
+
+DONE: Final = ""
+NO_MAP: Final = "there is no map yet: drive a metre or two"
+NO_FOLDER: Final = "maps are not kept: `map.folder` is none"
+FIXED: Final = "the map is used as it is: `map.localise` is true"
+ADRIFT: Final = "the place in the stored map is not known yet, and the map has not changed"
+
+Revision = tuple[int, int, int]
+Told = Callable[[str], None]
+"""Takes the end of a save that was asked for: :data:`DONE`, or why it came to nothing."""
+End = Callable[[Path | None, str], None]
+"""Takes the end of a save in the loop's thread: the file, or None and why there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What is said of every map of a run.
+
+    Attributes:
+        robot: name of the configuration. survey: digest of the lamps' survey, empty without. localise: never saved.
+    """
+
+    robot: str = ""
+    survey: str = ""
+    localise: bool = False
+
+
+class Keeper:
+    """Keeps the map of a running estimator.
+
+    Attributes:
+        error: why the latest save came to nothing, empty while all is well. saves: so far.
+        busy_since: when the save began that is under way (`time.monotonic`), None: there is none.
+    """
+
+    def __init__(
+        self,
+        store: Store | None,
+        start: Start | None,
+        state: Callable[[], State | None],
+        map_id: Callable[[], int],
+        about: About,
+        clock: Clock,
+    ) -> None:
+        """Nothing happens before :meth:`run`. ``state``: None while the estimator is loaded."""
+        self.error = "" if store is None else store.trouble
+        self.saves = 0
+        self.busy_since: float | None = None
+        self._store, self._start, self._state, self._map_id = store, start, state, map_id
+        self._about, self._clock = about, clock
+        self._saved: Revision | None = None  # the revision that is on the disk
+        self._map_of = map_id()
+        self._anew = self._last = False
+        self._proved_at, self._lasted = math.inf, False
+        self._due = clock.now() + FIRST_S
+        self._look_due = clock.now() + LOOK_S
+        self._waiting: list[Told] = []
+        self._over = asyncio.Event()
+        self._over.set()
+
+    @property
+    def fault(self) -> bool:
+        """Whether the map cannot be kept."""
+        return bool(self.error)
+
+    @property
+    def refused(self) -> bool:
+        """Whether a stored map was found that cannot be used, and none has been saved since."""
+        return self._store is not None and self._store.refused and self.saves == 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether the estimator has been loaded."""
+        return self._state() is not None
+
+    @property
+    def map_id(self) -> int:
+        """Identity of the map in use."""
+        return self._map_id()
+
+    def switched(self, map_id: int, start: Start) -> None:
+        """The estimator goes on in another stored map, ``map_id`` from now on, which need not be saved as it is."""
+        self._start, self._map_of, self._anew = start, map_id, False
+        if (state := self._state()) is not None:
+            _, news, closures = self._revision(state)
+            self._saved = map_id, news, closures
+
+    def without_start(self) -> None:
+        """The run begins with no map after all, under another identity; of it, nothing is there to be saved yet."""
+        self._start, self._map_of = None, self._map_id()
+
+    def loaded(self) -> None:
+        """The estimator can begin: what it begins with need not be saved, but proved to be no start's end."""
+        state, self._proved_at = self._state(), self._clock.now() + PROOF_S
+        if state is not None and self._start is not None:
+            self._saved = self._revision(state)
+
+    def ask(self, told: Told) -> None:
+        """Save as soon as possible, and say when it is on the disk, or why not."""
+        if reason := self._against():
+            told(reason)
+            return
+        self._waiting.append(told)
+        self._go_on()
+
+    def _against(self) -> str:
+        """Why there is nothing to be saved when asked."""
+        if self._store is None:
+            return NO_FOLDER
+        if self._about.localise:
+            return FIXED
+        state = self._state()
+        if state is None or empty(state):
+            return NO_MAP
+        return ADRIFT if state.atlas.unproved is not None and self._saved == self._revision(state) else DONE
+
+    async def run(self) -> None:
+        """Save on the schedule until cancelled."""
+        while True:
+            await asyncio.sleep(BEAT_S)
+            if self._clock.now() >= self._proved_at:
+                await self._proved()
+            self._go_on()
+
+    async def _proved(self) -> None:
+        """The map that the run began with has not ended it."""
+        self._proved_at, self._lasted = math.inf, True
+        if self._store is not None:
+            with contextlib.suppress(RuntimeError):  # no thread: the next start has one less to go
+                await beside(self._store.lasted, "map")
+
+    async def finish(self, in_order: bool = True) -> None:
+        """Save what has changed since the last time, wait for it, but not for ever.
+
+        ``in_order``: the run ends because somebody wants it. One that a defect ends before it has lasted saves nothing:
+        a service that dies again and again would leave a map each time.
+        """
+        with contextlib.suppress(asyncio.TimeoutError):
+            async with asyncio.timeout(STOP_S):
+                if in_order and not self._lasted and self._store is not None:
+                    with contextlib.suppress(RuntimeError):
+                        await beside(self._store.trial.ended, "map")
+                await self._over.wait()
+                if in_order or self._lasted:
+                    self._due, self._last = self._clock.now(), True
+                    self._go_on()
+                    await self._over.wait()
+        if not self._over.is_set():
+            log.error("the map could not be saved within %.0f s of the stop; the one before stays", STOP_S)
+        elif self._store is not None:
+            self._store.close()
+
+    def _go_on(self) -> None:
+        """Begin a save where one is due and none is under way."""
+        state, store = self._state(), self._store
+        if store is None or self._about.localise or not self._over.is_set():
+            return
+        if store.trouble and not self._last and self._clock.now() >= self._look_due:
+            self._look(store)
+            return
+        if state is None:
+            return
+        revision = self._revision(state)
+        if self._map_id() != self._map_of:  # begun anew, which counts at once: the old map must not come back
+            self._start, self._map_of, self._anew, self._due = None, self._map_id(), True, self._clock.now()
+        news = self._anew or (revision != self._saved and not empty(state))
+        if not (self._waiting or (news and self._clock.now() >= self._due)):
+            return
+        self._anew = False
+        waiting, self._waiting = self._waiting, []
+        end = partial(self._end, revision, waiting)
+        self._busy(True)
+        try:
+            self._begin(store, state, end)
+        except Exception as failure:  # no memory, no thread, or a defect: whoever waits is told, and it is tried again
+            log.exception("the save of the map cannot begin")
+            end(None, f"the save cannot begin: {failure!r}")
+
+    def _busy(self, busy: bool) -> None:
+        """A thread is at the folder from now on, or no more."""
+        self.busy_since = time.monotonic() if busy else None
+        if busy:
+            self._over.clear()
+        else:
+            self._over.set()
+
+    def _look(self, store: Store) -> None:
+        """Try again to take the folder, in a thread: a disk may hang."""
+        self._look_due = self._clock.now() + LOOK_S
+        loop, before = asyncio.get_running_loop(), store.trouble
+
+        def work() -> None:
+            store.claim()
+            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+                loop.call_soon_threadsafe(self._looked, store, before)
+
+        self._busy(True)
+        try:
+            threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
+        except Exception:  # no memory, or no thread: the next look is soon
+            log.exception("the folder of maps cannot be looked at")
+            self._busy(False)
+
+    def _looked(self, store: Store, before: str) -> None:
+        """Back in the loop's thread: what kept the folder from being taken is over, or it is not."""
+        self._busy(False)
+        if self.error == before:
+            self.error = store.trouble
+        if not store.trouble:
+            log.info("maps can be kept in %s from now on", store.folder)
+        self._go_on()
+
+    def _begin(self, store: Store, state: State, end: End) -> None:
+        """Gather the map, and have a thread save it, which calls ``end`` in this one."""
+        begun = time.perf_counter()
+        image = self._image(state)
+        log.debug("the map was gathered in %.2f ms", 1e3 * (time.perf_counter() - begun))
+        work = partial(self._work, store, image, asyncio.get_running_loop(), end)
+        threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
+
+    def _revision(self, state: State) -> Revision:
+        """Changes when there is something new to save."""
+        atlas = state.atlas
+        if (first := atlas.unproved) is not None:
+            return self._map_id(), first, -1
+        return self._map_id(), state.next_key, atlas.closures
+
+    def _image(self, state: State) -> MapImage:
+        from estimator.mapping.map_snapshot import Identity, image_of
+
+        before = self._start.stored.meta if self._start is not None else None
+        who = Identity(
+            map_id=self._map_id(),
+            name=before.name if before is not None else "",
+            surveyed=before is not None and before.surveyed,
+            survey=self._about.survey or (before.survey if before is not None else ""),
+            session=1 + (before.session if before is not None else 0),
+        )
+        return image_of(state, who)
+
+    def _work(self, store: Store, image: MapImage, loop: asyncio.AbstractEventLoop, end: End) -> None:
+        """Pack, write, verify; in a thread of its own."""
+        path, error = None, DONE
+        try:
+            path = store.save(self._packed(image), image.identity.map_id)
+        except OSError as failure:
+            error = f"{store.folder}: {said(failure)}"
+        except BadMap as failure:
+            error = f"{store.folder}: {failure}"
+        except Exception as failure:  # a defect in the packing must not end saving for good, and is told in full
+            log.exception("the map cannot be packed")
+            error = f"it cannot be packed: {failure!r}"
+        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+            loop.call_soon_threadsafe(end, path, error)
+
+    def _packed(self, image: MapImage) -> bytes:
+        from daemon.maps.image import meta_of, packed
+
+        meta = meta_of(image, self._clock.utc(), self._about.robot, release())
+        return packed(image, meta, partial(time.sleep, BREATH_S))
+
+    def _end(self, revision: Revision, waiting: list[Told], path: Path | None, error: str) -> None:
+        """Back in the loop's thread."""
+        self._busy(False)
+        self._due = self._clock.now() + (RETRY_S if error else EVERY_S)
+        if path is not None:
+            self._saved = revision
+            self.saves += 1
+            news = waiting or self.error or self.saves == 1 or self._last
+            log.log(logging.INFO if news else logging.DEBUG, "map saved: %s", path)
+        else:
+            # tried again, though there may be nothing new: the fault is to end when what was in the way has gone
+            self._anew |= self._saved is not None and (self._saved == revision or self._saved[0] != self._map_id())
+        if error and not self.error:
+            again = "" if self._last else ", and it is tried again"
+            log.info("the map cannot be saved: %s; what was saved before stays%s", error, again)  # the fault warns
+        self.error = error
+        for told in waiting:
+            told(error)
+        if self._waiting:
+            self._go_on()
+
+
+def empty(state: State) -> bool:
+    """Whether there is nothing of a map yet: no keyframe, and nothing learned of lamps."""
+    learned = state.light is not None and bool(state.light.filter.gains)
+    return not (state.keyframes or state.atlas.submaps or learned)

@@ -1,0 +1,231 @@
+"""``lumiloop map align`` and ``lumiloop map name``: a map file changed as a whole, written as the next generation.
+
+Nothing here loads the estimator's compiler.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import secrets
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from daemon.cli import parser
+from daemon.config.paths import maps_folder
+from daemon.config.schema import Config
+from daemon.maps.container import BadMap, pack
+from daemon.maps.schema import Meta, Stored, Tables, read
+from daemon.maps.store import Store, said
+from daemon.system.atomic_file import write_whole
+
+Array = npt.NDArray[np.float64]
+
+LONGEST_NAME: Final = 64
+LEAST_APART_M: Final = 1.0
+"""Points nearer together than this say nothing of how the map is turned."""
+TOLERANCE_M, TOLERANCE = 0.1, 0.01
+"""A point may be off by so much, and the scale by so much: what people measure with a tape."""
+
+
+class Refused(Exception):
+    """It cannot be done; the text says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A rigid motion of the map.
+
+    Attributes:
+        T: (x, y, yaw), the map's old frame in the new one. residual_m: of each point. scale: distances in the new frame
+            over those in the old one, 1 where they agree.
+    """
+
+    T: tuple[float, float, float]
+    residual_m: tuple[float, ...]
+    scale: float
+
+
+def opened(path: Path) -> Stored:
+    """What a map file holds.
+
+    Raises:
+        OSError: it cannot be read. BadMap: it cannot be used. Both name the file and the remedy.
+    """
+    try:
+        return read(path.read_bytes())
+    except OSError as error:
+        raise OSError(f"{path}: cannot be read: {said(error)}; name a map file, *.lumimap") from error
+    except BadMap as error:
+        raise type(error)(f"{path}: {error}; {error.advice}") from error
+
+
+def put(path: Path, content: bytes) -> Path:
+    """Write a map to a place that a person has named; `OSError` names it and the remedy."""
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {said(error)}; name another place with --out FILE") from error
+    return path
+
+
+def keep(settings: Config, content: bytes, map_id: int) -> Path:
+    """Put a map into the configured folder; `OSError`, with the remedy, where another process uses it."""
+    if not settings.map.kept:
+        raise OSError("`map.folder` is none; name a place with --out FILE")
+    store = Store(maps_folder(settings.map.folder))
+    try:
+        return store.save(content, map_id)
+    except OSError as error:
+        raise OSError(f"{store.folder}: {said(error)}; stop the daemon, or name --out FILE") from error
+    finally:
+        store.close()
+
+
+def align(args: argparse.Namespace) -> int:
+    """Move a map so that points of it come to lie where a person says; returns the exit code."""
+    try:
+        stored = opened(args.map)
+        if stored.meta.surveyed:
+            raise Refused(f"{args.map}: lies in the frame of the lamps' survey; move the lamps in the survey instead")
+        fit = fitted([pair_of(text) for text in args.point])
+        judge(fit)
+        meta = msgspec.structs.replace(stored.meta, map_id=1 + secrets.randbelow(2**32 - 1))
+        path = written(args, moved(stored.tables, fit.T), meta)
+    except (BadMap, Refused, OSError) as error:
+        return parser.fail(str(error))
+    x, y, yaw = fit.T
+    off = ", ".join(f"{1e3 * one:.0f} mm" for one in fit.residual_m)
+    sys.stdout.write(
+        f"moved by x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg; points are off by {off}; "
+        f"distances are {100.0 * (fit.scale - 1.0):+.2f} % of the map's\n{path}: map {meta.map_id:08x}\n"
+    )
+    return parser.OK
+
+
+def name(args: argparse.Namespace) -> int:
+    """Say which floor or building a map is of; returns the exit code."""
+    try:
+        stored = opened(args.map)
+        meta = msgspec.structs.replace(stored.meta, name=called(args.text))
+        path = written(args, stored.tables, meta)
+    except (BadMap, Refused, OSError) as error:
+        return parser.fail(str(error))
+    sys.stdout.write(f"{path}: map {meta.map_id:08x} is called {meta.name!r}\n")
+    return parser.OK
+
+
+def called(text: str) -> str:
+    """The name of a map.
+
+    Raises:
+        Refused: it cannot be one.
+    """
+    text = text.strip()
+    if len(text) > LONGEST_NAME or not text.isprintable():
+        raise Refused(f"a name is one line of at most {LONGEST_NAME} characters")
+    return text
+
+
+def written(args: argparse.Namespace, tables: Tables, meta: Meta) -> Path:
+    """Write the changed map: to ``args.out``, else as the next generation beside the old one."""
+    content = pack({**tables, "meta": msgspec.structs.replace(meta, saved=time.time()).packed()})
+    read(content)  # what cannot be read again is not written
+    if args.out is not None:
+        return put(args.out, content)
+    store = Store(args.map.parent)
+    try:
+        return store.save(content, meta.map_id)
+    except OSError as error:
+        raise Refused(f"{args.map.parent}: {said(error)}; stop the daemon, or name --out FILE") from error
+    finally:
+        store.close()
+
+
+def pair_of(text: str) -> tuple[float, float, float, float]:
+    """``X,Y=X',Y'`` as four numbers, m.
+
+    Raises:
+        Refused: it is not written so.
+    """
+    sides = [side.split(",") for side in text.split("=")]
+    try:
+        numbers = [float(part) for side in sides for part in side]
+    except ValueError:
+        numbers = []
+    if [len(side) for side in sides] != [2, 2] or len(numbers) != 4 or not all(map(math.isfinite, numbers)):
+        raise Refused(f"--point {text}: write X,Y=X',Y', in metres: where it is in the map, and where it should be")
+    a, b, c, d = numbers
+    return a, b, c, d
+
+
+def fitted(pairs: list[tuple[float, float, float, float]]) -> Fit:
+    """The rigid motion that brings the first points nearest to the second ones (least squares, Arun et al. 1987).
+
+    Raises:
+        Refused: fewer than two points, or all in one place.
+    """
+    if len(pairs) < 2:
+        raise Refused("two points at least are needed: --point X,Y=X',Y' --point ...; the farther apart the better")
+    a, b = np.array(pairs)[:, :2], np.array(pairs)[:, 2:]
+    p, q = a - a.mean(axis=0), b - b.mean(axis=0)
+    wide_p, wide_q = float(np.hypot(*np.ptp(a, axis=0))), float(np.hypot(*np.ptp(b, axis=0)))
+    if min(wide_p, wide_q) < LEAST_APART_M:
+        raise Refused(f"the points lie within {min(wide_p, wide_q):.2f} m; take some {LEAST_APART_M:g} m apart or more")
+    yaw = math.atan2(float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()), float((p * q).sum()))
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array(((c, -s), (s, c)))
+    x, y = (b.mean(axis=0) - R @ a.mean(axis=0)).tolist()
+    off = np.hypot(*(a @ R.T + (x, y) - b).T)
+    scale = math.sqrt(float((q * q).sum()) / float((p * p).sum()))
+    return Fit((x, y, yaw), tuple(off.tolist()), scale)
+
+
+def judge(fit: Fit) -> None:
+    """Whether the points are those of one rigid body.
+
+    Raises:
+        Refused: their distances disagree.
+    """
+    worst = int(np.argmax(fit.residual_m))
+    if abs(fit.scale - 1.0) > TOLERANCE or fit.residual_m[worst] > TOLERANCE_M:
+        raise Refused(
+            f"the distances disagree: {100.0 * (fit.scale - 1.0):+.1f} % of the map's, point {worst + 1} is off by "
+            f"{fit.residual_m[worst]:.2f} m; measuring errors are at most {100.0 * TOLERANCE:g} % and {TOLERANCE_M:g} m"
+        )
+
+
+def moved(tables: Tables, T: tuple[float, float, float]) -> Tables:
+    """The map with everything that lies in its frame moved."""
+    after = dict(tables)
+    for key in ("submap.map", "pose"):
+        after[key] = shifted(tables[key], T)
+    for key in ("submap.light", "frame.light"):
+        after[key] = np.column_stack((shifted(tables[key][:, :3], T), turned(tables[key][:, 3:], T[2])))
+    after["pose.P"] = turned(tables["pose.P"].reshape(-1, 9), T[2]).reshape(-1, 3)
+    after["lamp"] = tables["lamp"].copy()
+    after["lamp"][:, :2] = shifted(np.column_stack((tables["lamp"][:, :2], np.zeros(len(tables["lamp"])))), T)[:, :2]
+    return after
+
+
+def shifted(poses: Array, T: tuple[float, float, float]) -> Array:
+    """Poses (n, 3) seen from the new frame."""
+    x, y, yaw = T
+    c, s = math.cos(yaw), math.sin(yaw)
+    u, v, w = np.asarray(poses).T
+    w = np.mod(w + yaw + np.pi, 2.0 * np.pi) - np.pi
+    return np.column_stack((x + c * u - s * v, y + s * u + c * v, w))
+
+
+def turned(P: Array, yaw: float) -> Array:
+    """Covariances, (n, 9) row by row, in the axes of the new frame."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+    return np.asarray(R @ P.reshape(-1, 3, 3) @ R.T).reshape(-1, 9)

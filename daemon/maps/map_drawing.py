@@ -1,0 +1,168 @@
+"""A map with a trajectory as a picture to look at: walls dark on white, the path coloured from its start to its end.
+
+Ceiling lamps, where the map lies in their survey, are rings filled with yellow.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.mapping.occupancy_grid import Grid
+from estimator.measurements import Array
+
+Pixels = npt.NDArray[np.float64]
+
+SMALLEST_SIDE: Final = 1200
+"""Cells are drawn larger until the longer side has about this many pixels."""
+
+UNKNOWN: Final = np.array((205.0, 211.0, 220.0))
+FREE: Final = np.array((255.0, 255.0, 255.0))
+WALL: Final = np.array((28.0, 34.0, 48.0))
+PATH: Final = np.array(((37, 99, 235), (16, 185, 129), (245, 158, 11), (220, 38, 38)), dtype=np.float64)
+"""Path colours from start to end: blue, green, amber, red."""
+
+START: Final = np.array((37.0, 99.0, 235.0))
+END: Final = np.array((220.0, 38.0, 38.0))
+LAMP: Final = np.array((250.0, 204.0, 21.0))
+_LAMP_PX: Final = 6.0
+_RING_PX: Final = 2.0
+_LINE_PX: Final = 1.2
+_JUMP_M: Final = 0.5
+_JUMP_TIMES: Final = 8.0
+"""Between two positions that lie farther apart than this, and than so many ordinary steps, nothing was driven: the
+robot was carried, or found elsewhere. No line is drawn."""
+_DOT_PX: Final = 7.0
+_BAR_PX: Final = 3.0
+_LETTERS: Final = {
+    "0": (" ### ", "#   #", "#   #", "#   #", "#   #", "#   #", " ### "),
+    "1": (" #", "##", " #", " #", " #", " #", " #"),
+    "5": ("#####", "#    ", "#### ", "    #", "    #", "#   #", " ### "),
+    "m": ("       ", "       ", "###### ", "#  #  #", "#  #  #", "#  #  #", "#  #  #"),
+    " ": ("  ",) * 7,
+}
+_LETTER_PX: Final = 2
+_BAND: Final = 64
+"""Rows of cells that are drawn at a time."""
+
+Discs = tuple[Array, Pixels, float]
+"""Places (n, 2) in pixels, colours (n, 3) and radius."""
+
+
+def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.uint8]:
+    """RGB pixels (rows, columns, 3), top row first.
+
+    Args:
+        grid: the map.
+        path: (n, 2 or more) positions in the map frame in order of time, metres; n may be 0.
+        lamps: (k, 2) positions of lamps in the map frame; those beyond the map's edge are not drawn.
+    """
+    probability = grid.probability[::-1]
+    if probability.size == 0:
+        return np.broadcast_to(UNKNOWN, (16, 16, 3)).astype(np.uint8)
+    rows, columns = probability.shape
+    scale = max(1, round(SMALLEST_SIDE / max(rows, columns)))
+    discs = _discs(grid, path, lamps, scale)
+    pixels = np.empty((scale * rows, scale * columns, 3), np.uint8)
+    for first in range(0, rows, _BAND):  # what is computed with takes twenty times the memory of the picture
+        band = _shade(probability[first : first + _BAND].repeat(scale, axis=0).repeat(scale, axis=1))
+        top = scale * first
+        for places, colours, radius in discs:
+            _stamp(band, places - (top, 0.0), colours, radius)
+        pixels[top : top + len(band)] = np.rint(band)
+    _draw_bar(pixels, scale / grid.resolution)
+    return pixels
+
+
+def _shade(probability: npt.NDArray[np.float32]) -> Pixels:
+    """Unknown at one half, towards free below and towards wall above."""
+    certain = 2.0 * probability[..., None].astype(np.float64) - 1.0
+    goal = np.where(certain > 0.0, WALL, FREE)
+    return np.asarray(UNKNOWN + np.abs(certain) * (goal - UNKNOWN))
+
+
+def _to_pixels(grid: Grid, path: Array, scale: int, rows: int) -> Array:
+    """Pixel coordinates (row, column) of positions."""
+    cells = (path[:, :2] - grid.origin) / grid.resolution * scale
+    return np.stack([rows - cells[:, 1], cells[:, 0]], axis=1)
+
+
+def _discs(grid: Grid, path: Array, lamps: Array | None, scale: int) -> list[Discs]:
+    """What is drawn over the map, the lowest first."""
+    rows = scale * len(grid.log_odds)
+    discs: list[Discs] = []
+    if lamps is not None and len(lamps) > 0:
+        at = _to_pixels(grid, lamps, scale, rows)
+        discs.append((at, np.tile(WALL, (len(at), 1)), _LAMP_PX + _RING_PX))
+        discs.append((at, np.tile(LAMP, (len(at), 1)), _LAMP_PX))
+    places = _to_pixels(grid, path, scale, rows)
+    return discs + _line(places, scale / grid.resolution) if len(places) > 0 else discs
+
+
+def _line(places: Array, pixels_per_metre: float) -> list[Discs]:
+    """The path, densely stamped with soft dots, and a larger dot at either end; nothing where the robot was carried."""
+    steps = np.hypot(*np.diff(places, axis=0).T) if len(places) > 1 else np.zeros(0)
+    driven = steps[steps > 0.01 * pixels_per_metre]
+    ordinary = float(np.percentile(driven, 90.0)) if len(driven) else 0.0
+    carried = steps > max(_JUMP_M * pixels_per_metre, _JUMP_TIMES * ordinary)
+    along = np.concatenate([[0.0], np.cumsum(np.where(carried, 1e-9, steps))])
+    count = max(2, int(along[-1] * 1.5))
+    wanted = np.linspace(0.0, along[-1], count)
+    dense = np.stack([np.interp(wanted, along, places[:, axis]) for axis in (0, 1)], axis=1)
+    shades = np.linspace(0.0, len(PATH) - 1.0, count)
+    colours = np.stack([np.interp(shades, np.arange(len(PATH)), PATH[:, c]) for c in range(3)], axis=1)
+    return [
+        (dense, colours, _LINE_PX),
+        (places[:1], START[None], _DOT_PX),
+        (places[-1:], END[None], _DOT_PX),
+    ]
+
+
+def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> None:
+    """Blend a soft-edged disc of ``radius`` pixels at each place; a pixel takes the colour of its last disc."""
+    reach = int(np.ceil(radius)) + 1
+    rows, columns = pixels.shape[:2]
+    near = (places[:, 0] > -reach - 1) & (places[:, 0] < rows + reach + 1)
+    if not near.any():
+        return
+    places, colours = places[near], colours[near]
+    centre = np.floor(places).astype(np.int64)
+    cover = np.zeros((rows, columns))
+    paint = np.zeros((rows, columns, 3))
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            r, c = centre[:, 0] + down, centre[:, 1] + right
+            distance = np.hypot(r + 0.5 - places[:, 0], c + 0.5 - places[:, 1])
+            strength = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+            seen = (strength > 0.0) & (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
+            np.maximum.at(cover, (r[seen], c[seen]), strength[seen])
+            paint[r[seen], c[seen]] = colours[seen]
+    pixels += cover[..., None] * (paint - pixels)
+
+
+def lettered(text: str) -> npt.NDArray[np.bool_]:
+    """A length in pixels, (14, columns), true where there is ink; no font has to be installed for that."""
+    letters = [np.array([[pixel == "#" for pixel in row] for row in _LETTERS[letter]]) for letter in text]
+    word = np.concatenate([np.pad(letter, ((0, 0), (0, 1))) for letter in letters], axis=1)
+    return word.repeat(_LETTER_PX, axis=0).repeat(_LETTER_PX, axis=1)
+
+
+def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
+    """A scale bar in the lower left corner, the longest of 1, 5, 10, 50, 100 m that takes at most a third."""
+    rows, columns = pixels.shape[:2]
+    length = next((m for m in (100, 50, 10, 5, 1) if m * pixels_per_metre <= columns / 3), 0)
+    margin = round(4 * _BAR_PX)
+    if length == 0 or rows <= 3 * margin:
+        return
+    end = margin + round(length * pixels_per_metre)
+    bottom = rows - margin
+    pixels[bottom - round(_BAR_PX) : bottom, margin:end] = WALL
+    word = lettered(f"{length} m")
+    top = bottom - round(4 * _BAR_PX) - len(word)
+    if top >= 0 and margin + word.shape[1] <= columns:
+        pixels[top : top + len(word), margin : margin + word.shape[1]][word] = WALL
+    for tick in np.linspace(margin, end - 1, (length if length <= 10 else 10) + 1):
+        column = round(float(tick))
+        pixels[bottom - round(3 * _BAR_PX) : bottom, column : column + 1] = WALL

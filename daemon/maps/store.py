@@ -1,0 +1,451 @@
+"""The folder in which maps are kept: generations of whole files, of which the newest good one is loaded.
+
+A map is written beside, synced, moved to a name of its own, read back and compared; only then do older generations go.
+A power cut, or a kill at any moment, therefore leaves the old map or the new one. A file that is not as it was written
+is moved aside under the same name with ``.broken`` and never deleted.
+
+Kept of the map in use are the two newest generations, of which one may fail, and the one that this run began with: it
+is the last that a whole run has proved, should this run spoil the map. Of every other map (RESET begins one, and each
+building has its own) the newest good generation is kept, of the seven latest: nothing goes but behind a file that has
+been read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon.config.paths import maps_folder
+from daemon.config.schema import MapConfig
+from daemon.maps.container import BadMap, Damaged, Foreign
+from daemon.maps.schema import OtherBuilding, Stored, against_survey, read
+from daemon.maps.start_trial import LEFT_OUT, MOST, Trial
+from daemon.system.atomic_file import sync_folder, write_whole
+
+if TYPE_CHECKING:
+    from daemon.runtime.light_setup import Lights
+
+log = logging.getLogger(__name__)
+
+LOCK: Final = "lock"
+NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap")
+BROKEN: Final = ".broken"
+BROKEN_NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap\.broken")
+MOST_BROKEN: Final = 8
+"""Files that a failing disk has spoilt while they were saved, kept for who wants to know."""
+START: Final = "start.lumimap"
+"""File of a recording's folder: the map that the run began with."""
+NEWEST: Final = 2
+OTHERS: Final = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Generation:
+    """One file.
+
+    Attributes:
+        number: counts all saves in the folder; 0: somebody has put it there. map_id: by its name; negative: not told.
+    """
+
+    number: int
+    map_id: int
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The map that a run begins with.
+
+    Attributes:
+        content: of the file. stored: what it holds. changed: lamps whose gains are not believed, because the survey has
+            changed since. localise: it is only used, and never changed.
+    """
+
+    content: bytes
+    stored: Stored
+    changed: frozenset[int] = frozenset()
+    localise: bool = False
+
+
+class NoMap(Exception):
+    """There is no map, and nothing can be done without one; names the folder and the remedy."""
+
+
+Judge = Callable[[Stored], tuple[str, frozenset[int]]]
+"""Whether a map fits the configured survey: see `store_tables.against_survey`."""
+
+
+def unjudged(stored: Stored) -> tuple[str, frozenset[int]]:
+    """Every map fits where there is no survey."""
+    return "", frozenset()
+
+
+def judge_for(lights: Lights | None) -> Judge:
+    """Whether a map fits what is configured of lights."""
+    return unjudged if lights is None else partial(against_survey, survey=lights.survey)
+
+
+def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tuple[Store | None, Start | None]:
+    """The folder of maps and the map that a run begins with, as far as there are such.
+
+    Raises:
+        NoMap: a map is to be used as it is, and there is none that can be.
+    """
+    if not config.kept:
+        return None, None
+    store = Store(maps_folder(config.folder), mend)
+    if mend and not config.localise:
+        store.claim()
+    start = store.load(judge_for(lights))
+    if start is None and config.localise:
+        raise NoMap(
+            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
+            "one, or import one: lumiloop map import"
+        )
+    if start is None and store.refused:
+        log.error("no map in %s can be used; a new one is begun", store.folder)
+    if start is not None:
+        start = replace(start, localise=config.localise)
+        meta = start.stored.meta
+        named = f" ({meta.name})" if meta.name else ""
+        count = len(start.stored.tables["submap.key"])
+        log.info("map %08x%s of %d submaps loaded from %s", meta.map_id, named, count, store.folder)
+    return store, start
+
+
+def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
+    """The map in a recording's folder.
+
+    Raises:
+        OSError: it cannot be read. BadMap: it is not the one that the run began with, or not good.
+    """
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise Damaged(f"{path.name} is not the map that the recorded run began with")
+    stored = read(content)
+    return Start(content, stored, judge_for(lights)(stored)[1], localise)
+
+
+class Store:
+    """A folder of maps, used by one process at a time.
+
+    Attributes:
+        damaged: whether a map was found and could not be used. left_out: or is not, because no start has outlived it.
+        trouble: what kept `claim` from taking the folder.
+        trial: of the map that a run begins with which has taken the folder.
+    """
+
+    def __init__(self, folder: Path, mend: bool = True) -> None:
+        """Nothing is touched yet. ``mend``: what is broken may be moved aside."""
+        self.folder = folder
+        self._mend = mend
+        self.damaged = self.left_out = False
+        self._origin: Path | None = None
+        self._good: dict[Path, bool] = {}
+        self._lock: int | None = None
+        self.trouble = ""
+        self.trial: Final = Trial(folder)
+
+    @property
+    def refused(self) -> bool:
+        """Whether there is a map that is not used."""
+        return self.damaged or self.left_out
+
+    def claim(self) -> None:
+        """Take the folder for this process before there is a map to save: what keeps it from that is known at once.
+
+        May be tried again; what has not changed is not said again.
+        """
+        try:
+            self._use()
+        except OSError as error:
+            before, self.trouble = self.trouble, f"{self.folder}: {said(error)}"
+            if self.trouble != before:
+                log.error("no map can be kept in %s; mend that, or name another `map.folder`", self.trouble)
+
+    def generations(self) -> list[Generation]:
+        """All that are there, newest first."""
+        try:
+            paths = sorted(self.folder.glob("*.lumimap")) if self.folder.is_dir() else []
+            if not paths and self.folder.exists():
+                os.scandir(self.folder).close()  # says why there is nothing to be seen
+        except FileNotFoundError:
+            return []
+        found = []
+        for foreign, path in enumerate(paths):
+            match = NAME.fullmatch(path.name)
+            found.append(Generation(int(match[2]), int(match[1], 16), path) if match else Generation(0, ~foreign, path))
+        return sorted(found, key=lambda one: one.number, reverse=True)
+
+    def load(self, judge: Judge = unjudged) -> Start | None:
+        """The newest good map that fits; None where there is none. What cannot be used is said in the log.
+
+        Where a generation is damaged the one before it counts. Another map than the latest is taken only if that one
+        belongs to another building: what a person has begun anew does not come back by itself. A file under a name
+        of one's own is no generation of anything: where it is damaged the next one counts.
+        """
+        if self._lock is not None:
+            self.trial.read()
+        while True:
+            start, before = self._newest(judge), self.trial.out
+            name = self._origin.name if start is not None and self._origin is not None else ""
+            if self._lock is None or not self.trial.changes(name):
+                return start
+            if not self.trial.out:
+                them = ", ".join(before)
+                log.warning("%s: %d starts without %s have not lasted either; tried again", self.folder, MOST, them)
+
+    def _newest(self, judge: Judge) -> Start | None:
+        """As :meth:`load`, of those that are not left out."""
+        self._origin, self.left_out = None, False
+        try:
+            generations = self.generations()
+        except OSError as error:
+            log.error(
+                "maps in %s cannot be read: %s; mend that, or name another `map.folder`", self.folder, said(error)
+            )
+            self.damaged = True
+            return None
+        by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
+        looked = set[int]()
+        for map_id, files in groupby(by_map, key=lambda one: one.map_id):
+            looked.add(map_id)
+            elsewhere, refused = True, False
+            for generation in files:
+                if generation.path.name in self.trial.out:
+                    log.error("%s is refused: %s", generation.path, LEFT_OUT)
+                    elsewhere, refused, self.left_out = False, True, True
+                    continue
+                try:
+                    start = self._read(generation, judge)
+                except OtherBuilding as error:
+                    self._refuse(generation.path, error)
+                except (BadMap, OSError) as error:
+                    self._refuse(generation.path, error)
+                    elsewhere, refused = not generation.number, True  # what somebody has put there is no generation
+                else:
+                    if refused:
+                        log.warning("%s is used, the newest good generation of this map", generation.path)
+                    self._origin = generation.path
+                    return start
+            if not elsewhere:
+                others = ", ".join(sorted(one.path.name for one in generations if one.map_id not in looked))
+                if others:
+                    log.warning(
+                        "%s: not looked at, being of other maps: %s; to use one, move the others out",
+                        self.folder,
+                        others,
+                    )
+                break
+        return None
+
+    def lasted(self) -> None:
+        """This run has lasted: what it was begun without is moved aside, all others are good."""
+        if self._lock is None:
+            return
+        for name in self.trial.lasted():
+            with contextlib.suppress(OSError):
+                aside = (self.folder / name).replace(self.folder / (name + BROKEN))
+                log.warning("%s: a start without it has lasted; it is kept for whoever mends that", aside)
+
+    def load_map(self, map_id: int, judge: Judge = unjudged) -> Start:
+        """The newest good generation of one map.
+
+        Raises:
+            BadMap: none is good, or it belongs to another building. OSError: it cannot be read.
+        """
+        failure: BadMap | OSError = Foreign(f"there is no map {map_id:08x} in {self.folder}")
+        for generation in self.generations():
+            if generation.map_id == map_id:
+                try:
+                    start = self._read(generation, judge)
+                except (BadMap, OSError) as error:
+                    log.error("%s is refused: %s", generation.path, error)
+                    failure = error
+                else:
+                    self._origin = generation.path
+                    return start
+        raise failure
+
+    def _read(self, generation: Generation, judge: Judge) -> Start:
+        content = generation.path.read_bytes()
+        stored = read(content)
+        if generation.number and stored.meta.map_id != generation.map_id:
+            raise Foreign(f"it holds map {stored.meta.map_id:08x}, another than its name says")
+        words, changed = judge(stored)
+        if words:
+            log.warning("%s: %s; what was learned of them is forgotten, the map is used", generation.path, words)
+        if stored.isolated:
+            log.warning(
+                "%s: %d of its submaps are joined with the rest by nothing and are left out",
+                self._copy_aside(generation.path, content),
+                stored.isolated,
+            )
+        return Start(content, stored, changed)
+
+    def refuse(self, error: BadMap) -> None:
+        """The map that was loaded cannot be used after all: say why, and get it out of the way."""
+        if self._origin is not None:
+            self._refuse(self._origin, error)
+            self._origin = None
+
+    def _copy_aside(self, path: Path, content: bytes) -> Path:
+        """Keep a torn map for who wants to know: what is saved next lacks a part of it."""
+        aside = path.with_name(path.name + ".torn")
+        with contextlib.suppress(OSError):
+            if self._mend and not aside.exists():
+                write_whole(aside, content)
+            return aside if aside.exists() else path
+        return path
+
+    def _refuse(self, path: Path, error: BadMap | OSError) -> None:
+        """Say why a file is not used; one that is damaged gets out of the way."""
+        self.damaged = True
+        if isinstance(error, OSError):
+            log.error("%s cannot be read: %s; mend that, or move it away", path, said(error))
+            return
+        where = path
+        if self._mend and isinstance(error, Damaged | Foreign):
+            aside = path.with_name(path.name + BROKEN)
+            with contextlib.suppress(OSError):
+                where = path.replace(aside)
+        log.error("%s is refused: %s; %s", where, error, error.remedy)
+
+    def save(self, content: bytes, map_id: int) -> Path:
+        """Write a generation, verify it by reading it back, then let older ones go; returns its path.
+
+        Raises:
+            OSError: it cannot be written or read, or another process uses the folder; what was there before stays.
+            BadMap: what was read back is not what was written; the file is kept aside.
+        """
+        self._use()
+        path = self.folder / f"map-{map_id:08x}-{self._next():08d}.lumimap"
+        write_whole(path, content)
+        try:
+            verify(path, content)
+        except BadMap:
+            path.replace(path.with_name(path.name + BROKEN))
+            self._drop_broken()
+            raise
+        self._let_go(map_id)
+        return path
+
+    def _drop_broken(self) -> None:
+        """A disk that does not keep what is written would fill up with what it has spoilt: the newest few stay."""
+        found = [(int(match[2]), path) for path in self.folder.iterdir() if (match := BROKEN_NAME.fullmatch(path.name))]
+        for _, path in sorted(found)[:-MOST_BROKEN]:
+            log.warning("%s goes: %d damaged maps are newer", path, MOST_BROKEN)
+            path.unlink(missing_ok=True)
+
+    def _use(self) -> None:
+        """Make the folder and take it for this process; what a killed one has left half written goes."""
+        if self._lock is None or not self.folder.is_dir():
+            self._take()
+        self.trouble = ""
+
+    def _take(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            raise
+        if self._lock is not None:
+            os.close(self._lock)
+        self._lock = lock
+        for part in self.folder.glob(".map-*.part"):
+            try:
+                part.unlink(missing_ok=True)
+            except OSError as error:  # in nobody's way: the next map has another name
+                log.warning("%s cannot be removed: %s; it is left there", part, said(error))
+
+    def _next(self) -> int:
+        """The number after all that were ever given, broken ones too."""
+        numbers = [int(match[2]) for path in self.folder.iterdir() if (match := NAME.match(path.name))]
+        return 1 + max(numbers, default=0)
+
+    def _let_go(self, map_id: int) -> None:
+        for generation in self._superfluous(map_id):
+            log.info("%s goes: an older generation", generation.path)
+            generation.path.unlink(missing_ok=True)
+        sync_folder(self.folder)
+
+    def _superfluous(self, map_id: int) -> Iterator[Generation]:
+        """What newer files make up for: of this map the one just verified, of others one that has been read."""
+        others: dict[int, list[Generation]] = {}
+        mine = 0
+        for generation in self.generations():
+            if generation.number == 0:
+                continue
+            if generation.map_id != map_id:
+                others.setdefault(generation.map_id, []).append(generation)
+                continue
+            mine += 1
+            if mine > NEWEST and generation.path != self._origin:
+                yield generation
+        for files in others.values():
+            if len(files) > 1:
+                yield from files[1 + self._newest_good(files) :]
+        if len(others) > OTHERS:
+            usable = [files for files in others.values() if self._newest_good(files) < len(files)]
+            for files in usable[OTHERS:]:
+                log.warning("%s goes: %d maps of other places are newer", files[0].path, OTHERS)
+                yield from files[: 1 + self._newest_good(files)]
+
+    def _newest_good(self, files: list[Generation]) -> int:
+        """Place of the first generation of one map that can be read; their number where none can."""
+        return next((place for place, generation in enumerate(files) if self._is_good(generation)), len(files))
+
+    def _is_good(self, generation: Generation) -> bool:
+        """Whether a file can be read; each is looked at once, maps are large."""
+        if generation.path not in self._good:
+            try:
+                read(generation.path.read_bytes())
+            except (BadMap, OSError) as error:
+                log.warning("%s cannot be used: %s; the generation before it is kept", generation.path, error)
+                self._good[generation.path] = False
+            else:
+                self._good[generation.path] = True
+        return self._good[generation.path]
+
+    def close(self) -> None:
+        """Let others use the folder; idempotent."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def verify(path: Path, content: bytes) -> None:
+    """Whether a file on the disk is what was written, and loads.
+
+    Raises:
+        Damaged: it is not. OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # from the disk, not from what we just gave it
+        found = file.read()
+    if found != content:
+        raise Damaged("what was read back is not what was written: the disk is failing")
+    read(found)
+
+
+def said(error: OSError) -> str:
+    """What is wrong, for people."""
+    if isinstance(error, BlockingIOError):
+        return "another process keeps its maps there"
+    return error.strerror or str(error)
+
+
+def _newest(generations: list[Generation], map_id: int) -> int:
+    return max(one.number for one in generations if one.map_id == map_id)

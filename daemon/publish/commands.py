@@ -1,0 +1,106 @@
+"""Orders that come in over Modbus: each goes to who carries it out, and its end back to the client.
+
+A controller may repeat an order at any rate (it writes a new number in every turn of its program): the log then gets
+some of them and their count.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from daemon.publish.modbus.holding import CommandCode, Outcome, Request
+from daemon.snapshot import Snapshot
+from daemon.system.logging import Sparing
+from estimator.measurements import Command, Order
+from hal.clock import Clock
+
+if TYPE_CHECKING:
+    from daemon.publish.network import Feeds
+
+log = logging.getLogger(__name__)
+
+Told = Callable[[str], None]
+"""Told the end of something: empty, or why it came to nothing."""
+
+NO_RECORDER: Final = "this run keeps no flight recorder: start it with --record DIR --last MINUTES"
+NO_MAPS: Final = "this run stores no maps: set map.folder"
+ASKED: Final = 8
+"""Requests that are waited for, the latest: a client hears of its last one only."""
+
+
+@dataclass(slots=True)
+class _Asked:
+    """A request whose cycle has yet to publish; ``placed``: it is done when there is a pose."""
+
+    number: int
+    placed: bool
+
+
+class Orders:
+    """Hands orders on.
+
+    Args:
+        acknowledge: tells the client what became of its request.
+    """
+
+    def __init__(self, clock: Clock, feeds: Feeds, acknowledge: Callable[[int, Outcome], None]) -> None:
+        self._clock = clock
+        self._feeds = feeds
+        self._acknowledge = acknowledge
+        self._asked: list[_Asked] = []
+        self._lines = Sparing(log)
+
+    def take(self, request: Request) -> None:
+        """An order as it was written; whatever goes wrong with it, the client hears of its end."""
+        self._lines.say(self._clock.now(), logging.INFO, f"Modbus: {_said(request)}")
+        told = partial(self._ended, request)
+        try:
+            self._hand_on(request, told)
+        except Exception as failure:
+            log.debug("%s has failed", request.code.name, exc_info=True)  # at any rate: above, it would fill the log
+            told(f"it has failed: {failure!r}")
+
+    def _hand_on(self, request: Request, told: Told) -> None:
+        feeds, code = self._feeds, request.code
+        if code is CommandCode.SAVE_MAP:
+            feeds.on_save(told)
+        elif code is CommandCode.DUMP_RECORDER:
+            told(NO_RECORDER) if feeds.on_dump is None else feeds.on_dump(told)
+        elif code is CommandCode.SWITCH_MAP:
+            told(NO_MAPS) if feeds.on_switch is None else feeds.on_switch(request.map_id, told)
+        else:
+            self._to_cycle(request)
+
+    def _to_cycle(self, request: Request) -> None:
+        """Carried out by the next cycle."""
+        order = Order[request.code.name]
+        pose = np.array(request.pose) if order is Order.SET_POSE else None
+        self._feeds.on_command(Command(self._clock.now(), order, pose))
+        asked = _Asked(request.number, placed=order not in (Order.PAUSE, Order.RESUME))
+        self._asked = [*self._asked, asked][-ASKED:]
+
+    def published(self, snapshot: Snapshot) -> None:
+        """The cycle that took the orders has published: they are done; a sink of the cycle."""
+        if self._asked:
+            placed = snapshot.pose is not None
+            done = [asked for asked in self._asked if placed or not asked.placed]
+            self._asked = [asked for asked in self._asked if not placed and asked.placed]
+            for asked in done:
+                self._acknowledge(asked.number, Outcome.DONE)
+
+    def _ended(self, request: Request, reason: str) -> None:
+        if reason:
+            self._lines.say(self._clock.now(), logging.WARNING, f"Modbus: {request.code.name} refused: {reason}")
+        self._acknowledge(request.number, Outcome.REFUSED if reason else Outcome.DONE)
+
+
+def _said(request: Request) -> str:
+    """The order with what it carries."""
+    carried = {CommandCode.SET_POSE: f" {request.pose}", CommandCode.SWITCH_MAP: f" {request.map_id:08x}"}
+    return request.code.name + carried.get(request.code, "")

@@ -1,0 +1,58 @@
+"""Rows and tables of the documents that are written from the published tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from daemon.publish.modbus import registers
+from daemon.publish.modbus.points import Layout, Point, Rule
+
+NOTICE: Final = (
+    "<!-- Written by `python -m daemon.publish.document`; edit the tables in daemon/publish, not this file. -->"
+)
+NOT_KNOWN: Final = """A value that is not known reads as all ones (unsigned) or as the smallest number (signed), as
+SunSpec's "not implemented"; the column says where that can happen. Measurements saturate and never wrap. Counters wrap:
+take differences, modulo their width."""
+
+
+def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """A Markdown table."""
+    lines = [head, tuple("---" for _ in head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _step(point: Point) -> str:
+    unit = f" {point.unit}" if point.unit else ""
+    return f"1/{point.per_unit}{unit}" if point.per_unit > 1 else point.unit
+
+
+def _not_known(point: Point) -> str:
+    width = point.wire.bits // 4
+    return f"0x{point.wire.not_known % (1 << point.wire.bits):0{width}X}" if point.can_be_unknown else ""
+
+
+def _describe(point: Point) -> str:
+    wraps = " Wraps." if point.rule is Rule.WRAP else ""
+    return f"{point.label[0].upper()}{point.label[1:]}. {point.text}{wraps}".strip()
+
+
+def layout_rows(layout: Layout, start: int, step: int) -> list[tuple[str, ...]]:
+    """Rows of a layout; `start` and `step` turn a word offset into a register address or a byte."""
+    return [
+        (str(start + step * offset), f"`{p.name}`", p.wire.name, _step(p), _not_known(p), _describe(p))
+        for offset, p in zip(layout.offsets, layout.points, strict=True)
+    ]
+
+
+def holding_rows(layout: Layout, start: int) -> list[tuple[str, ...]]:
+    """The same with who may write."""
+    return [
+        (str(start + offset), f"`{p.name}`", p.wire.name, p.access, _step(p), _not_known(p), _describe(p))
+        for offset, p in zip(layout.offsets, layout.points, strict=True)
+    ]
+
+
+def bit_rows(bits: tuple[registers.Bit, ...]) -> list[tuple[str, ...]]:
+    """Rows of named bits."""
+    return [(str(number), f"`{name}`", text) for number, (name, text, _) in enumerate(bits)]

@@ -1,0 +1,1 @@
+"""Modbus server (UDP, TCP, RTU) and its register blocks."""

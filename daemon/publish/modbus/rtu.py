@@ -1,0 +1,171 @@
+"""Modbus RTU on a serial line: the same tables as on UDP and TCP, and one client, the line's master.
+
+* An answer goes out 3.5 characters after its request at the earliest, as the standard asks: a half-duplex master needs
+  that time to let the line go.
+* What the line sends back of our own answers (adapters with echo) is no request.
+* A request for which this computer had no time until its master has given up is neither carried out nor answered: the
+  answer would collide with the master's next request.
+* Nothing waits: an answer that the line does not take is dropped, and after three in a row the line is opened anew.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Final, Protocol
+
+from daemon.config.endpoints import RtuLine
+from daemon.publish.modbus.rtu_frames import BROADCAST, RtuFrames, framed
+from hal.errors import DeviceMissing, DeviceRefused, HalError
+from hal.port.port import Port
+
+SILENCE_S: Final = 0.05
+"""Without a byte for so long, a request that has begun does not end any more; USB adapters pause for up to 16 ms."""
+ECHO_S: Final = 0.005
+"""Our own answer may come back this long after its last bit; no master asks again that soon."""
+PATIENCE_S: Final = 0.3
+"""A request older than this is given up by its master, or soon will be; masters wait for half a second or more."""
+TURN_S: Final = 0.05
+"""The loop tells this often that it has time for the line."""
+STRAY: Final = 2
+"""Bytes that a line driver may add where the direction changes; more of them are the master's next request."""
+UNSENT: Final = 3
+"""Answers in a row that a line does not take, until it is opened anew: its adapter is wedged."""
+_FAST: Final = 19200
+_FAST_GAP_S: Final = 0.00175
+_CHARACTER: Final = 11.0  # bits
+
+Answer = Callable[[bytes], bytes]
+"""Body of a request to the body of its answer."""
+
+
+class LineOpener(Protocol):
+    """Opens a serial line with its character format."""
+
+    def __call__(self, device: str, baud: int, *, style: str) -> Awaitable[Port]:
+        """Raises `DeviceMissing`, `DeviceRefused`."""
+        ...
+
+
+async def open_line(device: str, baud: int, *, style: str) -> Port:
+    """A real line; pyserial is imported only here. Raises `DeviceMissing`, `DeviceRefused`."""
+    from hal.port.serial_port import NOT_SERIAL, open_serial_port
+
+    try:
+        return await open_serial_port(device, baud, style=style)
+    except DeviceMissing as error:
+        remedy = "plug the adapter in, or correct `modbus.serial`; it is opened by itself once it is there"
+        raise DeviceMissing(device, error.problem, remedy) from error
+    except DeviceRefused as error:
+        if error.problem != NOT_SERIAL:
+            raise
+        remedy = "name the adapter's own device file in `modbus.serial`, such as /dev/ttyUSB1"
+        raise DeviceRefused(device, error.problem, remedy) from error
+
+
+class RtuServer:
+    """Serves one line.
+
+    Args:
+        line: which, and our unit. answer: makes the answer's body.
+        opener: opens it.
+
+    Attributes:
+        requests, unsent: answered, and answers that the line did not take. late: given up, for lack of time.
+    """
+
+    def __init__(self, line: RtuLine, answer: Answer, opener: LineOpener = open_line) -> None:
+        self.requests = self.unsent = self.late = 0
+        self.frames = RtuFrames(line.unit)
+        self._line = line
+        self._answer = answer
+        self._opener = opener
+        self._port: Port | None = None
+        self._lost: asyncio.Future[HalError] | None = None
+        self._untaken = 0  # answers in a row
+        self._heard = 0.0
+        self._sent = b""
+        self._echo_until = 0.0
+        self._going: asyncio.TimerHandle | None = None
+        self._turn: asyncio.TimerHandle | None = None
+        self._free = 0.0
+
+    async def run(self) -> None:
+        """Serve until cancelled.
+
+        Raises:
+            HalError: the line cannot be opened, has gone, or takes no answers.
+        """
+        self._lost, self._untaken = asyncio.get_running_loop().create_future(), 0
+        self._port = await self._opener(self._line.path, self._line.baud, style=self._line.format)
+        try:
+            self._turns()
+            self._port.start(self._take, self._end)
+            raise await self._lost
+        finally:
+            for timer in (self._going, self._turn):
+                if timer is not None:
+                    timer.cancel()
+            self.frames.forget()
+            self._port.close()
+            self._port = None
+
+    def _end(self, error: HalError) -> None:
+        if self._lost is not None and not self._lost.done():
+            self._lost.set_result(error)
+
+    def _turns(self) -> None:
+        """Whatever comes after this was not there before it."""
+        loop = asyncio.get_running_loop()
+        self._free = loop.time()
+        self._turn = loop.call_later(TURN_S, self._turns)
+
+    def _take(self, data: bytes, t_rx: float) -> None:
+        if t_rx - self._heard > SILENCE_S:
+            self.frames.forget()
+        self._heard = t_rx
+        if self._going is not None and len(data) > STRAY:  # the master does not wait for it any more
+            self._give_up()
+        late = t_rx - self._free > PATIENCE_S
+        for unit, body in self.frames.take(data):
+            if t_rx <= self._echo_until and framed(unit, body) == self._sent:
+                continue  # the answer to a write of one register is its request again
+            if late and unit != BROADCAST:  # what is for all is not answered, nor repeated
+                self.late += 1
+                continue
+            self.requests += 1
+            answer = self._answer(body)
+            if unit != BROADCAST:
+                self._send_soon(framed(unit, answer), t_rx)
+
+    def _give_up(self) -> None:
+        if self._going is not None:
+            self._going.cancel()
+            self._going = None
+            self.late += 1
+
+    def _send_soon(self, frame: bytes, asked: float) -> None:
+        """Once the master has let the line go; it waits for no more than one answer, and for that not for ever."""
+        self._give_up()
+        gap = _FAST_GAP_S if self._line.baud > _FAST else 3.5 * _CHARACTER / self._line.baud
+        self._going = asyncio.get_running_loop().call_later(gap, self._send, frame, asked)
+
+    def _send(self, frame: bytes, asked: float) -> None:
+        now = asyncio.get_running_loop().time()
+        self._going = None
+        if self._port is None:
+            return
+        if now - asked > PATIENCE_S:
+            self.late += 1
+            return
+        try:
+            self._port.write(frame)
+        except HalError as error:
+            self.unsent += 1
+            self._untaken += 1
+            if self._untaken == UNSENT:
+                self._end(error)
+            return
+        self._untaken = 0
+        self._sent = frame
+        self._echo_until = now + _CHARACTER * len(frame) / self._line.baud + ECHO_S

@@ -1,0 +1,177 @@
+"""The daemon's sockets: Modbus, pose datagrams, and the port that takes odometry and gyro readings.
+
+Each is a part that the supervisor keeps running, and imported only if it is configured.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon.config.endpoints import ANYBODY, interface_of, parse_endpoint, subscription_port
+from daemon.config.schema import Config, ModbusConfig
+from daemon.health.reasons import REASONS, Reason
+from daemon.publish.allow_list import Access
+from daemon.runtime.cycle import Sink
+from estimator.measurements import Command
+from hal.clock import Clock
+from hal.imu import RawImu
+from hal.odometry import RawOdometry
+
+if TYPE_CHECKING:
+    from daemon.publish.commands import Told
+    from daemon.publish.modbus.server import ModbusPublisher
+    from daemon.publish.stream_server import StreamServer
+    from daemon.publish.udp_sender import PoseSender
+
+log = logging.getLogger(__name__)
+
+SILENT_S: Final = 1.0
+"""Another sender of odometry is listened to once the present one has been silent for this long."""
+CALM_S: Final = 60.0
+"""That one is ignored is said again when it has not happened for so long."""
+
+Run = Callable[[], Awaitable[None]]
+OnOdometry = Callable[[RawOdometry], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Feeds:
+    """Who takes what comes in.
+
+    ``on_save`` is asked to save the map, ``on_dump`` to write the flight recorder, ``on_switch`` to go on in another
+    map; each tells the end of it: empty, or why it came to nothing. What is None is refused. ``on_loop_seen``: how many
+    loops a client has seen.
+    """
+
+    on_odometry: OnOdometry
+    on_imu: Callable[[RawImu], None]
+    on_command: Callable[[Command], None]
+    on_save: Callable[[Told], None]
+    on_dump: Callable[[Told], None] | None = None
+    on_switch: Callable[[int, Told], None] | None = None
+    on_loop_seen: Callable[[int], None] = lambda _: None
+
+
+class OneSender:
+    """Lets one sender of odometry through at a time: two cumulative poses have nothing to do with each other."""
+
+    def __init__(self, on_odometry: OnOdometry) -> None:
+        self.refused = 0
+        self._refused_at = -math.inf
+        self._on_odometry = on_odometry
+        self._sender = ""
+        self._heard = 0.0
+
+    def take(self, sender: str, reading: RawOdometry) -> None:
+        """Pass a reading on if its sender has the floor."""
+        if sender != self._sender and self._sender and reading.t_rx - self._heard <= SILENT_S:
+            self.refused += 1
+            if reading.t_rx - self._refused_at > CALM_S:
+                log.warning("odometry from %s is ignored while %s sends it too", sender, self._sender)
+            self._refused_at = reading.t_rx
+            return
+        self._sender, self._heard = sender, reading.t_rx
+        self._on_odometry(reading)
+
+
+class Network:
+    """Everything that listens or sends.
+
+    Attributes:
+        sinks: take every snapshot. parts: by name, for the supervisor. modbus, pose, stream: None: there is none.
+    """
+
+    def __init__(self, settings: Config, clock: Clock, feeds: Feeds, stream: Path | None = None) -> None:
+        self.sinks: list[Sink] = []
+        self.parts: dict[str, Run] = {}
+        self._settings = settings
+        self._clock = clock
+        self._feeds = feeds
+        self._access = Access(settings.allow, settings.bind)
+        self._odometry = OneSender(feeds.on_odometry)
+        self.modbus: ModbusPublisher | None = None
+        self.pose: PoseSender | None = None
+        if settings.modbus.port or settings.modbus.line is not None:
+            self._add_modbus(settings.modbus)
+        if settings.pose.receivers:
+            self._add_pose()
+        if settings.odometry.port:
+            self._add_inputs()
+        self.stream: StreamServer | None = None
+        if stream is not None:
+            self._add_stream(stream)
+
+    @property
+    def failing(self) -> set[str]:
+        """Parts that run and cannot do their work at the moment."""
+        return {"pose"} if self.pose is not None and self.pose.failing else set()
+
+    def _add_modbus(self, settings: ModbusConfig) -> None:
+        from daemon.publish.commands import Orders
+        from daemon.publish.modbus.server import ModbusPublisher
+
+        modbus = ModbusPublisher(
+            self._clock,
+            write=settings.write,
+            allowed=self._access,
+            on_command=lambda request: orders.take(request),
+            on_odometry=self._from("Modbus"),
+            on_loop_seen=self._feeds.on_loop_seen,
+        )
+        orders = Orders(self._clock, self._feeds, modbus.acknowledge)
+        self.modbus = modbus
+        self.sinks += [modbus.publish, orders.published]
+        if settings.port:
+            self.parts["modbus"] = lambda: _open(lambda: modbus.start(self._settings.bind, settings.port), modbus.close)
+        if settings.line is not None:
+            from daemon.publish.modbus.rtu import RtuServer
+
+            self.parts["modbus serial"] = RtuServer(settings.line, modbus.answer).run
+
+    def _add_pose(self) -> None:
+        from daemon.publish.udp_sender import PoseSender
+        from daemon.publish.udp_subscriptions import Subscriptions
+
+        settings, subscriptions = self._settings, None
+        if port := subscription_port(settings.pose.receivers):
+            subscriptions = Subscriptions(settings.bind, port, self._access)
+            self.parts["pose subscriptions"] = lambda: _open(subscriptions.start, subscriptions.close)
+        fixed = [receiver for receiver in settings.pose.receivers if parse_endpoint(receiver)[0] != ANYBODY]
+        self.pose = sender = PoseSender(fixed, interface_of(settings.bind), subscriptions)
+        self.sinks.append(sender.publish)
+        self.parts["pose"] = lambda: _open(sender.start, sender.close)
+
+    def _add_stream(self, path: Path) -> None:
+        from daemon.publish.stream_server import StreamServer
+
+        server = StreamServer(path, self._settings.name, lambda reason: REASONS[Reason(reason)])
+        self.stream = server
+        self.sinks.append(server.publish)
+        self.parts["stream"] = server.run
+
+    def _add_inputs(self) -> None:
+        from hal.net.inputs import InputPort
+
+        port = InputPort(self._clock, self._settings.bind, self._settings.odometry.port, allowed=self._access)
+        on_odometry, on_imu = self._from("UDP"), self._feeds.on_imu
+        self.parts["odometry"] = lambda: port.odometry.run(on_odometry)
+        self.parts["imu"] = lambda: port.imu.run(on_imu)
+
+    def _from(self, sender: str) -> OnOdometry:
+        """A callback for one sender's readings."""
+        return lambda reading: self._odometry.take(sender, reading)
+
+
+async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:
+    """A part that works by itself between its start and its close."""
+    await start()
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await close()

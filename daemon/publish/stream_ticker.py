@@ -1,0 +1,98 @@
+"""What the local stream tells once a second: faults, statistics, tiles of the map."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from daemon.health.faults import FAULTS, Fault
+from daemon.maps.tiles import MapTiles
+from daemon.publish.stream_server import StreamServer
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.vitals import process_age_s, resident_mb
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from estimator.state import State
+
+BEAT_S: Final = 1.0
+
+
+class StreamBeat:
+    """One of the daemon's parts.
+
+    Args:
+        state: of the estimator, None before it is loaded. faults: that are present.
+    """
+
+    def __init__(
+        self,
+        server: StreamServer,
+        cycle: Cycle,
+        state: Callable[[], State | None],
+        faults: Callable[[], tuple[Fault, ...]],
+    ) -> None:
+        self._server, self._cycle, self._faults = server, cycle, faults
+        server.place = partial(place_of, state)
+        self.tiles = server.tiles = MapTiles(state, server.on_tiles)
+
+    async def run(self) -> None:
+        """Tell until cancelled."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                await asyncio.sleep(BEAT_S)
+                self.beat(loop)
+        finally:
+            self.tiles.close()
+
+    def beat(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Tell once."""
+        server, cycle = self._server, self._cycle
+        now = cycle.parts.clock.now()
+        server.on_faults(now, in_words(self._faults()))
+        server.on_statistics(lambda: figures(cycle, now))
+        if server.wanted("map"):
+            self.tiles.follow(loop)
+        else:
+            self.tiles.forget()
+
+
+def in_words(faults: tuple[Fault, ...]) -> list[tuple[int, str, str]]:
+    """Number, meaning and remedy of each."""
+    return [(int(fault), *FAULTS[fault]) for fault in faults]
+
+
+def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:
+    """Where a keyframe lies in the map as corrected so far (m, m, rad); None where it is not kept any more."""
+    now = state()
+    frame = None if now is None else now.keyframes.get(keyframe)
+    if frame is None:
+        return None
+    x, y, yaw = frame.T_map_keyframe.tolist()
+    return x, y, yaw
+
+
+def figures(cycle: Cycle, t_mono: float) -> dict[str, object]:
+    """Counters since the start, times in s unless said otherwise."""
+    status, blocks = cycle.parts.status, cycle.parts.blocks
+    return {
+        "t_mono": t_mono,
+        "uptime": process_age_s(),
+        "memory_mb": resident_mb(),
+        "cycles": cycle.cycles,
+        "overruns": cycle.overruns,
+        "cycle_us": cycle.cycle_us,
+        "jobs_failed": cycle.parts.worker.failed,
+        "scan_period": cycle.period.seconds,
+        "scans": status.scans,
+        "scans_missed": status.missed,
+        "scans_invalid": status.invalid,
+        "scans_dropped": cycle.inbox.dropped,
+        "resyncs": status.resyncs,
+        "reconnects": status.reconnects,
+        "blocks": None if blocks is None else cycle.blocks,
+        "blocks_lost": None if blocks is None else cycle.blocks_lost(),
+        "odometry_jumps": cycle.odometry.jumps,
+    }

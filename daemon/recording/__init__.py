@@ -1,0 +1,1 @@
+"""Recordings, flight recorder and checkpoints."""

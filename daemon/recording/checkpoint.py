@@ -1,0 +1,233 @@
+"""The state of a running daemon, taken within a cycle and written out later: where the replay of a dump begins.
+
+Taking it must not delay the cycle, however large the map. So it is two things. What is small and changes all the time
+is pickled at once (:func:`take`). What is large never changes once it is there (keyframes, settled submaps, patches):
+it is only referred to, and pickled afterwards by another thread, piece by piece (:meth:`Taken.pieces`). Submaps are
+few and do change, so the values of their fields are taken at once.
+
+Jobs under way are functions within functions with what they hold. They are kept by name
+(:func:`daemon.recording.restore.function_within`), and made again from the same place of the same software. What is
+written here is read by `daemon.recording.restore`.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import types
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields
+from enum import Enum
+from operator import attrgetter
+from typing import Any, Final, NamedTuple
+from weakref import WeakSet
+
+from daemon.recording.restore import (
+    FIXED,
+    ROOT,
+    WHOLE,
+    Piece,
+    blank,
+    field_names,
+    fill,
+    function_within,
+    piece_of,
+    weak_set,
+)
+from estimator.light_filter.residual_map import ResidualMap
+from estimator.light_filter.survey import Survey
+from estimator.mapping.keyframe import Keyframe, Submap
+from estimator.mapping.submap import Settled
+from estimator.mapping.submap_graph import Aside, Atlas
+from estimator.state import State
+
+PROTOCOL: Final = 5
+
+
+class CannotTake(Exception):
+    """Something in the state cannot be kept: a defect, which the text names."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Ref:
+    """Stands for a piece."""
+
+    number: int
+
+
+class Taken:
+    """What :func:`take` has taken."""
+
+    def __init__(self) -> None:
+        self._pieces: list[object] = []  # all stay alive to the end: their numbers go by their identities
+        self._numbers: dict[int, int] = {}
+        self._said: dict[int, tuple[Any, ...]] = {}  # fields of submaps as they were
+        self._root = b""
+        self._late = False
+
+    def hold(self, piece: object) -> _Ref:
+        """Refer to a piece."""
+        number = self._numbers.get(id(piece))
+        if number is None:
+            if isinstance(piece, Submap):
+                self.hold_all([piece])
+                return self.hold(piece)
+            number = self._numbers[id(piece)] = len(self._pieces)
+            self._pieces.append(piece)
+            if not self._late:  # the submaps that it refers to, while they are as they are
+                if isinstance(piece, Keyframe):
+                    self.hold(piece.submap)
+                elif isinstance(piece, Settled):
+                    self.hold(piece.witness.submap)
+        return _Ref(number)
+
+    def hold_all(self, submaps: Iterable[Submap]) -> None:
+        """Refer to submaps, and to those that they refer to, as they are now."""
+        numbers, pieces, said = self._numbers, self._pieces, self._said
+        waiting = list(submaps)
+        while waiting:
+            submap = waiting.pop()
+            if id(submap) in numbers:
+                continue
+            if self._late:
+                raise CannotTake(f"submap {submap.key} was not there when the state was taken")
+            number = numbers[id(submap)] = len(pieces)
+            pieces.append(submap)
+            hung = tuple(submap.hung) if len(submap.hung) else ()
+            said[number] = *_of_submap(submap), hung
+            waiting += hung
+            if submap.into is not None:
+                waiting.append(submap.into[0])
+            if submap.settled is not None:
+                waiting.append(submap.settled.witness.submap)
+
+    def seal(self, root: object) -> None:
+        """Pickle what is small; called once."""
+        self._root = _pickled(root, self)
+        self._late = True
+
+    def pieces(self) -> Iterator[Piece]:
+        """Everything, pickled a piece at a time; may run in another thread while the daemon goes on."""
+        number = 0
+        while number < len(self._pieces):  # pieces refer to more pieces
+            piece = self._pieces[number]
+            kind = type(piece)
+            yield Piece(number, f"{kind.__module__}:{kind.__qualname__}", self._content(piece, number))
+            number += 1
+        yield Piece(ROOT, "", self._root)
+
+    def _content(self, piece: object, number: int) -> bytes:
+        if isinstance(piece, WHOLE):
+            return pickle.dumps(piece, PROTOCOL)
+        if isinstance(piece, dict):
+            return _pickled(_Dict(piece), self)
+        if isinstance(piece, Submap):
+            return _pickled(dict(zip(_SUBMAP, self._said[number], strict=True)), self)
+        return _pickled(_fields_of(piece), self)
+
+
+_SUBMAP: Final = (*(field.name for field in fields(Submap) if field.name != "hung"), "hung")
+_of_submap: Final = attrgetter(*_SUBMAP[:-1])
+
+
+_submap_of: Final = attrgetter("submap")
+
+
+class _Dict(NamedTuple):
+    """A dict that is a piece of its own, so that pickling does not take it for a reference to itself."""
+
+    content: dict[Any, Any]
+
+
+def _fields_of(piece: object) -> dict[str, Any]:
+    kind: type = type(piece)
+    return {name: getattr(piece, name) for name in field_names(kind)}
+
+
+def take(state: State, rest: dict[str, object]) -> Taken:
+    """Take the estimator's state and the ``rest``, which may refer to the same things.
+
+    It takes longer the more submaps and keyframes there are; docs/replay.md has figures.
+
+    Raises:
+        CannotTake: something in them cannot be pickled.
+    """
+    taken = Taken()
+    taken.hold_all(set(map(_submap_of, state.keyframes.values())).union(state.atlas.submaps.values()))
+    if (aside := state.atlas.aside) is not None:
+        taken.hold_all(set(map(_submap_of, aside.frames.values())).union(aside.submaps.values()))
+    try:
+        taken.seal({"state": state, "rest": rest})
+    except (TypeError, AttributeError, ValueError, pickle.PicklingError, RecursionError) as error:
+        raise CannotTake(f"the state cannot be taken: {error}") from error
+    return taken
+
+
+class _Writer(pickle.Pickler):
+    """Pickles; pieces become references."""
+
+    def __init__(self, file: io.BytesIO, taken: Taken) -> None:
+        super().__init__(file, PROTOCOL)
+        self._taken = taken
+
+    def reducer_override(self, obj: object) -> Any:
+        """How the kinds of objects are kept that pickle does not know how to keep."""
+        kept = _KEPT.get(type(obj))
+        if kept is not None:
+            return kept(obj, self._taken)
+        if isinstance(obj, Enum):  # Python 3.11.0 to 3.11.3 name members by getattr, which a state must not call
+            return type(obj), (obj.value,)
+        return NotImplemented
+
+
+def _pickled(what: object, taken: Taken) -> bytes:
+    file = io.BytesIO()
+    _Writer(file, taken).dump(what)
+    return file.getvalue()
+
+
+def _keep_state(state: State, taken: Taken) -> Any:
+    said = _fields_of(state)
+    said["keyframes"] = taken.hold(state.keyframes.copy())
+    said["places"] = taken.hold({place: tuple(keys) for place, keys in state.places.items()})
+    said["journal"] = None
+    if state.bearing_rad is not None:
+        said["bearing_rad"] = taken.hold(state.bearing_rad)
+    return blank, (State,), said, None, None, fill
+
+
+def _keep_atlas(atlas: Atlas, taken: Taken) -> Any:
+    said = _fields_of(atlas)
+    said["submaps"] = taken.hold(atlas.submaps.copy())
+    said["ties"] = taken.hold(atlas.ties.copy())
+    return blank, (Atlas,), said, None, None, fill
+
+
+def _keep_aside(aside: Aside, taken: Taken) -> Any:
+    said = _fields_of(aside)
+    said["submaps"], said["frames"] = taken.hold(aside.submaps), taken.hold(aside.frames)  # neither is ever changed
+    return blank, (Aside,), said, None, None, fill
+
+
+def _keep_function(function: types.FunctionType, taken: Taken) -> Any:
+    if "<" not in function.__qualname__:
+        return NotImplemented
+    held = tuple(cell.cell_contents for cell in function.__closure__ or ())
+    names = function.__module__, function.__qualname__, function.__code__.co_firstlineno
+    return function_within, (*names, held, function.__defaults__)
+
+
+def _keep_piece(piece: object, taken: Taken) -> Any:
+    return piece_of, (taken.hold(piece).number,)
+
+
+_KEPT: Final[dict[type, Callable[[Any, Taken], Any]]] = {
+    **dict.fromkeys((Submap, Survey, ResidualMap, *FIXED), _keep_piece),
+    State: _keep_state,
+    Atlas: _keep_atlas,
+    Aside: _keep_aside,
+    types.FunctionType: _keep_function,
+    WeakSet: lambda held, taken: (weak_set, (tuple(held),)),
+    _Ref: lambda ref, taken: (piece_of, (ref.number,)),
+    _Dict: lambda one, taken: (dict, (), None, None, iter(one.content.items())),
+}

@@ -1,0 +1,275 @@
+"""Recording a run: every byte from and to the devices, every input, every decision of every cycle.
+
+The loop thread only appends to a list; one thread (`daemon/recording/disk_writer.py`) writes what is ready. What is
+kept is all it takes to repeat the run exactly: the same bytes go through the same codec, and each cycle consumes what
+it consumed, under the same caps. The published pose, state and reason are kept too, so that a replay can say whether
+they are the same; and the published faults, most of which a replay cannot have: drivers and the computer said them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from daemon.config.schema import Config
+from daemon.devices.port_tap import tapped
+from daemon.maps.store import START, Start
+from daemon.recording.disk_writer import SegmentWriter, both
+from daemon.recording.flight_recorder import BlackBox
+from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.light_setup import RESIDUALS, Lights
+from daemon.snapshot import Snapshot
+from daemon.system.atomic_file import write_whole
+from daemon.system.versions import versions
+from estimator.measurements import UNLIMITED, Array, Command, Limits, Order
+from estimator.result import StepResult
+from hal.adc import RawSamples
+from hal.clock import Clock
+from hal.imu import RawImu
+from hal.lidar import RawScan
+from hal.odometry import RawOdometry
+from hal.port.port import PortOpener
+from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_samples, pack_scan
+
+MAP: Final = "map"
+"""Key of a recording's head where the run began with a map."""
+LIDAR, PHOTODIODE = 0, 0
+"""Channels: which device of its kind."""
+
+Pose = tuple[float, float, float]
+
+
+def switch_name(sha256: str) -> str:
+    """File of a recording's folder: a map that the run has gone on in."""
+    return f"switch-{sha256[:16]}.lumimap"
+
+
+class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
+    """A command as a cycle consumed it."""
+
+    t_begin: float
+    order: str
+    pose: Pose | None
+
+
+class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
+    """A cycle as it is recorded; see `daemon.runtime.cycle.CycleRecord`. Fields are only ever added at the end.
+
+    Attributes:
+        limits: (ICP iterations, points, whether the map may be updated), None where nothing was stepped.
+        odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
+        codes: `Limits.codes`, None where nothing was stepped or before there were lights.
+        samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
+        rung: `Limits.rung`. switched: `CycleRecord.switched`; the map is in a file of its own, see :func:`switch_name`.
+        reason: published with the state, None in recordings of before it was kept; they know of no ``faults`` either.
+        faults: numbers of all that were published, gravest first. In every cycle, for a recording may begin with any.
+        waiting: `CycleRecord.waiting`, all that state and reason take from a driver.
+    """
+
+    cycle: int
+    scan: int | None
+    dropped: tuple[int, ...]
+    odometry: int
+    imu: int
+    commands: tuple[CommandEntry, ...]
+    limits: tuple[int, int, bool] | None
+    answers: tuple[int, ...]
+    state: int
+    odom: Pose | None = None
+    map_odom: Pose | None = None
+    codes: int | None = None
+    samples: int = 0
+    light: Pose | None = None
+    rung: int = 0
+    switched: str = ""
+    reason: int | None = None
+    faults: tuple[int, ...] = ()
+    waiting: bool = False
+
+    def caps(self) -> Limits | None:
+        """The step's caps as the estimator takes them."""
+        if self.limits is None:
+            return None
+        return Limits(*self.limits, UNLIMITED.codes if self.codes is None else self.codes, self.rung)
+
+    def orders(self) -> list[Command]:
+        """The commands as the estimator takes them."""
+        return [
+            Command(entry.t_begin, Order(entry.order), None if entry.pose is None else np.array(entry.pose))
+            for entry in self.commands
+        ]
+
+
+_encode: Final = msgspec.msgpack.Encoder().encode
+_decode: Final = msgspec.msgpack.Decoder(CycleEntry).decode
+
+
+def decode_cycle(payload: bytes) -> CycleEntry:
+    """The cycle in a CYCLE record; raises `msgspec.DecodeError` for anything else."""
+    return _decode(payload)
+
+
+def _pose(T: Array | None) -> Pose | None:
+    return None if T is None else (float(T[0]), float(T[1]), float(T[2]))
+
+
+def _entry(record: CycleRecord) -> CycleEntry:
+    limits, result = record.limits, record.result
+    return CycleEntry(
+        cycle=record.cycle,
+        scan=record.scan,
+        dropped=record.dropped,
+        odometry=record.odometry,
+        imu=record.imu,
+        commands=tuple(CommandEntry(c.t_begin, c.order.value, _pose(c.T_map_base)) for c in record.commands),
+        limits=None if limits is None else (limits.icp_iterations, limits.points, limits.update_map),
+        answers=record.answers,
+        state=int(record.snapshot.state),
+        odom=None if result is None else _pose(result.T_odom_base),
+        map_odom=None if result is None else _pose(result.T_map_odom),
+        codes=None if limits is None else limits.codes,
+        samples=record.samples,
+        light=light_of(result),
+        rung=0 if limits is None else limits.rung,
+        switched=record.switched,
+        reason=record.snapshot.reason,
+        faults=_faults(record.snapshot),
+        waiting=record.waiting,
+    )
+
+
+def _faults(snapshot: Snapshot) -> tuple[int, ...]:
+    if snapshot.condition is not None:
+        return snapshot.condition.faults
+    return (snapshot.fault,) if snapshot.fault else ()
+
+
+def light_of(result: StepResult | None) -> Pose | None:
+    """Pose of the `lights` filter; None where there is none."""
+    return None if result is None or result.lights is None else _pose(result.lights.T_map_base)
+
+
+class Recorder:
+    """Taps a running daemon. Every method returns at once and never raises for what a disk can do.
+
+    Hand :meth:`tap` to the driver as its port opener, :meth:`on_scan`, :meth:`on_samples`, :meth:`on_odometry` and
+    :meth:`on_imu` to the sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
+
+    Attributes:
+        t_begun: start of the run, as its head says it: what has not spoken yet is silent from then on.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        clock: Clock,
+        lights: Lights | None = None,
+        start: Start | None = None,
+        keep_s: float = math.inf,
+    ) -> None:
+        """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
+
+        ``lights``, ``start``: what the estimator is told of lights, and the map that it begins with: a replay has to
+        tell it again. ``keep_s``: how far back it reaches, see `daemon.recording.retention`. Where nothing can be
+        written, now or later, :attr:`error` says so and it is tried again: a robot is to know its place on a full disk,
+        too.
+        """
+        t_mono, t_utc = both(clock)
+        started = datetime.fromtimestamp(t_utc, UTC)
+        header: dict[str, Any] = {
+            "recording": f"{started:%Y-%m-%dT%H-%M-%S.%f}",
+            "t_mono": t_mono,
+            "t_utc": t_utc,
+            "versions": versions(),
+            "config": msgspec.to_builtins(config),
+            **({} if lights is None else lights.header()),
+            **({} if start is None else {MAP: {"sha256": hashlib.sha256(start.content).hexdigest()}}),
+        }
+        self._clock, self.t_begun = clock, t_mono
+        beside = {RESIDUALS: lights.residuals} if lights is not None and lights.residuals else {}
+        beside |= {} if start is None else {START: start.content}  # too large for every head
+        self.disk: Final = SegmentWriter(folder, f"{started:%Y-%m-%dT%H-%M-%SZ}", header, beside=beside, clock=clock)
+        self.box: Final = BlackBox(self.disk, clock, header, keep_s)
+
+    @property
+    def error(self) -> str:
+        """Why nothing is being written at the moment; empty while all is well."""
+        return self.disk.error
+
+    @property
+    def failing(self) -> set[str]:
+        """Which parts of the recording do not work at the moment."""
+        return {name for name, error in (("recorder", self.error), ("flight recorder", self.box.failing)) if error}
+
+    def close(self, ended: bool = True) -> None:
+        """Write and sync what is left; idempotent. ``ended``: the run has, as it should."""
+        self.disk.close()
+        self.box.close(ended)
+
+    def on_cycle(self, record: CycleRecord) -> None:
+        """Keep a cycle's decisions (`daemon.runtime.cycle.Tap`)."""
+        self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
+        self.box.on_cycle(record)
+
+    def keep_switch(self, sha256: str, content: bytes) -> None:
+        """Keep a map that the run is to go on in; for another thread, it may be large.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        write_whole(self.disk.folder / switch_name(sha256), content)
+
+    def on_scan(self, then: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
+        """A scan callback that marks the scan and passes it on."""
+
+        def mark(scan: RawScan) -> None:
+            self.disk.put(Kind.SCAN, LIDAR, scan.t_rx, pack_scan(scan))
+            self.box.line.scan()
+            then(scan)
+
+        return mark
+
+    def on_samples(self, then: Callable[[RawSamples], None]) -> Callable[[RawSamples], None]:
+        """A callback for blocks of samples that keeps the block and passes it on."""
+
+        def keep(block: RawSamples) -> None:
+            self.disk.put(Kind.SAMPLES, PHOTODIODE, block.t1, pack_samples(block))
+            then(block)
+
+        return keep
+
+    def on_odometry(self, then: Callable[[RawOdometry], None]) -> Callable[[RawOdometry], None]:
+        """An odometry callback that keeps the reading and passes it on."""
+
+        def keep(reading: RawOdometry) -> None:
+            self.disk.put(Kind.ODOMETRY, 0, reading.t_rx, pack_odometry(reading))
+            then(reading)
+
+        return keep
+
+    def on_imu(self, then: Callable[[RawImu], None]) -> Callable[[RawImu], None]:
+        """A gyro callback that keeps the reading and passes it on."""
+
+        def keep(reading: RawImu) -> None:
+            self.disk.put(Kind.IMU, 0, reading.t_rx, pack_imu(reading))
+            then(reading)
+
+        return keep
+
+    def tap(self, opener: PortOpener, channel: int = LIDAR) -> PortOpener:
+        """A port opener whose ports keep what passes through them."""
+        return tapped(opener, partial(self._passed, channel), self._clock)
+
+    def _passed(self, channel: int, kind: Kind, t_mono: float, payload: bytes) -> None:
+        self.disk.put(kind, channel, t_mono, payload)
+        if channel == LIDAR:
+            self.box.line.passed(kind, t_mono, payload)

@@ -1,0 +1,137 @@
+"""The moment at which the replay of a recording begins that has no beginning, or none that is wanted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hal.errors import DataInvalid
+from hal.replay.recording import STATE_SUFFIX, Recording
+from hal.replay.text import unreadable
+
+if TYPE_CHECKING:  # loads the estimator
+    from daemon.recording.restore import Piece
+    from daemon.runtime.cycle import Cycle
+    from estimator.measurements import Job
+    from estimator.state import State
+
+
+CYCLE_PARTS: Final = (
+    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
+    "alarm", "trust", "inbox", "paused", "watch", "_left_out",
+)  # fmt: skip
+"""What a cycle remembers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """A state on the disk.
+
+    Attributes:
+        path: of the file. t_mono: when it was taken. cycle: the last one before. line: what the lidar's line had said.
+    """
+
+    path: Path
+    t_mono: float
+    cycle: int
+    line: bytes
+    versions: dict[str, str]
+    pieces: Iterator[Piece]
+
+    def load(self) -> Restored:
+        """What is in it, once.
+
+        Raises:
+            DataInvalid: it was made by other software, or is damaged.
+        """
+        from daemon.recording.restore import CannotRestore, restore
+        from daemon.recording.state_file import BadState
+
+        try:
+            state, rest = restore(self.pieces)
+            if unknown := set(rest["cycle"]) - set(CYCLE_PARTS):
+                raise CannotRestore(f"a cycle remembers no {', '.join(sorted(map(str, unknown)))}")
+        except (CannotRestore, BadState) as error:
+            made = ", ".join(f"{name} {number}" for name, number in sorted(self.versions.items()))
+            raise DataInvalid(
+                str(self.path), f"the state cannot be restored: {error}", f"replay it with {made}"
+            ) from error
+        return Restored(state, rest["jobs"], rest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Restored:
+    """A state of estimator and cycle.
+
+    Attributes:
+        state: of the estimator. jobs: under way, by ID. rest: what the cycle and its parts remember.
+    """
+
+    state: State
+    jobs: dict[int, Job]
+    rest: dict[str, Any]
+
+    def keep_history(self) -> State:
+        """The state, which keeps from now on what a replay wants to know at its end."""
+        self.state.settings = replace(self.state.settings, history=True)
+        return self.state
+
+    def put_into(self, cycle: Cycle) -> None:
+        """Let a cycle remember."""
+        for name, value in self.rest["cycle"].items():
+            setattr(cycle, name, value)
+        for part, remembered in (
+            (cycle.parts.samples, self.rest["samples"]),
+            (cycle.parts.blocks, self.rest["blocks"]),
+        ):
+            if part is not None and remembered is not None:
+                for name in vars(part).keys() & remembered.keys() - {"status"}:
+                    setattr(part, name, remembered[name])
+
+
+def state_beside(segment: Path) -> Path:
+    """Path of a segment's state, whether it is there or not."""
+    return segment.with_suffix(STATE_SUFFIX)
+
+
+def read_moment(path: Path) -> Moment:
+    """The state in a file.
+
+    Raises:
+        DataInvalid: it is none, or damaged. HalError: it cannot be read.
+    """
+    from daemon.recording.state_file import BadState, read_state
+
+    try:
+        header, line, pieces = read_state(path)
+        return Moment(path, float(header["t_state"]), int(header["cycle"]), line, dict(header["versions"]), pieces)
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except (BadState, KeyError, TypeError, ValueError) as error:
+        raise DataInvalid(str(path), str(error), "take the segments from the next state on") from error
+
+
+def beginning(recording: Recording, until: float = -math.inf) -> Recording:
+    """The recording from its beginning on, or from the last state before ``until`` (t_mono) where that is later.
+
+    Its beginning is that of the run, or the first segment that has a state; without any it is the first segment.
+    """
+    from daemon.recording.state_file import BadState, read_header
+
+    begin = None
+    for index, segment in enumerate(recording.segments):
+        if segment.stem == "000000":
+            begin = index if begin is None else begin
+            continue
+        try:
+            header = read_header(state_beside(segment))
+        except (OSError, BadState, ValueError):
+            continue
+        if begin is None or float(header.get("t_state", math.inf)) <= until:
+            begin = index
+    segments = recording.segments[begin or 0 :]
+    stem = segments[0].stem
+    return replace(recording, segments=segments, first=int(stem) if begin is not None and stem.isdigit() else 0)

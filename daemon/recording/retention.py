@@ -1,0 +1,400 @@
+"""What becomes of a recording's segments: states beside them, the oldest taken away, dumps. In a thread of its own.
+
+A recording can be replayed from its beginning, and from every segment with a state beside it. What is taken away is
+therefore everything before such a segment, and never the last of them. A dump is a folder of links to the segments that
+are there: it costs next to nothing until the ring goes on without them. Then it holds their room: where the disk has
+too little, dumps go first, and after them segments, whose room a dump may hold.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import math
+import os
+import queue
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from daemon.maps.store import START
+from daemon.runtime.light_setup import RESIDUALS
+from daemon.system.atomic_file import sync_folder, write_whole
+from hal.replay.recording import STATE_SUFFIX, SUFFIX, segment_name, state_name
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from daemon.recording.checkpoint import Taken
+
+log = logging.getLogger(__name__)
+
+DUMP: Final = "dump-"
+"""Folders of dumps are named so, by the time."""
+ABOUT: Final = "dump.json"
+DUMPS: Final = 8
+"""Dumps that are kept because of faults and of runs that died, the latest."""
+ASKED: Final = "asked"
+"""Reason of a dump that somebody has asked for."""
+ASKED_DUMPS: Final = 4
+"""Such dumps that are kept: whoever asks again and again does not push those of faults out."""
+DUMP_S: Final = 600.0
+"""What a dump of a recording that is kept as a whole reaches back."""
+MAP_SUFFIX: Final = ".lumimap"
+"""Of the map that the run began with, and of those that it went on in."""
+SWITCHED: Final = f"switch-*{MAP_SUFFIX}"
+"""The latter; each is needed as long as the cycle is there that took it."""
+SWITCH_S: Final = 60.0
+"""From a map's file to the cycle that takes it, at most."""
+RING: Final = "ring"
+"""File of a ring's folder, locked while somebody writes; empty until the run has ended as it should."""
+MB_A_MINUTE: Final = 24
+"""What a ring may hold at most, twice what a lidar of 1081 beams at 40 Hz and a photodiode make."""
+LEAST_BYTES: Final = 256 << 20
+"""A ring may hold that much in any case: maps may be large."""
+RESERVE_BYTES: Final = 512 << 20
+"""Room that a recording leaves on its disk: the maps have to go there, too."""
+BREATH_S: Final = 0.0005
+"""Pause between two slices of pickling."""
+CLOSE_S: Final = 5.0
+
+Told = Callable[[str], None]
+
+
+class Begun(NamedTuple):
+    """A segment that was begun with a state: the state, the lines it needs, and what is said of it.
+
+    Attributes:
+        t_mono: when the state was taken, s of the monotonic clock. taken: None where there is none to be had.
+    """
+
+    number: int
+    t_mono: float
+    taken: Taken | None
+    line: bytes
+    header: dict[str, Any]
+
+
+@dataclass(slots=True)
+class _Segment:
+    """A segment that is there; ``t_mono``: when it began, where a state begins it."""
+
+    bytes: int = 0
+    t_mono: float = math.nan
+    state: bool = False
+
+
+class Flight:
+    """The keeper of one recording's folder.
+
+    Attributes:
+        error: what of the latest state or dump could not be kept, empty while all is well.
+        state_bytes: of the latest state. dumps: written so far.
+    """
+
+    def __init__(self, folder: Path, keep_s: float = math.inf) -> None:
+        """``keep_s``: how far back the recording reaches at least; infinite: as far as the disk has room."""
+        self.error = ""
+        self.state_bytes = self.dumps = 0
+        self._folder = folder
+        self._keep_s = keep_s
+        self._most = math.inf if math.isinf(keep_s) else max(LEAST_BYTES, (MB_A_MINUTE << 20) * keep_s / 60.0)
+        self._segments: dict[int, _Segment] = {0: _Segment(t_mono=-math.inf, state=True)}
+        self._said_full = self._owed = False
+        self._made: Path | None = None  # the newest dump, as far as is known
+        self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._ring = -1
+        self._mark_ring()
+        self._thread = threading.Thread(target=self._work, name="lumiloop-flight", daemon=True)
+        self._thread.start()
+
+    def _mark_ring(self) -> None:
+        """Mark the folder as a ring, where it is to be one: at the start, or once there is a folder."""
+        if self._ring < 0 and not math.isinf(self._keep_s):
+            with contextlib.suppress(OSError):  # the recording itself says what is wrong with the disk
+                self._ring, self._made = _begin_ring(self._folder)
+
+    def prepare(self) -> None:
+        """The estimator has been loaded; what is still missing is loaded here, and not within a cycle."""
+        self._tasks.put(_load)
+
+    def closed(self, number: int, path: Path) -> None:
+        """A segment is complete."""
+        self._tasks.put(partial(self._take_away, number, path))
+
+    def begun(self, begun: Begun) -> None:
+        """A segment was begun; its state is to be written."""
+        self._tasks.put(partial(self._keep, begun))
+
+    def dump(self, about: dict[str, Any], told: Told) -> None:
+        """Link what there is; ``told``: empty, or why that came to nothing. Called in this thread of its own."""
+        self._tasks.put(partial(self._dump, about, told))
+
+    def close(self, ended: bool) -> None:
+        """Finish what was asked for, for so long. ``ended``: as it should; else the next start keeps it as a dump.
+
+        So it does where a dump was asked for, and is not there: the ring is all there is of it.
+        """
+        self._tasks.put(None)
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():  # it still writes: the ring stays locked for as long as it may
+            log.warning("%s: not everything is written yet; the next start keeps it as a dump", self._folder)
+            return
+        if self._ring >= 0:
+            if ended and not self._owed:
+                with contextlib.suppress(OSError):
+                    os.write(self._ring, b"ended\n")
+            os.close(self._ring)
+            self._ring = -1
+
+    def _work(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # the cycle goes first wherever both want the processor
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        while (task := self._tasks.get()) is not None:
+            try:
+                self._mark_ring()
+                task()
+            except Exception:  # a defect here must not end the recording, and is told in full
+                log.exception("the recording's folder cannot be looked after")
+                self.error = "a defect, see the log"
+
+    def _keep(self, begun: Begun) -> None:
+        """Write a state, and take away what is too old."""
+        segment = self._segments.setdefault(begun.number, _Segment())
+        segment.t_mono = begun.t_mono
+        if begun.taken is None:
+            self._prune(begun.t_mono)
+            return
+        from daemon.recording.checkpoint import CannotTake
+        from daemon.recording.state_file import write_state
+
+        pieces, breathe = begun.taken.pieces(), partial(time.sleep, BREATH_S)
+        try:
+            self.state_bytes = write_state(
+                self._folder / state_name(begun.number), begun.header, begun.line, pieces, breathe
+            )
+        except (OSError, CannotTake) as error:
+            self._fail("the state of the estimator", error)
+            self._prune(begun.t_mono)
+            return
+        segment.state = True
+        segment.bytes += self.state_bytes
+        self.error = ""
+        self._prune(begun.t_mono)
+
+    def _fail(self, what: str, error: Exception) -> None:
+        said = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+        if not self.error:
+            log.error(
+                "%s cannot be kept in %s: %s; what is recorded then replays from an older one", what, self._folder, said
+            )
+        self.error = f"{what}: {said}"
+
+    def _take_away(self, number: int, path: Path) -> None:
+        with contextlib.suppress(OSError):
+            self._segments.setdefault(number, _Segment()).bytes += path.stat().st_size
+
+    def _prune(self, now: float) -> None:
+        """Take away what is older than asked for, and then what there is no room for, dumps before segments.
+
+        Where states cannot be had, a ring that holds twice what it may goes on without a beginning: it must not fill
+        the disk that the maps go to.
+        """
+        starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
+        old = [number for number in starts if self._segments[number].t_mono <= now - self._keep_s]
+        if old:
+            self._remove_before(old[-1])
+        lacks = self._lacks_room()
+        for start in starts:
+            if start > min(self._segments) and (self._bytes() > self._most or (lacks and self._lacking() > 0)):
+                self._remove_before(start)
+        while len(self._segments) > 1 and self._bytes() > 2.0 * self._most:
+            self._remove_before(sorted(self._segments)[1])
+
+    def _bytes(self) -> int:
+        return sum(segment.bytes for segment in self._segments.values())
+
+    def _lacking(self) -> int:
+        """Bytes of room that are missing on the disk; not more than 0: none."""
+        try:
+            room = shutil.disk_usage(self._folder).free
+        except OSError:
+            return 0
+        if room < RESERVE_BYTES and not self._said_full:
+            what = "the oldest dumps go from now on, and then the oldest part of the recording"
+            log.warning("%s has %d MB of room left: %s", self._folder, room >> 20, what)
+            self._said_full = True
+        return RESERVE_BYTES - room
+
+    def _lacks_room(self) -> bool:
+        """Whether room is missing though dumps were taken away; what was theirs may be free only later."""
+        lacking = self._lacking()
+        with contextlib.suppress(OSError):  # a dump that cannot be taken away: then it is the recording's turn
+            for dump in _spare_dumps(self._folder.parent, self._made) if lacking > 0 else ():
+                held = _held_alone(dump)
+                shutil.rmtree(dump)
+                lacking -= held
+                log.warning("%s was taken away, for there is too little room on the disk", dump)
+                if lacking <= 0:
+                    break
+        return lacking > 0
+
+    def _remove_before(self, first: int) -> None:
+        ended = -math.inf
+        for number in [number for number in self._segments if number < first]:
+            del self._segments[number]
+            with contextlib.suppress(OSError):
+                ended = max(ended, (self._folder / segment_name(number)).stat().st_mtime)
+            for name in (segment_name(number), state_name(number)):
+                with contextlib.suppress(OSError):
+                    (self._folder / name).unlink(missing_ok=True)
+        for path in self._folder.glob(SWITCHED):  # a robot on a lift goes from map to map all day
+            with contextlib.suppress(OSError):
+                if path.stat().st_mtime < ended - SWITCH_S:
+                    path.unlink()
+
+    def _dump(self, about: dict[str, Any], told: Told) -> None:
+        reason = "a defect, see the log"
+        try:
+            reason = self._dumped(about)
+        finally:  # whoever has asked hears of it, whatever has happened
+            self._owed = bool(reason)
+            told(reason)
+
+    def _dumped(self, about: dict[str, Any]) -> str:
+        """Make a dump; empty, or why there is none."""
+        name = f"{DUMP}{about['at']}-{about['reason']}"
+        try:
+            names = self._names(self._dump_from(float(about["t_mono"])))
+            made = _linked(self._folder, names, self._folder.parent / name, about)
+            self._made = made
+            _prune_dumps(self._folder.parent, made)
+        except OSError as error:
+            self._fail("a dump", error)
+            return f"{self._folder.parent}: {error.strerror or error}"
+        self.dumps += 1
+        log.info("flight recorder: %s (%s)", made, about["why"])
+        return ""
+
+    def _dump_from(self, now: float) -> int:
+        """The segment a dump begins with."""
+        reach = min(self._keep_s, DUMP_S) if math.isinf(self._keep_s) else self._keep_s
+        starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
+        old = [number for number in starts if self._segments[number].t_mono <= now - reach]
+        return old[-1] if old else min(starts, default=0)
+
+    def _names(self, begin: int) -> list[str]:
+        """Files of a dump; the segment that is being written is one of them, whatever is known of it here."""
+        there = sorted(path.name for path in self._folder.iterdir())
+        names = [name for suffix in (SUFFIX, STATE_SUFFIX) for name in there if _numbered(name, suffix) >= begin]
+        maps = [name for name in there if name.endswith(MAP_SUFFIX) and not (name == START and begin > 0)]
+        return [*names, *(name for name in there if name == RESIDUALS), *maps]
+
+
+def _numbered(name: str, suffix: str) -> int:
+    """Number of a segment's or a state's file, -1 where it is none."""
+    stem = name.removesuffix(suffix)
+    return int(stem) if stem != name and stem.isdecimal() else -1
+
+
+def _load() -> None:
+    import_module("daemon.recording.state_file")
+
+
+def _linked(source: Path, names: list[str], target: Path, about: dict[str, Any]) -> Path:
+    """A folder with links to these files, or copies where links are not possible; appears whole."""
+    target = _free(target)
+    beside = target.with_name(f".{target.name}.part")
+    beside.mkdir(parents=True)
+    try:
+        for name in names:
+            try:
+                os.link(source / name, beside / name)
+            except OSError:
+                shutil.copyfile(source / name, beside / name)
+        write_whole(beside / ABOUT, (json.dumps(about, indent=2, sort_keys=True) + "\n").encode())
+        beside.replace(target)
+    except OSError:
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+    sync_folder(target.parent)
+    return target
+
+
+def _free(path: Path) -> Path:
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}-{number}")
+    return free
+
+
+def _prune_dumps(parent: Path, made: Path) -> None:
+    """Remove the oldest by their names, never the one just ``made``: the clock may not have been set yet.
+
+    Those that were asked for and the others do not count together.
+    """
+    asked = _was_asked(made)
+    others = sorted(path for path in parent.glob(f"{DUMP}*") if path != made and _was_asked(path) == asked)
+    for old in others[: 1 - (ASKED_DUMPS if asked else DUMPS)]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _spare_dumps(parent: Path, made: Path | None) -> list[Path]:
+    """Dumps that may go where there is no room, by when they were made; those that were asked for are the last.
+
+    The newest is none of them: that is the one ``made`` by this run, or else the last to the clock, which may have been
+    set meanwhile.
+    """
+    dumps = sorted((path.stat().st_mtime, path.name, path) for path in parent.glob(f"{DUMP}*") if path.is_dir())
+    newest = made if made is not None and made.exists() else dumps[-1][2] if dumps else None
+    return sorted((path for _, _, path in dumps if path != newest), key=_was_asked)
+
+
+def _held_alone(dump: Path) -> int:
+    """Bytes on the disk that nothing but this dump holds."""
+    return sum(512 * one.st_blocks for one in map(Path.stat, dump.iterdir()) if one.st_nlink == 1)
+
+
+def _was_asked(dump: Path) -> bool:
+    return re.search(rf"-{ASKED}(-\d+)?$", dump.name) is not None
+
+
+def _begin_ring(folder: Path) -> tuple[int, Path | None]:
+    """Mark a folder as a ring that is being written, and see to those that earlier runs have left; a dump of them."""
+    made = None
+    for other in sorted(folder.parent.glob(f"*/{RING}")):
+        if other.parent != folder:
+            made = _see_to(other) or made
+    handle = os.open(folder / RING, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return handle, made
+
+
+def _see_to(mark: Path) -> Path | None:
+    """A ring of an earlier run: nobody needs it if that run has ended as it should; else it is a dump from now on."""
+    kept: Path | None = None
+    try:
+        with mark.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if file.read():
+                shutil.rmtree(mark.parent, ignore_errors=True)
+                return None
+        kept = mark.parent
+        if not kept.name.startswith(DUMP):  # else it was moved, and the power went before its mark did
+            kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
+            mark.parent.rename(kept)
+        (kept / RING).unlink()
+        sync_folder(kept.parent)
+        log.warning("a run did not end as it should, or one of its dumps is missing: what it recorded is in %s", kept)
+        _prune_dumps(kept.parent, kept)
+    except OSError as error:
+        log.warning("%s: the ring of an earlier run stays as it is: %s", mark.parent, error.strerror)
+    return kept

@@ -1,0 +1,1 @@
+"""Logs and recordings through the daemon's own cycle on a virtual clock."""

@@ -1,0 +1,342 @@
+"""`lumiloop replay --journal`: single matches of a run as data, every iteration of them, and as pictures.
+
+The format is described in docs/replay.md; a change of meaning changes :data:`VERSION`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from daemon.replay import match_plot
+from daemon.replay.results import OutputRefused
+from daemon.system.extras import how_to_install
+from estimator.measurements import Array, Scan
+from estimator.result import MatchResult, Reason
+from estimator.scan_matching import icp, match_trace, scan_matcher
+from estimator.scan_matching.deskew import ScanPoints
+from estimator.scan_matching.match_trace import Entry, LightSaid, Pairs, Told
+from estimator.scan_matching.scan_matcher import Asked
+from estimator.state import State
+
+FORMAT: Final = "lumiloop-match"
+VERSION: Final = 1
+MOST: Final = 100
+"""Matches that may be asked for by number in one run: each is a few hundred kilobytes."""
+MOST_FAILED: Final = 20
+"""Matches without a result that are written; the others are counted."""
+FAILED: Final = "failed"
+OURS: Final = re.compile(r"match-[1-9][0-9]*\.(json|png)")
+"""Names of the files that are written."""
+
+UNITS: Final = {"length": "m", "angle": "rad", "time": "s", "information": "1/m^2, 1/(m rad), 1/rad^2"}
+FRAMES: Final = {
+    "base": "REP-103 body frame at the scan's last beam: x forward, y left",
+    "odom": "T_odom_base and the local map; never jumps",
+    "keyframe": "body frame of the newest keyframe",
+}
+
+
+class BadChoice(Exception):
+    """What was given for ``--journal`` cannot be meant; the text says why."""
+
+
+@dataclass(slots=True)
+class Choice:
+    """Which matches are wanted, counted from 1 in the order in which they were made.
+
+    Attributes:
+        numbers: these. seconds: the first at or after each of these, since the log's first event. failed: those that
+            are no result.
+    """
+
+    numbers: frozenset[int] = frozenset()
+    seconds: tuple[float, ...] = ()
+    failed: bool = False
+
+
+def choice_of(words: str | None, seconds: float | None) -> Choice:
+    """From the command line.
+
+    Raises:
+        BadChoice: not a list of numbers from 1, nor ``failed``; or more than :data:`MOST`.
+    """
+    if seconds is not None and not (math.isfinite(seconds) and seconds >= 0.0):
+        raise BadChoice(f"--journal-at {seconds}: give seconds since the beginning of the log")
+    parts = [part.strip() for part in words.split(",")] if words is not None else []
+    numbers = [part for part in parts if part != FAILED]
+    if not all(part.isdecimal() and int(part) > 0 for part in numbers):
+        raise BadChoice(f"--journal {words}: give numbers of matches from 1, separated by commas, or {FAILED}")
+    if len(numbers) > MOST:
+        raise BadChoice(f"--journal with {len(numbers)} numbers: at most {MOST} in one run")
+    times = () if seconds is None else (seconds,)
+    return Choice(frozenset(int(part) for part in numbers), times, FAILED in parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """What a match is called.
+
+    Attributes:
+        match: its number. seconds: of its scan, since the log's first event. pose, stamp: number of its pose among
+            those of ``trajectory.tum``, from 1, and the stamp there; None where its cycle gave no pose.
+    """
+
+    match: int
+    seconds: float
+    pose: int | None
+    stamp: float | None
+
+    def __str__(self) -> str:
+        """For people."""
+        if self.pose is None:
+            return f"match {self.match} (no pose)"
+        return f"match {self.match} (pose {self.pose} of trajectory.tum, stamp {self.stamp:.6f})"
+
+
+@dataclass(slots=True)
+class MatchJournal:
+    """Keeps the wanted matches of a run; a few references each, told only when they are written.
+
+    Attributes:
+        choice: what is wanted. kept: by number, with seconds since the log's first event. matches: how many there were.
+        failed: how many of them were no result; those beyond :data:`MOST_FAILED` are not kept.
+        removed: files of an earlier run.
+        rows: the ledger's row of each that is kept and gave a pose; light alone gives poses too, so not the number.
+    """
+
+    choice: Choice
+    kept: dict[int, tuple[float, Entry]] = field(default_factory=dict)
+    matches: int = 0
+    failed: int = 0
+    rows: dict[int, int] = field(default_factory=dict)
+    removed: int = 0
+    _told: int = 0
+    _t_first: float = math.nan
+    _before: float = -math.inf
+
+    def attach(self, state: State) -> None:
+        """Have the estimator tell every match from now on."""
+
+        def told(scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> None:
+            if self.wants(scan.t_end, result):
+                entry = match_trace.entry_of(state, scan, points, asked, result)
+                self.kept[self.matches] = (scan.t_end - self._t_first, entry)
+
+        state.journal = told
+
+    def begins(self, t_mono: float) -> None:
+        """The log's first event was at this instant."""
+        self._t_first = t_mono
+
+    def gave(self, row: int | None) -> None:
+        """The cycle has ended, and its pose has this row of the ledger; None: it gave no pose."""
+        if self.matches > self._told and self.matches in self.kept and row is not None:
+            self.rows[self.matches] = row
+        self._told = self.matches
+
+    def wants(self, t_mono: float, result: MatchResult) -> bool:
+        """Count a match, and say whether it is to be kept."""
+        self.matches += 1
+        at, before = t_mono - self._t_first, self._before
+        self._before = at
+        failed = not result.ok and result.reason is not Reason.NO_MAP
+        self.failed += failed
+        timed = any(before < second <= at for second in self.choice.seconds)
+        wanted = self.choice.failed and failed and self.failed <= MOST_FAILED
+        return wanted or timed or self.matches in self.choice.numbers
+
+    def named(self, stamps: Array) -> list[Named]:
+        """Those that are kept, by number, with what they are called in ``trajectory.tum``.
+
+        ``stamps``: of the poses, in the order in which they came; the file has them in ascending order.
+        """
+        line = np.empty(len(stamps), np.int64)
+        line[np.argsort(stamps, kind="stable")] = 1 + np.arange(len(stamps))
+        found = []
+        for number, (seconds, _) in sorted(self.kept.items()):
+            row = self.rows.get(number)
+            known = (None, None) if row is None else (int(line[row]), round(float(stamps[row]), 6))
+            found.append(Named(number, seconds, *known))
+        return found
+
+    def files(self, stamps: Array) -> Iterator[tuple[str, bytes]]:
+        """``match-N.json`` and, with matplotlib, ``match-N.png`` of each, one at a time; ``stamps`` as for `named`."""
+        for name in self.named(stamps):
+            number, entry = name.match, self.kept[name.match][1]
+            told = match_trace.tell(entry)
+            yield f"match-{number}.json", (json.dumps(document(name, entry, told)) + "\n").encode()
+            picture = match_plot.draw(str(name), entry, told)
+            if picture is not None:
+                yield f"match-{number}.png", picture
+
+    def clear(self, folder: Path) -> None:
+        """Remove the matches that an earlier run has left in ``folder``; nothing else is touched.
+
+        Raises:
+            OutputRefused: one of them may not be removed.
+        """
+        for path in sorted(folder.iterdir()):
+            if not (OURS.fullmatch(path.name) and path.is_file()):
+                continue
+            try:
+                path.unlink()
+            except OSError as error:
+                raise OutputRefused(f"cannot remove {path} of an earlier run: {error.strerror}") from error
+            self.removed += 1
+
+    def missed(self) -> bool:
+        """Whether matches were asked for by number or time and none at all was found."""
+        return not self.kept and bool(self.choice.numbers or self.choice.seconds)
+
+    def sentences(self) -> list[str]:
+        """What a person should know of what was written and what was not."""
+        said = [f"matches written: {len(self.kept)}" + self._cleared()]
+        missing = sorted(n for n in self.choice.numbers if n > self.matches)
+        if missing:
+            said.append(f"no match {', '.join(map(str, missing))}: the log has {self.matches}")
+        late = [f"{second:g} s" for second in self.choice.seconds if second > self._before]
+        if late:
+            said.append(f"no match at or after {', '.join(late)}")
+        if self.choice.failed:
+            said.append(f"{self.failed} matches were no result" + self._beyond())
+        if self.kept and not match_plot.available():
+            said.append(f"no pictures of matches: matplotlib is not installed ({how_to_install('plot')})")
+        return said
+
+    def _cleared(self) -> str:
+        return f"; files of an earlier run removed: {self.removed}" if self.removed else ""
+
+    def _beyond(self) -> str:
+        return f"; the first {MOST_FAILED} of them are in the journal" if self.failed > MOST_FAILED else ""
+
+
+def document(name: Named, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any]:
+    """Everything about one match, ready for JSON."""
+    scan, result = entry.scan, entry.result
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "units": UNITS,
+        "frames": FRAMES,
+        **asdict(name),
+        "scan": {"seq": scan.seq, "t_begin": scan.t_begin, "t_end": scan.t_end, "beams": len(scan.bearing_rad)},
+        "result": {
+            "ok": result.ok,
+            "reason": result.reason.name,
+            "text": result.reason.value,
+            "T_odom_base": result.T_odom_base.tolist(),
+            "correction": result.correction.tolist(),
+            "information": result.information.tolist(),
+            "known_axes": result.known_axes.tolist(),
+            "inliers": result.inliers,
+            "queries": result.queries,
+            "iterations": result.iterations,
+            "residual_m": result.residual_m,
+        },
+        "refusal": _refusal(entry, told),
+        "points": _rounded(entry.points.xy),
+        "asked": None if entry.asked is None else _asked(entry.asked),
+        "attempts": [_attempt(one) for one in told],
+        "light": None if entry.light is None else _light(entry.light),
+    }
+
+
+def _refusal(entry: Entry, told: tuple[Told, ...]) -> dict[str, Any] | None:
+    """What the place that was rejected showed, and what was asked of it; None for other outcomes."""
+    judged = [one.attempt for one in told if one.attempt.demand is not None]
+    if entry.asked is None or entry.result.reason is not Reason.REJECTED or not judged:
+        return None
+    best, local = judged[-1], entry.asked[1]
+    assert best.demand is not None
+    return {
+        "share": best.share,
+        "against": best.against(local),
+        "held": scan_matcher.held(best, local, entry.asked[4]),
+        "ways": [{"least_share": share, "most_against": most} for share, most in best.demand.ways],
+        "least_held": best.demand.held,
+    }
+
+
+def _asked(asked: Asked) -> dict[str, Any]:
+    view, local, prior, cap, settings = asked
+    names = ("x", "y", "normal_x", "normal_y", "slope", "weight")
+    return {
+        "T_odom_base": prior.T.tolist(),
+        "information": prior.L.tolist(),
+        "T_base_lidar": view.T_base_lidar.tolist(),
+        "noise_m": view.noise_m,
+        "most_iterations": cap,
+        "settings": asdict(settings),
+        "map": {"columns": names, "elements": _rounded(local.elements[:, : len(names)]), "updates": local.updates},
+    }
+
+
+def _attempt(told: Told) -> dict[str, Any]:
+    attempt = told.attempt
+    return {
+        "what": told.what,
+        "T_odom_base": attempt.prior.T.tolist(),
+        "found": attempt.T.tolist(),
+        "points": _rounded(attempt.view.points),
+        "settled": bool(attempt.sums[icp.SETTLED]),
+        "iterations": [
+            {
+                "T_odom_base": one.T_odom_base.tolist(),
+                "scale_m": one.row[icp.SCALE],
+                "gate_m": one.row[icp.GATE],
+                "every": int(one.row[icp.STRIDE]),
+                "inliers": int(one.row[icp.FITTED]),
+                "pairs": int(one.row[icp.PAIRED]),
+                "weights": one.row[icp.WEIGHED],
+                "squares_m2": one.row[icp.SQUARED],
+                "step_sigmas": math.sqrt(max(0.0, one.row[icp.STEP2])),
+                "damping": one.row[icp.DAMPED],
+                "looked_up": int(one.row[icp.SOUGHT]),
+                "pair": _pairs(one.pairs),
+            }
+            for one in told.iterations
+        ],
+    }
+
+
+def _pairs(pairs: Pairs) -> dict[str, list[Any]]:
+    return {
+        "point": pairs.point.tolist(),
+        "element": pairs.element.tolist(),
+        "residual_m": _rounded(pairs.residual_m),
+        "weight": _rounded(pairs.weight),
+        "fits": pairs.fits.tolist(),
+    }
+
+
+def _light(said: LightSaid) -> dict[str, Any]:
+    return {
+        "fix": said.fix.name,
+        "T_map_base": None if said.T_map_base is None else said.T_map_base.tolist(),
+        "keyframe": said.keyframe,
+        "lamps": [
+            {
+                "lamp_id": lamp.lamp_id,
+                "code": lamp.code,
+                "keyframe_xy": None if lamp.reference is None else lamp.reference.tolist(),
+                "base_xy": lamp.present.tolist(),
+                "residual_xy": None if lamp.residual is None else lamp.residual.tolist(),
+                "log_strength": lamp.logarithm,
+            }
+            for lamp in said.lamps
+        ],
+    }
+
+
+def _rounded(values: Array) -> list[Any]:
+    """Micrometres, microradians: what is computed from further is in full."""
+    rounded: list[Any] = np.round(values, 6).tolist()
+    return rounded

@@ -1,0 +1,327 @@
+"""Drives the daemon's own cycle with a log's events on a virtual clock, as fast as it can, and keeps what comes out."""
+
+from __future__ import annotations
+
+import math
+import time
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from daemon.config.schema import Config
+from daemon.devices.conversion import SampleBridge, ScanBridge
+from daemon.devices.photodiode import BlockWatch
+from daemon.health.assessment import REPLAYED, assess
+from daemon.health.faults import Fault
+from daemon.maps.container import BadMap
+from daemon.maps.store import Start, recorded_start
+from daemon.maps.switching import take_over
+from daemon.recording.recorder import CycleEntry, light_of, switch_name
+from daemon.recording.replay_start import Restored
+from daemon.replay.results import finest
+from daemon.replay.sources import Event, Source, Turn
+from daemon.replay.trajectories import Ledger
+from daemon.runtime.budget import FixedBudget
+from daemon.runtime.cycle import Cycle, CycleRecord, Parts
+from daemon.runtime.light_setup import Lights, begun, new_state
+from daemon.runtime.vitals import vitals
+from daemon.runtime.worker import CycleWorker, ScheduledWorker
+from estimator import pipeline
+from estimator.mapping.map_snapshot import Identity, MapImage, image_of
+from estimator.mapping.occupancy_grid import Grid
+from estimator.measurements import UNLIMITED, Array, Limits, Order, Record
+from estimator.result import StepResult
+from hal.adc import AdcStatus, RawSamples
+from hal.imu import RawImu
+from hal.lidar import Link, RawScan
+from hal.odometry import RawOdometry
+
+if TYPE_CHECKING:  # loaded only where somebody asks for matches
+    from daemon.replay.match_journal import MatchJournal
+    from estimator.state import State
+
+
+class ReplayClock:
+    """A clock that stands where the replay puts it (`hal.clock.Clock`)."""
+
+    def __init__(self) -> None:
+        self.t_mono = 0.0
+
+    def now(self) -> float:
+        """Seconds of the log's monotone time."""
+        return self.t_mono
+
+    def utc(self) -> float:
+        """The same: a replay has no calendar."""
+        return self.t_mono
+
+
+class ReplayBudget(FixedBudget):
+    """No caps for a log of others; for a recording the caps of the cycle that is being repeated."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = UNLIMITED
+
+    def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
+        """The caps in force."""
+        return self.now
+
+
+@dataclass(slots=True)
+class Comparison:
+    """What a recording says that was published, against its replay.
+
+    Attributes:
+        cycles: that were recorded. differ: whose pose, state, reason or inputs are not the same to the last bit, or
+            which cannot be run again. first: says how the first did.
+        judged: those of which state and reason were compared; of older recordings none.
+        faults: by number, in how many of those it was published. Not compared: a replay has no devices.
+    """
+
+    cycles: int = 0
+    differ: int = 0
+    first: str = ""
+    judged: int = 0
+    faults: Counter[int] = field(default_factory=Counter)
+
+    def note(self, cycle: int, how: str) -> None:
+        """Count one cycle that is not the recorded one."""
+        self.differ += 1
+        self.first = self.first or f"cycle {cycle}: {how}"
+
+
+@dataclass(slots=True)
+class Timing:
+    """Measured seconds; the only thing about a replay that is not repeatable."""
+
+    cycles: array[float] = field(default_factory=lambda: array("d"))
+    steps: array[float] = field(default_factory=lambda: array("d"))
+
+
+class Rerun:
+    """One log through one fresh daemon cycle: feed it every event, then ask for the results."""
+
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        lights: Lights | None = None,
+        journal: MatchJournal | None = None,
+        start: Start | None = None,
+    ) -> None:
+        """``start``: the map that it begins with; where the log begins with a state, that counts.
+
+        Raises:
+            DataInvalid: that state cannot be used.
+        """
+        begin = None if source.begin is None else source.begin.load()
+        self.ledger = Ledger()
+        self.comparison = Comparison()
+        self.timing = Timing()
+        self.odometry_m = 0.0
+        self.readings = self.blocks = 0
+        self.t_first = math.inf
+        self.watch: Callable[[CycleRecord], object] | None = None
+        self._source = source
+        self._clock = ReplayClock()
+        self._lights, self._localise = lights, config.map.localise
+        settings = pipeline.Settings(history=True, localise=config.map.localise)
+        self._state = begun(lights, settings, start) if begin is None else begin.keep_history()
+        self._journal = journal
+        if journal is not None:
+            journal.attach(self._state)
+        self._caps = ReplayBudget()
+        self._answers: dict[int, tuple[int, ...]] = {}
+        self._latest: tuple[float, float] = (0.0, 0.0)
+        self._odometry: RawOdometry | None = None
+        self._kept: list[CycleRecord] = []
+        self._published: frozenset[int] = frozenset()
+        self.cycle: Final = Cycle(self._parts(config, lights, begin))
+        if begin is not None:
+            begin.put_into(self.cycle)
+
+    def _parts(self, config: Config, lights: Lights | None, begin: Restored | None) -> Parts:
+        worker = CycleWorker() if not self._source.recorded else self._scheduled(begin)
+        return Parts(
+            clock=self._clock,
+            step=self._step,
+            scans=ScanBridge(config.lidar),
+            budget=self._caps,
+            worker=worker,
+            status=self._source.status,
+            lidar=config.lidar.fitted,
+            odometry=config.odometry.port > 0,
+            samples=None if lights is None else SampleBridge(lights.profile),
+            blocks=None if lights is None else BlockWatch(AdcStatus(), lights.profile),
+            budget_us=1e3 * config.cycle.budget_ms,
+            tap=self._keep,
+            alert_m=config.integrity.alert_m,
+            t_begun=self._source.t_begun,
+        )
+
+    def _scheduled(self, begin: Restored | None) -> ScheduledWorker:
+        if begin is None:
+            return ScheduledWorker(self._answers)
+        return ScheduledWorker(self._answers, begin.rest["cycle"]["cycles"], begin.jobs)
+
+    @property
+    def state(self) -> State:
+        """The estimator's, to be looked at."""
+        return self._state
+
+    @property
+    def t_mono(self) -> float:
+        """Where the log's clock stands."""
+        return self._clock.t_mono
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Those that are present, gravest first; to be asked for once a second.
+
+        What the data say (:data:`~daemon.health.assessment.REPLAYED`) is said anew; all others are those that were
+        published.
+        """
+        now = vitals(self.cycle, set(), 0.0)
+        again = [fault for fault in assess(now, now) if fault in REPLAYED]
+        return tuple(sorted([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)]))
+
+    def feed(self, event: Event) -> None:
+        """Take one event; runs a cycle where one is due."""
+        if isinstance(event, Turn):
+            self._repeat(event)
+            return
+        self._arrive(event.t1 if isinstance(event, RawSamples) else event.t_rx)
+        if isinstance(event, RawSamples):
+            self.blocks += 1
+            self._latest = (self._source.utc(event.t1), event.t1)
+            self.cycle.inbox.put_samples(event)
+        elif isinstance(event, RawScan):
+            self._latest = (self._source.stamp(event), event.t_mono)
+            self.cycle.inbox.put_scan(event)
+            if not self._source.recorded:
+                self._run()
+        elif isinstance(event, RawOdometry):
+            self._count(event)
+            self.cycle.inbox.put_odometry(event)
+        elif isinstance(event, RawImu):
+            self.cycle.inbox.put_imu(event)
+
+    def finish(self) -> None:
+        """The log has ended: poses take the places their anchors have now."""
+        self.ledger.settle(pipeline.keyframe_poses(self._state))
+
+    def render(self) -> Grid:
+        """The map at the finest resolution that its extent allows."""
+        return finest(partial(pipeline.render_map, self._state))
+
+    def image(self, identity: Identity) -> MapImage:
+        """The map as it is kept on a disk."""
+        return image_of(self._state, identity)
+
+    def lamps(self) -> Array | None:
+        """(k, 2) surveyed places of the lamps in the map frame; None until light has told where the map lies."""
+        tie, light = self._state.absolute, self._state.light
+        if tie is None or light is None or not tie.placed:
+            return None
+        return np.array([(lamp.x, lamp.y) for lamp in light.setup.survey.lamps]).reshape(-1, 2)
+
+    def _arrive(self, t_rx: float) -> None:
+        self._clock.t_mono = max(self._clock.t_mono, t_rx)
+        self.t_first = min(self.t_first, self._clock.t_mono)
+
+    def _count(self, reading: RawOdometry) -> None:
+        if self._odometry is not None:
+            way = math.hypot(reading.x - self._odometry.x, reading.y - self._odometry.y)
+            self.odometry_m += way if math.isfinite(way) else 0.0
+        self._odometry = reading
+        self.readings += 1
+
+    def _repeat(self, turn: Turn) -> None:
+        """Run a recorded cycle: at its time, with its commands, caps and answers; then compare."""
+        entry = turn.entry
+        self._clock.t_mono = turn.t_mono
+        self.t_first = min(self.t_first, turn.t_mono)
+        for command in entry.orders():
+            self.cycle.inbox.put_command(command)
+        if entry.switched:
+            self.cycle.switch(partial(self._switch, entry.switched))
+        self._caps.now = entry.caps() or UNLIMITED
+        self._answers[self.cycle.cycles + 1] = entry.answers
+        self._source.status.link = Link.WAITING if entry.waiting else Link.STREAMING
+        self._published = frozenset(entry.faults)
+        try:
+            record = self._run()
+        except LookupError as error:
+            self.comparison.cycles += 1
+            self.comparison.note(entry.cycle, str(error))
+        else:
+            self._compare(entry, record)
+
+    def _switch(self, sha256: str) -> tuple[int, str]:
+        """Go on in the map that the recorded run went on in.
+
+        Raises:
+            LookupError: it is not with the recording, or not the one.
+        """
+        path = self._source.files[0].parent / switch_name(sha256)
+        try:
+            start = recorded_start(path, sha256, self._lights, self._localise)
+        except (OSError, BadMap) as error:
+            raise LookupError(f"{path.name}, the map that the run went on in, cannot be used: {error}") from error
+        self.ledger.settle(pipeline.keyframe_poses(self._state))
+        take_over(self._state, new_state(self._lights, pipeline.Settings(history=True, localise=self._localise), start))
+        return start.stored.meta.map_id, sha256
+
+    def _compare(self, entry: CycleEntry, record: CycleRecord) -> None:
+        result = record.result
+        pose = None if result is None else (tuple(result.T_odom_base.tolist()), tuple(result.T_map_odom.tolist()))
+        recorded = None if entry.odom is None else (entry.odom, entry.map_odom)
+        light, said = light_of(result), (entry.state, entry.reason)
+        judged = (int(record.snapshot.state), int(record.snapshot.reason))
+        self.comparison.cycles += 1
+        if entry.reason is not None:
+            self.comparison.judged += 1
+            self.comparison.faults.update(entry.faults)
+        if (entry.scan, entry.dropped) != (record.scan, record.dropped):
+            self.comparison.note(entry.cycle, f"took scan {record.scan}, recorded is {entry.scan}")
+        elif entry.samples != record.samples:
+            self.comparison.note(entry.cycle, f"took block {record.samples}, recorded is {entry.samples}")
+        elif entry.caps() != record.limits:
+            self.comparison.note(entry.cycle, "stepped where the recorded cycle did not, or the other way round")
+        elif pose != recorded:
+            self.comparison.note(entry.cycle, f"T_odom_base, T_map_odom are {pose}, recorded are {recorded}")
+        elif light != entry.light:
+            self.comparison.note(entry.cycle, f"the pose from light is {light}, recorded is {entry.light}")
+        elif entry.reason is not None and judged != said:
+            self.comparison.note(entry.cycle, f"state and reason are {judged}, recorded are {said}")
+
+    def _run(self) -> CycleRecord:
+        begun = time.perf_counter()
+        self.cycle.run()
+        self.timing.cycles.append(time.perf_counter() - begun)
+        return self._kept.pop()
+
+    def _step(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
+        if self._journal is not None:
+            self._journal.begins(self.t_first)
+        if any(getattr(record, "order", None) is Order.RESET for record in records):
+            self.ledger.settle(pipeline.keyframe_poses(self._state))
+        begun = time.perf_counter()
+        result = pipeline.step(self._state, records, limits)
+        self.timing.steps.append(time.perf_counter() - begun)
+        return result
+
+    def _keep(self, record: CycleRecord) -> None:
+        self._kept.append(record)
+        if self.watch is not None:
+            self.watch(record)
+        rows = len(self.ledger)
+        self.ledger.take(record, *self._latest)
+        if self._journal is not None:
+            self._journal.gave(rows if len(self.ledger) > rows else None)

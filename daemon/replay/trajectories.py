@@ -1,0 +1,134 @@
+"""What a replay keeps of every scan: poses as published, poses as they stand at the end, and the figures of a run."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from daemon.replay.results import Trajectory
+from daemon.runtime.cycle import CycleRecord
+from estimator.measurements import Array
+from estimator.numerics import se2
+from estimator.result import Loop, StepResult
+
+_FIELDS: Final = 12
+_STAMP, _ANCHOR, _STATE = 0, 1, 11
+_ONLINE, _ODOM, _ON_ANCHOR = slice(2, 5), slice(5, 8), slice(8, 11)
+
+
+@dataclass(slots=True)
+class Ledger:
+    """One row a scan, in the order of the log, and counts. A row is 96 bytes: a day at 40 Hz fits into memory.
+
+    Where scans are missing, there is a row for each cycle in which light alone held the pose.
+
+    Attributes:
+        cycles, keyframes, matched: counts. outcomes: how often each reason of a match came. states: of the snapshot.
+        loops: each with the stamp of its scan. corrected_m, corrected_rad: largest correction by a match.
+        jumps: of T_map_odom. dropped: scans that a later one replaced before a cycle took them.
+    """
+
+    cycles: int = 0
+    keyframes: int = 0
+    matched: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    states: Counter[str] = field(default_factory=Counter)
+    loops: list[tuple[float, Loop]] = field(default_factory=list)
+    corrected_m: float = 0.0
+    corrected_rad: float = 0.0
+    jumps: int = 0
+    dropped: int = 0
+    _samples: int = 0
+    _rows: array[float] = field(default_factory=lambda: array("d"))
+    _settled: list[Array] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        """Rows: what gave a pose."""
+        return len(self._rows) // _FIELDS
+
+    def take(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
+        """Take in one cycle; ``stamp`` is the log's for the latest scan or block, which was true at ``t_mono``."""
+        self.cycles += 1
+        self.dropped += len(record.dropped)
+        self.states[record.snapshot.state.name] += 1
+        result, pose = record.result, record.snapshot.pose
+        if result is None:
+            return
+        self.jumps = result.jumps
+        if record.limits is not None:
+            self._count(result, stamp)
+        lit = record.samples > self._samples and result.lights is not None and result.placed
+        self._samples = record.samples
+        if (record.scan is not None or lit) and pose is not None:
+            at = stamp + (result.t_mono - t_mono)
+            odom, on_anchor = result.T_odom_base.tolist(), result.T_anchor_base.tolist()
+            self._rows.extend((at, result.anchor, *pose, *odom, *on_anchor, record.snapshot.state))
+
+    def _count(self, result: StepResult, stamp: float) -> None:
+        self.keyframes += result.keyframe >= 0
+        if result.loop is not None:
+            self.loops.append((stamp, result.loop))
+        if result.match is not None:
+            self.outcomes[result.match.reason.name] += 1
+            self.matched += result.match.ok
+            dx, dy, dyaw = result.match.correction.tolist()
+            self.corrected_m = max(self.corrected_m, math.hypot(dx, dy))
+            self.corrected_rad = max(self.corrected_rad, abs(dyaw))
+
+    def settle(self, keyframes: dict[int, Array]) -> None:
+        """Fix every pose by its anchor's present place: the map is about to be thrown away, or the log has ended.
+
+        A pose whose anchor is not among ``keyframes`` stays as it was published.
+        """
+        rows = self._table()[sum(map(len, self._settled)) :]
+        final = rows[:, _ONLINE].copy()
+        for i, row in enumerate(rows):
+            place = keyframes.get(int(row[_ANCHOR]))
+            if place is not None:
+                final[i] = se2.compose(place, row[_ON_ANCHOR])
+        self._settled.append(final)
+
+    def online(self) -> Trajectory:
+        """T_map_base of every scan as it was published, and in which state."""
+        rows = self._table()
+        return Trajectory(rows[:, _STAMP], rows[:, _ONLINE], rows[:, _STATE].astype(np.int64))
+
+    def final(self) -> Trajectory:
+        """T_map_base of every scan by what was known when it was settled; as published where it was not yet."""
+        rows = self._table()
+        settled = np.concatenate([*self._settled, np.empty((0, 3))])
+        return Trajectory(rows[:, _STAMP], np.concatenate([settled, rows[len(settled) :, _ONLINE]]))
+
+    def odom(self) -> Array:
+        """T_odom_base of every scan, (n, 3)."""
+        return self._table()[:, _ODOM]
+
+    def largest_step(self) -> tuple[float, float, float]:
+        """Largest step of T_odom_base between two scans: metres, radians, and the stamp after the one in metres."""
+        poses = self.odom()
+        if len(poses) < 2:
+            return 0.0, 0.0, 0.0
+        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        turns = np.abs(wrap(np.diff(poses[:, 2])))
+        return float(steps.max()), float(turns.max()), float(self._table()[int(steps.argmax()) + 1, _STAMP])
+
+    def way(self) -> tuple[float, float]:
+        """Length of T_odom_base's path in metres, and all it has turned in radians."""
+        poses = self.odom()
+        return (
+            float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
+            float(np.abs(wrap(np.diff(poses[:, 2]))).sum()),
+        )
+
+    def _table(self) -> Array:
+        return np.array(self._rows, dtype=np.float64).reshape(-1, _FIELDS)
+
+
+def wrap(angles: Array) -> Array:
+    """Angles in rad, brought into -pi to pi."""
+    return np.asarray(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)

@@ -1,0 +1,1 @@
+"""The cycle and what drives it: inbox, budget, scheduler, worker, warm-up."""

@@ -1,0 +1,416 @@
+"""The cycle: take what has arrived, step the estimator, judge, publish.
+
+There is one per scan; without scans, one per block of light samples; and at 1.5 periods at the latest.
+
+:class:`Cycle` is synchronous and knows no timer, so that replay can drive it as well; `daemon.runtime.scheduler` runs
+it when it is due, in real or in virtual time. What a cycle consumed and decided goes to a tap as a
+:class:`CycleRecord`: with the raw streams that is all it takes to repeat the run exactly.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from daemon.devices.conversion import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
+from daemon.devices.photodiode import BlockWatch
+from daemon.health.reasons import REASONS
+from daemon.health.reasons import Reason as Cause
+from daemon.integrity.evidence import SILENT_PERIODS, Evidence
+from daemon.integrity.input_monitor import Watch
+from daemon.integrity.lamp_monitor import LampWatch
+from daemon.integrity.laser_hysteresis import LeftOut
+from daemon.integrity.observer import EARLY, Observer
+from daemon.integrity.position_alert import Alarm, bounded
+from daemon.integrity.state_machine import judge
+from daemon.integrity.state_memory import Memory
+from daemon.maps.map_fallback import another, let_go
+from daemon.runtime.budget import Budget, Spent
+from daemon.runtime.inbox import Inbox, Taken
+from daemon.runtime.scan_period import ScanPeriod
+from daemon.runtime.snapshot_builder import Facts, Painter
+from daemon.runtime.stage_times import Laps, PulseTaker
+from daemon.runtime.worker import Worker
+from daemon.snapshot import Condition, Snapshot, Trust
+from daemon.system.logging import of_state
+from estimator.measurements import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
+from estimator.result import Fix, StepResult
+from hal.adc import RawSamples
+from hal.clock import Clock
+from hal.lidar import LidarStatus, Link
+
+log = logging.getLogger(__name__)
+
+OWN_SHARE: Final = 0.5
+"""Part of the scan period that is the budget where none is configured."""
+
+Sink = Callable[[Snapshot], None]
+"""Takes every snapshot; called from the loop thread, never waited for: it must return at once."""
+
+Step = Callable[[tuple[Record, ...], Limits], StepResult]
+"""The estimator with its state inside."""
+
+
+@dataclass(frozen=True, slots=True)
+class CycleRecord:
+    """What one cycle consumed and decided.
+
+    Attributes:
+        cycle: counts cycles from 1. t_mono: when it began.
+        scan: `RawScan.seq` of the scan consumed, None without one. dropped: those that a later scan replaced.
+        odometry, imu, samples: readings, and blocks of light samples, received since the start, all consumed by now.
+        commands: consumed. answers: job IDs of the answers applied, in order.
+        switched: SHA-256 of the stored map that the estimator has gone on in with this cycle, empty: none.
+        limits: the step's caps; None where nothing had arrived and no step was made.
+        result: of the step, or the previous one's; None before the first. snapshot: what was published.
+        stage_us: measured microseconds by stage, empty without a stopwatch. waiting: `Link.WAITING` of the lidar.
+    """
+
+    cycle: int
+    t_mono: float
+    scan: int | None
+    dropped: tuple[int, ...]
+    odometry: int
+    imu: int
+    commands: tuple[Command, ...]
+    answers: tuple[int, ...]
+    limits: Limits | None
+    result: StepResult | None
+    snapshot: Snapshot
+    stage_us: dict[str, int]
+    samples: int = 0
+    switched: str = ""
+    waiting: bool = False
+
+
+Tap = Callable[[CycleRecord], None]
+
+
+@dataclass(slots=True)
+class Parts:
+    """What a cycle is made of; every part can be replaced.
+
+    Attributes:
+        status: of the lidar driver, live. lidar, odometry: there is one.
+        samples, blocks: of the photodiode; None where there is none.
+        budget_us: time budget of a cycle, 0: half of the scan period.
+        stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
+        fault: number of the gravest present fault. condition: how the daemon's parts are. map_id: of the map frame.
+        alert_m: limit of the position error above which an alert is raised, 0: none. t_begun: start of the run; 0: now.
+    """
+
+    clock: Clock
+    step: Step
+    scans: ScanBridge
+    budget: Budget
+    worker: Worker
+    status: LidarStatus
+    lidar: bool = True
+    odometry: bool = False
+    samples: SampleBridge | None = None
+    blocks: BlockWatch | None = None
+    budget_us: float = 0.0
+    stopwatch: Callable[[], float] | None = None
+    sinks: list[Sink] = field(default_factory=list)
+    tap: Tap | None = None
+    fault: Callable[[], int] = int
+    condition: Callable[[], Condition | None] = lambda: None
+    map_id: int = 0
+    alert_m: float = 0.0
+    t_begun: float = 0.0
+
+
+class Cycle:
+    """One localisation cycle after the other. Devices call the ``inbox``; :meth:`run` does the rest.
+
+    Attributes:
+        cycles, overruns: so far. cycle_us: duration of the latest. failing: numbers of the sinks that raise.
+        verdict: what is said about the pose. result: of the latest step.
+        blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
+        alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
+        paused: by a command: map and laser are left alone, light and odometry carry the pose.
+        laps: stages of the latest cycle. taker: makes the published picture of how the cycle is doing.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self.inbox = Inbox()
+        self.period = ScanPeriod()
+        self.odometry = OdometryBridge()
+        self.imu = ImuBridge()
+        self.cycles = 0
+        self.overruns = 0
+        self.verdict = Memory()
+        self.watch = Watch()
+        self.result: StepResult | None = None
+        begun = parts.t_begun or parts.clock.now()
+        self.observer = Observer(begun, parts.odometry, parts.lidar, parts.samples is not None)
+        self._painter = Painter(parts.map_id)
+        self.cycle_us: int | None = None
+        self.failing: set[int] = set()
+        self.blocks = 0
+        self.lamps = LampWatch()
+        self.alarm = Alarm(parts.alert_m)
+        self.trust = Trust(limit_m=parts.alert_m or None, alert=self.alarm.on)
+        self.paused = False
+        self._switch: Callable[[], tuple[int, str]] | None = None
+        self._switched = ""
+        self._held: list[Answer] = []
+        self._left_out = LeftOut()
+        self.laps = Laps(parts.stopwatch)
+        self.taker = PulseTaker()
+
+    def run(self) -> Snapshot:
+        """Run one cycle with whatever has arrived."""
+        laps = self.laps
+        laps.begin()
+        self.cycles += 1
+        t_mono = self.parts.clock.now()
+        taken = self.inbox.take()
+        self._obey(taken.commands)
+        answers = self._answers(t_mono)
+        orders = [command for command in taken.commands if command.order not in (Order.PAUSE, Order.RESUME)]
+        records = (*answers, *orders, *self._bridge(taken))
+        laps.lap("bridge")
+        limits = self._step(records)
+        self._watch_lamps(t_mono, records, limits)
+        verdict = self._judge(t_mono, records, None if limits is None else self.result)
+        snapshot = self._painter.paint(self.result, verdict, self._facts(self.parts.clock.now()))
+        laps.lap("judge")
+        self._publish(snapshot)
+        laps.lap("publish")
+        self._account(t_mono, records, limits)
+        if self.parts.tap is not None:
+            record = CycleRecord(
+                cycle=self.cycles,
+                t_mono=t_mono,
+                scan=None if taken.scan is None else taken.scan.seq,
+                dropped=taken.dropped,
+                odometry=taken.odometry_total,
+                imu=taken.imu_total,
+                commands=taken.commands,
+                answers=tuple(answer.job_id for answer in answers),
+                limits=limits,
+                result=self.result,
+                snapshot=snapshot,
+                stage_us=laps.us,
+                samples=taken.samples_total,
+                switched=self._switched,
+                waiting=self.parts.status.link is Link.WAITING,
+            )
+            self.parts.tap(record)
+        return snapshot
+
+    def _obey(self, commands: tuple[Command, ...]) -> None:
+        for command in commands:
+            if command.order in (Order.PAUSE, Order.RESUME):
+                self.paused = command.order is Order.PAUSE
+
+    def _answers(self, t_mono: float) -> tuple[Answer, ...]:
+        """What the worker has found; during a pause it is kept for later, because the map is not to be touched."""
+        self._held += self.parts.worker.collect(t_mono)
+        if self.paused:
+            return ()
+        answers, self._held = tuple(replace(answer, t_begin=t_mono) for answer in self._held), []
+        return answers
+
+    def switch(self, take_over: Callable[[], tuple[int, str]] | None) -> None:
+        """Before the next step, have the estimator go on in another map: ``take_over`` does it, tells ID and digest.
+
+        None: do not, after all; what has been taken over stays.
+        """
+        self._switch = take_over
+
+    def loops_seen(self, counter: int) -> None:
+        """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
+        self._painter.loop_seen = counter
+
+    def announce(self) -> None:
+        """Publish where we stand without running a cycle: while the estimator is still being loaded."""
+        self._publish(self._painter.paint(None, self.verdict, self._facts(self.parts.clock.now())))
+
+    @property
+    def map_id(self) -> int:
+        """Identity of the map frame, another one after every RESET, and once a stored map was let go of."""
+        return self._painter.map_id
+
+    @map_id.setter
+    def map_id(self, map_id: int) -> None:
+        self._painter.map_id = map_id
+
+    @property
+    def budget_us(self) -> float:
+        """Microseconds that a cycle may take."""
+        return self.parts.budget_us or OWN_SHARE * self.period.seconds * 1e6
+
+    def _bridge(self, taken: Taken) -> list[Record]:
+        """SI records of everything taken; the estimator orders them by time itself."""
+        records: list[Record] = []
+        for reading in taken.odometry:
+            jumps = self.odometry.jumps
+            if (increment := self.odometry.increment(reading)) is not None:
+                records.append(increment)
+            if self.odometry.jumps > jumps:
+                self.observer.witnesses.restart()
+            self.observer.on_odometry(reading.t_rx)
+            self.watch.on_odometry(reading)
+        records += [turn for reading in taken.imu if (turn := self.imu.turn(reading)) is not None]
+        records += self._light(taken.samples)
+        if taken.scan is not None:
+            self.period.learn(taken.scan)
+            self.observer.on_scan(taken.scan.t_rx)
+            self.watch.on_scan(taken.scan, self.period.seconds)
+            records.append(self.parts.scans.scan(taken.scan))
+        return records
+
+    def _light(self, samples: tuple[RawSamples, ...]) -> list[Record]:
+        """The blocks that can be used."""
+        bridge, watch = self.parts.samples, self.parts.blocks
+        if bridge is None or watch is None:
+            return []
+        records: list[Record] = []
+        self.blocks += len(samples)
+        for raw in samples:
+            if (block := bridge.block(raw)) is not None:
+                watch.on_block(raw)
+                self.period.learn_block(watch.seconds)
+                records.append(block)
+        return records
+
+    def blocks_lost(self) -> int:
+        """Blocks of light samples that came to nothing: lost on their way, damaged, or without a cycle to take them."""
+        bridge, watch = self.parts.samples, self.parts.blocks
+        if bridge is None or watch is None:
+            return 0
+        return watch.status.dropped + bridge.unfit + self.inbox.blocks_dropped
+
+    def lidar_silence(self, t_mono: float) -> float | None:
+        """Scan periods since the last scan; None before the first."""
+        return self.observer.silence(t_mono, self.period.seconds)
+
+    def lidar_ok(self, t_mono: float) -> bool | None:
+        """Whether scans are coming; None where there is no lidar."""
+        silence = self.lidar_silence(t_mono)
+        return (silence is not None and silence < (1.0 - EARLY) * SILENT_PERIODS) if self.parts.lidar else None
+
+    def _step(self, records: tuple[Record, ...]) -> Limits | None:
+        """Step the estimator under the budget's caps and return them; None where there was nothing to step over."""
+        self._switched = ""
+        if not records:
+            return None
+        if (switch := self._switch) is not None:
+            self._switch = None
+            self._painter.map_id, self._switched = switch()
+        parts = self.parts
+        light = any(isinstance(record, SampleBlock) for record in records)
+        limits = parts.budget.limits(self.budget_us, light, self._carrier())
+        if self.paused:
+            limits = replace(limits, update_map=False, rung=Rung.CARRIED)
+        before, self.result = self.result, parts.step(records, limits)
+        self.laps.lap("step")
+        self._tell_unused(limits)
+        parts.worker.submit(self.result.jobs)
+        reset = any(isinstance(record, Command) and record.order is Order.RESET for record in records)
+        if let_go(before, self.result, self.map_id) or reset:
+            self._painter.map_id = another(self.map_id, self.result.t_mono)
+        return limits
+
+    def _carrier(self) -> bool:
+        """Whether light or odometry can carry the pose for a while."""
+        if self.observer.odometry_ok(self.parts.clock.now()):
+            return True
+        lights = None if self.result is None else self.result.lights
+        return lights is not None and lights.fix is Fix.GOOD and self.result is not None and self.result.placed
+
+    def _tell_unused(self, limits: Limits) -> None:
+        """Tell the judge that the laser is left out, and why."""
+        if self.paused or self.observer.unused is Cause.PAUSED:
+            self._left_out.clear()
+        overloaded = not self.paused and self._left_out.on_step(limits.rung >= Rung.CARRIED)
+        self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED if overloaded else None
+        self.taker.on_rung(limits.rung, self.paused)
+
+    def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
+        if limits is not None and self.result is not None:
+            fresh = any(isinstance(record, SampleBlock | LightEpoch) for record in records)
+            self.lamps.on_step(t_mono, self.result.lights, fresh)
+
+    def _judge(self, t_mono: float, records: tuple[Record, ...], fresh: StepResult | None) -> Memory:
+        """What may be said about the pose; a change goes to the log."""
+        evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
+        before, self.verdict = self.verdict, judge(self.verdict, evidence)
+        compared = bool(self.lidar_ok(t_mono)) and self.observer.unused is None
+        self.watch.on_verdict(t_mono, self.verdict, compared)
+        self.trust = self._trust(t_mono, evidence)
+        if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
+            meaning, remedy = REASONS[self.verdict.reason]
+            told, said = self.verdict.state.name, f" ({remedy})" if remedy else ""
+            log.info("%s: %s%s", told, meaning, said, extra=of_state(told, meaning, remedy))
+        return self.verdict
+
+    def _trust(self, t_mono: float, evidence: Evidence) -> Trust:
+        """The bound on the error of the pose, as far as the state lets it stand, and whether it is above its limit."""
+        result, limit_m = self.result, self.alarm.limit_m or None
+        gap = None if result is None else result.gap
+        protection = None if result is None else result.protection
+        if protection is None or not bounded(self.verdict, evidence):
+            return Trust(limit_m=limit_m, alert=self.alarm.take(t_mono, None), gap=gap, places=evidence.places)
+        return Trust(
+            horizontal_m=protection.horizontal_m,
+            yaw_rad=protection.yaw_rad,
+            limit_m=limit_m,
+            alert=self.alarm.take(t_mono, protection.horizontal_m),
+            laser=protection.laser,
+            light=protection.light,
+            wheels=protection.wheels,
+            gap=gap,
+            places=evidence.places,
+        )
+
+    def _facts(self, t_mono: float) -> Facts:
+        parts, alive = self.parts, self.lidar_ok(t_mono)
+        known = self.lidar_silence(t_mono) is not None
+        rate = None if not known else 1.0 / self.period.seconds if alive else 0.0
+        return Facts(
+            t_mono=t_mono,
+            t_utc=parts.clock.utc(),
+            period=self.period.seconds,
+            scan_rate=rate,
+            missed=parts.status.missed + (self.inbox.dropped if self.cycles else 0),
+            overruns=self.overruns,
+            cycle_us=self.cycle_us,
+            lidar_ok=alive,
+            adc_ok=None if parts.blocks is None else parts.blocks.ok(t_mono),
+            blocks=self.blocks,
+            blocks_lost=self.blocks_lost(),
+            odometry_ok=self.observer.odometry_ok(t_mono),
+            fault=parts.fault(),
+            condition=parts.condition(),
+            trust=self.trust,
+            pulse=self.taker.pulse,
+        )
+
+    def _publish(self, snapshot: Snapshot) -> None:
+        """Hand the snapshot to every sink; a sink that raises harms neither the cycle nor the others."""
+        for number, sink in enumerate(self.parts.sinks):
+            try:
+                sink(snapshot)
+            except Exception:
+                if number not in self.failing:
+                    log.exception("a publisher has failed; said once until it works again")
+                self.failing.add(number)
+            else:
+                self.failing.discard(number)
+
+    def _account(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
+        if self.parts.stopwatch is None:
+            return
+        us, budget_us = self.laps.us, self.budget_us
+        self.cycle_us = sum(us.values())
+        self.overruns += self.cycle_us > budget_us
+        self.taker.on_cycle(t_mono, us)
+        if limits is not None and self.result is not None and not self.paused:
+            light = any(isinstance(record, SampleBlock) for record in records)
+            self.parts.budget.learn(Spent(us, budget_us, light), limits, self.result)

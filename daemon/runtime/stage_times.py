@@ -1,0 +1,95 @@
+"""Microseconds per stage of a cycle, what they come to over the last minute, and where the time of a stall went."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from daemon.runtime.histogram import HALF_S, Histogram
+from daemon.snapshot import Pulse, Stage
+from estimator.measurements import Rung
+
+NAMES: Final = {stage.name.lower(): stage for stage in Stage}
+REFRESH_S: Final = 1.0
+"""Quantiles are worked out so often."""
+
+
+class Laps:
+    """The stages of the cycle that is running, by name; empty without a stopwatch."""
+
+    def __init__(self, stopwatch: Callable[[], float] | None) -> None:
+        self.us: dict[str, int] = {}
+        self._stopwatch = stopwatch
+        self._last = 0.0
+
+    def begin(self) -> None:
+        """A cycle begins."""
+        self.us = {}
+        if self._stopwatch is not None:
+            self._last = self._stopwatch()
+
+    def lap(self, stage: str) -> None:
+        """What has passed since the last lap belongs to this stage."""
+        if self._stopwatch is None:
+            return
+        now = self._stopwatch()
+        self.us[stage] = self.us.get(stage, 0) + round((now - self._last) * 1e6)
+        self._last = now
+
+    def longest(self) -> Stage:
+        """The stage that has taken longest."""
+        return NAMES.get(max(self.us, key=self.us.__getitem__), Stage.STEP) if self.us else Stage.OUTSIDE
+
+
+class PulseTaker:
+    """Counts rungs, stalls and microseconds, and tells them as a :class:`Pulse`.
+
+    Attributes:
+        short: cycles that left out map work or the laser for lack of time.
+    """
+
+    def __init__(self) -> None:
+        self.short = 0
+        self.pulse = Pulse()
+        self._cycle, self._late = Histogram(), Histogram()
+        self._stages = {name: Histogram() for name, stage in NAMES.items() if stage is not Stage.OUTSIDE}
+        self._refresh = self._turn = 0.0
+
+    def late(self, seconds: float) -> None:
+        """A cycle begins so long after it was due."""
+        self._late.add(max(0, round(seconds * 1e6)))
+
+    def on_rung(self, rung: int, paused: bool = False) -> None:
+        """A step was made on this rung."""
+        pulse = self.pulse
+        self.short += rung >= Rung.NO_MAP and not paused
+        if rung == Rung.FULL and pulse.rung == Rung.FULL:
+            return
+        self.pulse = replace(
+            pulse,
+            rung=rung,
+            thinned=pulse.thinned + (rung == Rung.THINNED),
+            without_map=pulse.without_map + (rung == Rung.NO_MAP),
+            carried=pulse.carried + (rung >= Rung.CARRIED),
+        )
+
+    def stalled(self, seconds: float, where: Stage) -> None:
+        """No cycle began for so long."""
+        self.pulse = replace(self.pulse, stalls=self.pulse.stalls + 1, stall_s=seconds, stall_in=where)
+
+    def on_cycle(self, t_mono: float, us: dict[str, int]) -> None:
+        """Take in the stages of a cycle that has ended."""
+        if not us:
+            return
+        self._cycle.add(sum(us.values()))
+        for name, took in us.items():
+            self._stages[name].add(took)
+        if t_mono >= self._refresh:
+            self._refresh = t_mono + REFRESH_S
+            stages = tuple([histogram.spread() for histogram in self._stages.values()])
+            self.pulse = replace(self.pulse, cycle=self._cycle.spread(), late=self._late.spread(), stages=stages)
+        if t_mono >= self._turn:
+            self._turn = t_mono + HALF_S
+            for histogram in (self._cycle, self._late, *self._stages.values()):
+                histogram.turn()

@@ -1,0 +1,177 @@
+"""When no cycle begins for two periods: what was the loop's thread doing, and for whom did it wait?
+
+One interval timer of the kernel, put forward at every cycle (about a microsecond); nothing runs while all is well.
+Where it goes off, Python calls the handler in the loop's thread between two instructions, with the frame that was
+running. Threads that keep the interpreter are seen too: the handler then comes late, with the frame that waited.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+log = logging.getLogger(__name__)
+
+AGAIN_S: Final = 10.0
+"""Stalls are counted all; a line in the log goes with the first of so long."""
+SHARE: Final = 0.5
+"""Part of a stall that one thing has to make up to be called its cause."""
+MUCH_S: Final = 0.01
+"""A loop at rest looks around sooner than this, if it may."""
+OWN: Final = Path(__file__).resolve().parents[2]
+DEEP: Final = 3
+"""Functions named, the innermost ones of ours."""
+IDLE: Final = ("select", "wait", "get", "_wait_for_tstate_lock", "sleep", "poll")
+"""Functions in which a thread waits and holds nobody up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Caught:
+    """What was found when the timer went off.
+
+    Attributes:
+        where: in which functions the loop's thread was, empty: at rest. task: which one it was about.
+        others: other threads at work, and where. late: seconds until the loop's thread got to look around.
+    """
+
+    where: str
+    task: str
+    others: str
+    late: float = 0.0
+
+
+class StallWatch:
+    """Watches the thread that makes it, which must be the main one (signals are handled there).
+
+    Call :meth:`arm` when a cycle begins.
+
+    Attributes:
+        said: the latest line, empty before the first stall.
+    """
+
+    def __init__(self) -> None:
+        self.said = ""
+        self._thread = threading.get_ident()
+        self._caught: Caught | None = None
+        self._armed = self._due = time.monotonic()
+        self._cpu = time.thread_time()
+        self._schedstat = _open(f"/proc/self/task/{threading.get_native_id()}/schedstat")
+        self._kept = self._stolen()
+        self._said_at = -AGAIN_S
+        self._unsaid = 0
+        self._before = signal.signal(signal.SIGALRM, self._ring)
+
+    def arm(self, seconds: float) -> float | None:
+        """A cycle begins, the next one has to within ``seconds``. Seconds since the last, if that was not so."""
+        now, cpu = time.monotonic(), time.thread_time()
+        caught, self._caught = self._caught, None
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        lasted = None
+        if caught is not None:
+            lasted = now - self._armed
+            self._tell(caught, lasted, cpu - self._cpu)
+        self._armed, self._due, self._cpu = now, now + seconds, cpu
+        self._kept = self._stolen()
+        return lasted
+
+    def close(self) -> None:
+        """Stop watching; idempotent."""
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if signal.getsignal(signal.SIGALRM) == self._ring:
+            signal.signal(signal.SIGALRM, self._before)
+        if self._schedstat >= 0:
+            os.close(self._schedstat)
+        self._schedstat = -1
+
+    def _ring(self, number: int, frame: FrameType | None) -> None:
+        """The timer has gone off: look around. Nothing here waits."""
+        if self._caught is None:
+            late = max(0.0, time.monotonic() - self._due)
+            self._caught = Caught(place(frame), _task(), self._others(), late)
+
+    def _others(self) -> str:
+        """Which of our other threads are at work, and where."""
+        names = {thread.ident: thread.name for thread in threading.enumerate()}
+        found = []
+        for ident, frame in sys._current_frames().items():
+            if ident != self._thread and frame.f_code.co_name not in IDLE and (where := place(frame)):
+                found.append(f"{names.get(ident, 'a thread')} in {where}")
+        return ", ".join(found)
+
+    def _tell(self, caught: Caught, lasted: float, worked: float) -> None:
+        now = time.monotonic()
+        if now - self._said_at < AGAIN_S:
+            self._unsaid += 1
+            return
+        more = f"; {self._unsaid} more since the line before" if self._unsaid else ""
+        stolen = self._stolen()
+        waited = None if stolen is None or self._kept is None else stolen - self._kept
+        self.said = f"no cycle began for {lasted:.3f} s: {cause(caught, lasted, worked, waited)}{more}"
+        log.info("%s", self.said)  # long ones are a fault, which warns
+        self._said_at, self._unsaid = now, 0
+
+    def _stolen(self) -> float | None:
+        """Seconds for which this thread could have run, and another program did; None where the kernel does not say."""
+        try:
+            return int(os.pread(self._schedstat, 100, 0).split()[1]) * 1e-9
+        except (OSError, IndexError, ValueError):
+            return None
+
+
+def cause(caught: Caught, lasted: float, worked: float, waited: float | None) -> str:
+    """Whose fault it was: own work, another program, another thread of ours, or a call that did not return."""
+    task = f" (task {caught.task})" if caught.task else ""
+    if worked >= SHARE * lasted:
+        return f"{caught.where or 'the loop'}{task} ran for {worked:.3f} s"
+    if waited is not None and waited >= SHARE * lasted:
+        return f"other programs had the processor for {waited:.3f} s, in {caught.where or 'the loop'}{task}"
+    if caught.others and (caught.where or caught.late >= MUCH_S):
+        return f"{caught.where or 'the loop'}{task} waited while {caught.others}"
+    if not caught.where and caught.late < MUCH_S:
+        return "nothing was due: neither a scan nor the timer came"
+    return f"{caught.where or 'the loop'}{task} waited: a call that blocks, or the process was stopped"
+
+
+def place(frame: FrameType | None) -> str:
+    """The innermost functions of ours below a frame, the outer one first; empty where there is none: the loop waits."""
+    names: list[str] = []
+    inner = frame
+    while inner is not None and len(names) < DEEP:
+        code = inner.f_code
+        path = Path(code.co_filename)
+        if OWN in path.parents and "site-packages" not in path.parts and path.stem != "stall_watch":
+            names.append(f"{os.path.relpath(path, OWN).removesuffix('.py').replace('/', '.')}.{code.co_qualname}")
+        inner = inner.f_back
+    if names and frame is not None and frame.f_code.co_name in ("select", "poll") and _resting(names[0]):
+        return ""
+    return " > ".join(reversed(names))
+
+
+def _resting(name: str) -> bool:
+    """Whether the innermost function of ours is only the one that runs the loop."""
+    return name.endswith((".main", ".run", ".<module>"))
+
+
+def _open(path: str) -> int:
+    try:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return -1
+
+
+def _task() -> str:
+    """The task that is running, by name."""
+    try:
+        task = asyncio.current_task()
+    except RuntimeError:
+        return ""
+    return "" if task is None else task.get_name()

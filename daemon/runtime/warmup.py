@@ -1,0 +1,321 @@
+"""Loads the estimator once: the first start ever compiles its kernels, under a lock, every later one loads them.
+
+Importing the estimator is what compiles. Two processes that do so at once could spoil the cache's index, hence the lock
+(`daemon.system.kernel_lock`), which who finds all of them there does not need; and the daemon wants to go on talking to
+its devices meanwhile, hence the thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import hashlib
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon.system.kernel_lock import KernelLock, before_compiling, waits
+from hal.blocking_calls import beside
+
+if TYPE_CHECKING:
+    from daemon.runtime.light_setup import Lights
+
+log = logging.getLogger(__name__)
+
+ROOM: Final = Path(__file__).resolve().parents[2] / "estimator"
+LIGHT: Final = ("cdma", "light_filter")
+"""Packages of the estimator that are loaded only where there is a photodiode."""
+OFFLINE: Final = ("calibration", "paper", "floorplan_import")
+"""Packages and modules of the estimator that no daemon loads."""
+TIMED_CODES: Final = 129
+TIMED_TURNS: Final = 5
+
+CPUINFO: Final = Path("/proc/cpuinfo")
+MAKE: Final = frozenset({
+    "vendor_id", "cpu family", "model", "model name", "stepping", "flags",
+    "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "CPU revision", "Features",
+})  # fmt: skip
+"""Of an x86 processor, and of an ARM one."""
+REPORT_S: Final = 5.0
+"""Seconds between two progress lines."""
+_one: Final = threading.Lock()
+"""Of those that load in one process."""
+LOOK_S: Final = 0.5
+"""Seconds between two looks for the first kernel that has been compiled."""
+
+
+class CannotLoad(Exception):
+    """The estimator cannot be loaded; the text says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Warmth:
+    """How the warm-up went.
+
+    Attributes:
+        compiled: kernels had to be compiled. seconds: it took. code_us: microseconds that the search for one light code
+            takes here, 0 without lights.
+    """
+
+    compiled: bool
+    seconds: float
+    code_us: float = 0.0
+
+
+async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | None = None) -> Warmth:
+    """Load the estimator in a thread; ``progress`` gets a line every few seconds while kernels are being compiled.
+
+    A stop during the first start does not wait for the compiler.
+    What belongs to light is loaded only where ``lights`` says that there is a photodiode.
+    """
+    begun = time.monotonic()
+    loading = beside(load if lights is None else partial(load, lights), "warm-up")
+    while not loading.done():
+        await asyncio.wait([loading], timeout=REPORT_S)
+        if not loading.done() and (line := _progress_line(time.monotonic() - begun, lights is not None)):
+            progress(line)
+    warmth = loading.result()
+    gc.collect()
+    gc.freeze()  # what exists now stays: the collector need not walk through it during a cycle
+    if warmth.compiled:
+        progress(f"kernels compiled in {warmth.seconds:.0f} s; later starts load them in less than a second")
+    return warmth
+
+
+def load(lights: Lights | None = None) -> Warmth:
+    """Import and exercise the estimator. Blocks; for a thread, or for a command that may wait.
+
+    Where kernels are missing it waits until no other process compiles any; where none are, for nobody.
+
+    Raises:
+        CannotLoad: nowhere to keep compiled kernels, or memory must not be made executable here.
+    """
+    begun = time.monotonic()
+    try:
+        with _one:
+            return _load(begun, lights)
+    except PermissionError as error:
+        remedy = "the process must be allowed to make memory executable"  # see MemoryDenyWriteExecute= (systemd.exec)
+        if error.filename is not None:
+            remedy = "give that file to the user who runs this, or name another folder with NUMBA_CACHE_DIR"
+        raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
+    except (OSError, RuntimeError) as error:
+        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
+
+
+def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object], module: str = "") -> None:
+    """Do ``work``, which loads ``what`` of the estimator, and ``say`` (in another thread) that kernels are compiled.
+
+    Nothing is done where an earlier start has left all of them, and nothing said where it has left these. ``module``:
+    imported after that; of what it is missing it compiles under the lock.
+
+    Raises:
+        CannotLoad: as for :func:`load`.
+    """
+    try:
+        if is_marked(what):
+            return
+        begun, before = time.monotonic(), _compiled()
+        with _announced(say, before):
+            work()
+            if module:
+                _import(module)
+        mark_of(what).touch()
+    except (OSError, RuntimeError) as error:
+        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
+    if count := len(_compiled() - before):
+        say(f"{count} kernels compiled in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
+
+
+def _import(module: str) -> None:
+    """Import a module of kernels that no daemon loads."""
+    from estimator.numerics.jit_cache import CACHE_DIR
+
+    with KernelLock(CACHE_DIR) as lock, before_compiling(lock.take):
+        import_module(module)
+
+
+@contextlib.contextmanager
+def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
+    """``say`` that kernels are being compiled as soon as the first one is there that was not ``before``."""
+    done = threading.Event()
+
+    def look() -> None:
+        while not done.wait(LOOK_S):
+            if _compiled() - before:
+                say("first start of this version: its kernels are being compiled, which takes a minute or more")
+                return
+
+    looking = threading.Thread(target=look, name="lumiloop-compiling", daemon=True)
+    looking.start()
+    try:
+        yield
+    finally:
+        done.set()
+        looking.join()
+
+
+def _compiled() -> set[Path]:
+    from estimator.numerics.jit_cache import CACHE_DIR
+
+    return set(CACHE_DIR.rglob("*.nbc"))
+
+
+def mark_of(what: str) -> Path:
+    """The file that says that an earlier start has compiled all that this one needs."""
+    from estimator.numerics.jit_cache import CACHE_DIR
+
+    # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
+    # processor: a disk may be put into another computer
+    key = f"{ROOM} {os.environ.get('NUMBA_CPU_NAME') or _processor()}"
+    return CACHE_DIR / f"{what}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+
+
+def _processor() -> str:
+    """What Linux says of the first one's make and abilities (proc(5)): more than the compiler goes by."""
+    first = CPUINFO.read_text().partition("\n\n")[0]
+    return "\n".join(line for line in first.splitlines() if line.partition("\t")[0].partition(":")[0].strip() in MAKE)
+
+
+def is_marked(what: str) -> bool:
+    """Whether that file is there, and kernels: who makes room on a disk deletes these, which are large."""
+    return mark_of(what).exists() and bool(_compiled())
+
+
+def _what(lights: bool) -> str:
+    """What a start of the daemon needs, with lights or without."""
+    return "warm-lights" if lights else "warm"
+
+
+def is_warm(lights: bool) -> bool:
+    """Whether an earlier start has compiled all that one needs, with lights or without; loads none of it.
+
+    Raises:
+        CannotLoad: nowhere to keep compiled kernels.
+    """
+    try:
+        return is_marked(_what(lights))
+    except (OSError, RuntimeError) as error:
+        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
+
+
+def _load(begun: float, lights: Lights | None) -> Warmth:
+    from estimator.numerics.jit_cache import CACHE_DIR
+
+    what = _what(lights is not None)
+    with KernelLock(CACHE_DIR) as lock:
+        compiled = False
+        if not is_marked(what):
+            lock.take()
+            compiled = not is_marked(what)  # who had the lock may have compiled them all
+        cold = compiled
+        if cold:
+            count = kernel_count(lights is not None)
+            log.info(
+                "first start of this version: compiling its %d kernels, or what is missing of them (a minute or two)",
+                count,
+            )
+
+        def missing() -> None:
+            """A kernel is not there, whatever the mark says."""
+            nonlocal compiled
+            lock.take()
+            compiled = True
+
+        with _uncollected(not cold), before_compiling(missing):
+            _exercise()
+            code_us = 0.0 if lights is None else _exercise_lights(lights)
+        if cold:
+            mark_of(what).touch()
+    return Warmth(compiled, time.monotonic() - begun, code_us)
+
+
+@contextlib.contextmanager
+def _uncollected(wanted: bool) -> Iterator[None]:
+    """No look for garbage meanwhile: a fifth of what loading takes, which leaves little; compiling leaves much."""
+    collects = gc.isenabled()
+    if wanted:
+        gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def kernel_count(lights: bool = False) -> int:
+    """Kernels that the first start compiles, with lights or without; not those that are written into others."""
+    left_out = OFFLINE if lights else OFFLINE + LIGHT
+    files = (path for path in ROOM.rglob("*.py"))
+    paths = (path for path in files if not {path.stem, path.parent.name} & set(left_out))
+    heads = (text.partition("\ndef ")[0] for path in paths for text in path.read_text().split("\n@kernel(")[1:])
+    return sum("inline=True" not in head for head in heads)
+
+
+def _exercise() -> None:
+    """Two steps with a small scan: what is imported or allocated on first use is so before the first real cycle."""
+    import numpy as np
+
+    from estimator.measurements import UNLIMITED, Scan
+    from estimator.pipeline import new_state, step
+
+    state = new_state()
+    bearing = np.linspace(-2.0, 2.0, 100)
+    reach = 2.0 / np.maximum(np.abs(np.cos(bearing)), np.abs(np.sin(bearing)))
+    hit = np.ones(100, dtype=np.uint8)
+    for seq in range(2):
+        step(state, [Scan(seq * 0.1, seq * 0.1 + 0.05, seq, np.zeros(3), bearing, reach, hit, 0.01)], UNLIMITED)
+
+
+def _exercise_lights(lights: Lights) -> float:
+    """Steps with light in them; returns the microseconds that the search for one code takes on this computer."""
+    import numpy as np
+
+    from daemon.runtime.light_setup import new_state
+    from estimator.cdma.decoder import decode, new_decoder, search
+    from estimator.measurements import UNLIMITED, SampleBlock
+    from estimator.pipeline import step
+
+    profile, state = lights.profile, new_state(lights)
+    words = np.round(2000.0 + 500.0 * np.sin(0.9 * np.arange(round(profile.epoch_s * profile.sample_rate)) ** 1.1))
+    blocks = [
+        SampleBlock(turn * profile.epoch_s, (turn + 1) * profile.epoch_s, words, profile.sample_rate)
+        for turn in range(TIMED_TURNS)
+    ]
+    for block in blocks[:2]:
+        step(state, [block], UNLIMITED)
+    decoder = new_decoder(profile, 0.0)
+    decode(decoder, blocks[0])
+    search(decoder, TIMED_CODES)  # the first one makes the spectra of the codes
+    best = float("inf")
+    for block in blocks[1:]:
+        decode(decoder, block)
+        begun = time.perf_counter()
+        search(decoder, TIMED_CODES)
+        best = min(best, time.perf_counter() - begun)
+    return 1e6 * best / TIMED_CODES
+
+
+def _progress_line(seconds: float, lights: bool = False) -> str:
+    """How far compiling has come after ``seconds``, or what is waited for; empty until the compiler is loaded."""
+    kernel = sys.modules.get("estimator.numerics.jit_cache")
+    directory: Path | None = getattr(kernel, "CACHE_DIR", None)
+    if directory is None:
+        return ""
+    if waits.is_set():
+        return f"waiting for another process, which compiles kernels, after {seconds:.0f} s"
+    since = time.time() - seconds
+    count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
+    if count == 0:
+        return f"still loading the estimator after {seconds:.0f} s"
+    total = kernel_count(lights)  # kernels that only one part of the program loads may have been compiled beside
+    return f"compiling: {min(count, total)} of {total} kernels after {seconds:.0f} s"

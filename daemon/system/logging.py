@@ -1,0 +1,156 @@
+"""Where the daemon's log goes: fields to the journal where the service manager runs it, plain lines to a terminal."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import socket
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from daemon.health.faults import FAULTS, Fault
+
+JOURNAL: Final = Path("/run/systemd/journal/socket")
+TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
+PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
+"""Of syslog(3), by level."""
+LONGEST: Final = 32_768
+"""Bytes of a message that are kept: a datagram has to take it."""
+
+FAULT_ID: Final = "0f26ad5c5f9d4f6fa1a3c8a7e7c1d9b4"
+OVER_ID: Final = "5c0cb1d0b8a64f27a0a5f5a4b0b9d3e1"
+STATE_ID: Final = "a7d9d3f86c0e4f21b1c4a98e2f63d07c"
+"""Message IDs of the journal's catalog (systemd/lumiloop.catalog). Part of the contract: never change."""
+
+Fields = Mapping[str, object]
+
+
+def of_fault(fault: Fault, over: bool = False) -> dict[str, Any]:
+    """``extra=`` of a line that tells that a fault has come, or is over."""
+    text, remedy = FAULTS[fault]
+    fields = {"LUMILOOP_FAULT": int(fault), "LUMILOOP_FAULT_NAME": fault.name, "LUMILOOP_MEANING": text}
+    if over:
+        return _extra({"MESSAGE_ID": OVER_ID, **fields})  # nothing needs to be done
+    return _extra({"MESSAGE_ID": FAULT_ID, **fields, "LUMILOOP_REMEDY": remedy})
+
+
+def of_state(state: str, reason: str, remedy: str) -> dict[str, Any]:
+    """``extra=`` of a line that tells what may be said about the pose from now on."""
+    fields = {"LUMILOOP_STATE": state, "LUMILOOP_REASON": reason, "LUMILOOP_REMEDY": remedy}
+    return _extra({"MESSAGE_ID": STATE_ID, **fields})
+
+
+def _extra(fields: Fields) -> dict[str, Any]:
+    return {"fields": fields}
+
+
+class Sparing:
+    """Lines about what others do at a rate of their own: so many in a while, then only how many more there were.
+
+    Args:
+        log: gets the lines. lines, seconds: so many are told in so many seconds.
+    """
+
+    def __init__(self, log: logging.Logger, lines: int = 10, seconds: float = 10.0) -> None:
+        self._log, self._lines, self._seconds = log, lines, seconds
+        self._until = -math.inf
+        self._told = self._left_out = 0
+
+    def say(self, t_mono: float, level: int, text: str) -> None:
+        """Tell it, or count it."""
+        if t_mono >= self._until:
+            self._until, self._told = t_mono + self._seconds, 0
+        if self._told == self._lines:
+            self._left_out += 1
+            return
+        more, self._left_out = self._left_out, 0
+        self._told += 1
+        self._log.log(level, "%s%s", text, f" ({more} more such lines were left out before it)" if more else "")
+
+
+def start_log() -> None:
+    """Log to the journal where stderr is the journal's own stream, else to stderr with the time of day."""
+    handler: logging.Handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter(TERMINAL_FORMAT))
+    if to_journal():
+        handler.setFormatter(_PriorityFormat("%(message)s"))
+        handler = JournalHandler(JOURNAL, handler)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+def to_journal() -> bool:
+    """Whether stderr is the journal's own stream and not redirected (systemd.exec(5), JOURNAL_STREAM)."""
+    try:
+        at = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{at.st_dev}:{at.st_ino}"
+
+
+class JournalHandler(logging.Handler):
+    """Sends each line with its fields in the journal's native protocol (https://systemd.io/JOURNAL_NATIVE_PROTOCOL).
+
+    Never waits: a journal that takes nothing just now loses the line, which is counted and said with the next one that
+    gets through. Where the socket is missing, ``otherwise`` takes the lines.
+    """
+
+    def __init__(self, path: Path, otherwise: logging.Handler) -> None:
+        super().__init__()
+        self.lost = 0
+        self._path = str(path)
+        self._otherwise = otherwise
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one line."""
+        try:
+            self._socket.sendto(packed(self._fields(record)), self._path)
+            self.lost = 0
+        except BlockingIOError:
+            self.lost += 1
+        except OSError:
+            self._otherwise.handle(record)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+        super().close()
+
+    def _fields(self, record: logging.LogRecord) -> dict[str, object]:
+        text = self.format(record).encode(errors="replace")[:LONGEST].decode(errors="ignore")
+        lost = {"LUMILOOP_LINES_LOST": self.lost} if self.lost else {}
+        return {
+            "MESSAGE": text,
+            "PRIORITY": PRIORITY.get(record.levelno, 6),
+            "SYSLOG_IDENTIFIER": "lumiloop",
+            "CODE_FILE": record.pathname,
+            "CODE_LINE": record.lineno,
+            "CODE_FUNC": record.funcName,
+            "LUMILOOP_PART": record.name,
+            **lost,
+            **record.__dict__.get("fields", {}),
+        }
+
+
+def packed(fields: Fields) -> bytes:
+    """One entry of the native protocol: a value that has line feeds in it goes with its length."""
+    parts = []
+    for name, value in fields.items():
+        data = str(value).encode(errors="replace")
+        if b"\n" in data:
+            parts.append(name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n")
+        else:
+            parts.append(name.encode() + b"=" + data + b"\n")
+    return b"".join(parts)
+
+
+class _PriorityFormat(logging.Formatter):
+    """Lines as sd-daemon(3) wants them: priority first, on every line of a message."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        prefix = f"<{PRIORITY.get(record.levelno, 6)}>"
+        return "\n".join(prefix + line for line in super().format(record).splitlines())

@@ -1,0 +1,1 @@
+"""Off-line calibration from recorded drives: lamps, receiver, odometry, lidar mount."""

@@ -1,0 +1,279 @@
+"""What is remembered of the lamps from block to block: code phases, crystal rates, strengths, life and death.
+
+Each lamp has a two-state Kalman filter [phase, rate]; what is common to all (lateness of the block's time stamps, host
+clock against the lamps' crystals, sample clock) has filters of its own, so that a late time stamp moves no lamp.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma.air_interface import Profile
+from estimator.cdma.data_frame import LampFrame
+from estimator.cdma.frame_accumulator import BitRings
+from estimator.cdma.gold_codes import gold_codes
+from estimator.cdma.sample_block import Fit, Prior
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+CAPACITY: Final = 64
+"""Lamps at once."""
+
+NEW_PHASE: Final = 0.06
+"""Chips: how well acquisition knows a phase."""
+
+PHASE_WALK: Final = 2e-4
+"""Chips per root second: what the rate does not explain."""
+
+RATE_WALK: Final = 1e-8
+"""Relative crystal rate per root second (a lamp that warms up)."""
+
+CLOCK_WALK: Final = 3e-6
+"""Relative sample clock per root second."""
+
+DRIFT_WALK: Final = 3e-8
+"""Host clock against lamps' crystals, per root second."""
+
+STAMP_S: Final = 40e-6
+"""One sigma of a block's time base from its two stamps."""
+
+APART: Final = 1.0
+"""Chips between two lamps with the same code, below which they cannot be told apart."""
+
+ASTRAY: Final = 0.15
+"""Chips: a phase that is not known better (after a long pause) is forgotten; to search for it anew takes 0.2 s."""
+
+LONGEST_S: Final = 1e6
+"""No pause counts for more: nothing is known any more of any phase, and squares stay numbers."""
+
+UNTRIED: Final = 1.5e-4
+"""One sigma of a sample clock that is stored (good to 200 ppm) or comes from a search."""
+
+FINEST: Final = 3e-4
+"""Chips: phases are not believed better than this (shape errors of the template)."""
+
+HITS, MISSES, LOST = 2, 2, 20
+"""Blocks until a candidate is a lamp; until it is dropped; until a lamp is given up."""
+
+FAINT, CLEAR, EVIDENT = 5.0, 8.0, 20.0
+"""Sigmas below which a lamp is not seen, and that count as seen once and as seen often enough."""
+
+
+class Life(IntEnum):
+    """State of a slot."""
+
+    FREE = 0
+    TENTATIVE = 1
+    CONFIRMED = 2
+
+
+_FREE, _TENTATIVE, _CONFIRMED = (int(life) for life in Life)
+"""As plain numbers, for comparisons with arrays."""
+
+
+class Clocks:
+    """What all lamps share. Lag and drift are in chips and chips per chip; clock is the sample clock's relative error.
+
+    ``clock`` is positive when samples are farther apart than the book says.
+    """
+
+    def __init__(self, profile: Profile, clock_ppm: float | None) -> None:
+        self._chip_rate = profile.chip_rate
+        self.known = clock_ppm is not None
+        self.clock = 0.0 if clock_ppm is None else clock_ppm * 1e-6
+        self.clock_var = UNTRIED**2
+        self.proven, self._proven_var = self.clock, self.clock_var
+        self.guess: float | None = None
+        self.state = np.zeros(2)  # lag, drift
+        self.cov = np.diag([(STAMP_S * self._chip_rate) ** 2, (3e-5) ** 2])
+
+    def predict(self, dt: float) -> None:
+        """Advance by ``dt`` seconds."""
+        chips = dt * self._chip_rate
+        step = np.array([[1.0, chips], [0.0, 1.0]])
+        self.state = step @ self.state
+        self.cov = step @ self.cov @ step.T
+        self.cov[0, 0] += PHASE_WALK**2 * dt
+        self.cov[1, 1] += DRIFT_WALK**2 * dt
+        self.clock_var += CLOCK_WALK**2 * dt
+
+    def update(self, lag: float, excess_s: float, fit: Fit) -> None:
+        """Take in the lag found beyond the prediction; ``excess_s`` is how uncertain the stamps were this time."""
+        noise = (max(STAMP_S, 0.3 * excess_s) * self._chip_rate) ** 2
+        gain = self.cov[:, 0] / (self.cov[0, 0] + noise)
+        self.state = self.state + gain * lag
+        self.cov = self.cov - np.outer(gain, self.cov[0])
+        self.clock += fit.clock * (1.0 + self.clock)
+        self.clock_var = max(fit.clock_var, 1e-14)
+
+    def prove(self) -> None:
+        """The sample clock has been confirmed by a lamp beyond doubt."""
+        self.known, self.guess = True, None
+        self.proven, self._proven_var = self.clock, self.clock_var
+
+    def suppose(self, clock: float) -> None:
+        """A search over the whole range says so; the next ones, over newer blocks, will confirm it or not."""
+        self.clock = self.guess = clock
+        self.clock_var = UNTRIED**2
+
+    def rest(self) -> None:
+        """No lamp left: back to the last sample clock that was proven, so that chance finds do not wear it out."""
+        self.clock = self.proven if self.guess is None else self.guess
+        self.clock_var = max(self._proven_var, self.clock_var)
+
+
+class Tracks:
+    """Slots of lamps. Phases are in chips at the time ``t``, without the common lag, and count periods for ever."""
+
+    def __init__(self, profile: Profile) -> None:
+        self._codes = gold_codes(profile.degree)
+        self._chip_rate = profile.chip_rate
+        self._crystal = 0.6e-6 * profile.crystal_ppm
+        self.length = profile.length
+        self.t = -np.inf
+        self.life: Index = np.zeros(CAPACITY, np.int64)
+        self.code: Index = np.zeros(CAPACITY, np.int64)
+        self.phase, self.rate = np.zeros(CAPACITY), np.zeros(CAPACITY)
+        self.cov = np.zeros((CAPACITY, 2, 2))
+        self.amplitude, self.amplitude_var = np.zeros(CAPACITY), np.zeros(CAPACITY)
+        self._dark = np.zeros(CAPACITY, bool)
+        self.hits: Index = np.zeros(CAPACITY, np.int64)
+        self.misses: Index = np.zeros(CAPACITY, np.int64)
+        self.rings = BitRings(CAPACITY)
+        self.frames: list[LampFrame | None] = [None] * CAPACITY
+
+    @property
+    def slots(self) -> Index:
+        """Occupied slots."""
+        return self.life.nonzero()[0]
+
+    @property
+    def confirmed(self) -> Index:
+        """Slots of lamps that are beyond doubt."""
+        found: Index = (self.life == _CONFIRMED).nonzero()[0]
+        return found
+
+    def predict(self, t: float) -> float:
+        """Advance all phases to time ``t``; returns the seconds passed (0 at the first call)."""
+        dt = min(max(t - self.t, -LONGEST_S), LONGEST_S) if np.isfinite(self.t) else 0.0
+        self.t = t
+        chips = dt * self._chip_rate
+        self.phase += (1.0 + self.rate) * chips
+        p = self.cov
+        p[:, 0, 0] += 2 * chips * p[:, 0, 1] + chips**2 * p[:, 1, 1] + PHASE_WALK**2 * abs(dt)
+        p[:, 0, 1] += chips * p[:, 1, 1]
+        p[:, 1, 0] = p[:, 0, 1]
+        p[:, 1, 1] += RATE_WALK**2 * abs(dt)
+        for slot in ((p[:, 0, 0] > ASTRAY**2) & (self.life != _FREE)).nonzero()[0]:
+            self.drop(int(slot))
+        return dt
+
+    def add(self, code: int, phase: float, t: float, amplitude: float) -> None:
+        """A candidate, its phase at time ``t`` without the common lag; ignored if all slots are taken.
+
+        A lamp that is known and seen there is left alone; one that is known but faint has been lost sight of: it is
+        put where the candidate is, and has to be confirmed anew.
+        """
+        free = np.flatnonzero(self.life == Life.FREE)
+        chips = (self.t - t) * self._chip_rate
+        same = (self.life != Life.FREE) & (self.code == code)
+        apart = np.abs((self.phase - phase - chips + 0.5 * self.length) % self.length - 0.5 * self.length)
+        known = np.flatnonzero(same & (apart < APART))
+        if len(known) and self.faint(known).all():
+            self._place(int(known[0]), phase, t)
+            self.life[known[0]] = Life.TENTATIVE
+        if len(known) or not len(free):
+            return
+        k = int(free[0])
+        self.life[k], self.code[k] = Life.TENTATIVE, code
+        self.frames[k] = None
+        self._place(k, phase, t)
+        self.amplitude[k], self.amplitude_var[k] = amplitude, 0.0
+
+    def _place(self, k: int, phase: float, t: float) -> None:
+        """Put a slot to the phase that a search has found at time ``t``."""
+        chips = (self.t - t) * self._chip_rate
+        self.phase[k], self.rate[k] = phase + chips, 0.0
+        var = self._crystal**2
+        self.cov[k] = [[NEW_PHASE**2 + var * chips**2, var * chips], [var * chips, var]]
+        self.hits[k] = self.misses[k] = 0
+        self._dark[k] = False
+        self.rings.forget(k)
+
+    def faint(self, slots: Index) -> npt.NDArray[np.bool_]:
+        """Which of these lamps were not seen in the last block."""
+        dark: npt.NDArray[np.bool_] = self._dark[slots]
+        return dark
+
+    def weigh(self, slots: Index, amplitude: Array, variance: Array) -> None:
+        """Amplitudes of a block. A lamp that was dark must be clearly seen: chance reaches 5 sigmas once in a while."""
+        self.amplitude[slots], self.amplitude_var[slots] = amplitude, variance
+        self._dark[slots] = amplitude < np.where(self._dark[slots], CLEAR, FAINT) * np.sqrt(variance)
+
+    def drop(self, slot: int) -> None:
+        """Forget a lamp."""
+        self.life[slot] = Life.FREE
+        self.frames[slot] = None
+
+    def move(self, slot: int, chips: float) -> None:
+        """A candidate that sits on a side lobe goes to the peak and starts anew."""
+        self.phase[slot] += chips
+        self.cov[slot] = [[NEW_PHASE**2, 0.0], [0.0, self._crystal**2]]
+        self.hits[slot] = 0
+        self.rings.forget(slot)
+
+    def first_period(self, slots: Index, lag: float, span: float) -> Index:
+        """Running number of the code period heard first in a block that begins ``span`` chips before the middle.
+
+        A period is still heard one chip after its end (its last chip's tail), with a data sign of its own.
+        """
+        begin = self.phase[slots] + lag - (1.0 + self.rate[slots]) * span
+        return np.floor((begin - 1.0) / self.length).astype(np.int64)
+
+    def prior(self, slots: Index, lag: float, lag_var: float, clock_var: float, span: float) -> Prior:
+        """Prediction for a block whose middle is now."""
+        first = self.first_period(slots, lag, span)
+        bit_sum, bit_weight = self.rings.before(slots, first)
+        phase = self.phase[slots] + lag
+        return Prior(
+            chips=self._codes[self.code[slots]],
+            phase=phase - first * self.length,
+            rate=1.0 + self.rate[slots],
+            phase_var=self.cov[slots, 0, 0],
+            lag_var=lag_var,
+            clock_var=clock_var,
+            amplitude=self.amplitude[slots],
+            bit_sum=bit_sum,
+            bit_weight=bit_weight,
+        )
+
+    def learn_phases(self, slots: Index, fit: Fit) -> None:
+        """Conditional Gaussian: the fit's posterior of each phase moves phase and rate."""
+        before = self.cov[slots, 0, 0]
+        after = np.minimum(np.maximum(fit.phase_var, FINEST**2), before)
+        share = self.cov[slots, 0, 1] / before
+        self.phase[slots] += fit.phase
+        self.rate[slots] += share * fit.phase
+        self.cov[slots, 1, 1] -= share**2 * (before - after)
+        self.cov[slots, 0, 0] = after
+        self.cov[slots, 0, 1] = self.cov[slots, 1, 0] = share * after
+
+    def judge(self, slots: Index, floor: float) -> Index:
+        """Count blocks seen and missed, drop the lost; returns candidates that have been seen often enough."""
+        amplitude, sigma = self.amplitude[slots], np.sqrt(self.amplitude_var[slots])
+        seen = (amplitude > CLEAR * sigma) & (amplitude > floor)
+        tentative = self.life[slots] == _TENTATIVE
+        missed = np.where(tentative, ~seen, self.faint(slots))
+        beyond = amplitude > EVIDENT * sigma
+        self.hits[slots] += np.where(seen & beyond, HITS, seen)
+        self.misses[slots] = np.where(missed, self.misses[slots] + 1, np.where(tentative, self.misses[slots], 0))
+        limit = np.where(tentative, MISSES, LOST)
+        for slot in slots[self.misses[slots] >= limit].tolist():
+            self.drop(slot)
+        ripe: Index = slots[(self.life[slots] == _TENTATIVE) & (self.hits[slots] >= HITS)]
+        return ripe

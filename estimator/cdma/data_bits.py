@@ -1,0 +1,120 @@
+"""The data signs of a block: amplitude of every lamp in every code period touched, solved jointly.
+
+One more pair of rows stands for what the leaders' lag and clock are off by; without it their errors, ten times a weak
+lamp's light, would look like noise and hide its signs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma.code_period_kernels import TAIL_CHIPS, compare_shifts, cut, lay_out, solve_rows, tell_signs
+from estimator.cdma.correlation_kernels import columns, mixed
+from estimator.cdma.joint_fit_kernels import REACH
+from estimator.cdma.sample_block import Fit, Prior, Sampled, rows_of
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+LEADER: Final = 0.4
+"""Lamps of at least this share of the strongest lead: their signs are certain before anything is solved."""
+
+LONG_PIECE: Final = 0.25
+"""A code period of which the block holds at least this share gets its likelier sign in any case."""
+
+
+@dataclass(eq=False)
+class Pieces:
+    """The block's signal, a row per lamp and code period touched (K), and two for lag and clock.
+
+    Attributes:
+        index, bounds: of :func:`estimator.cdma.code_period_kernels.lay_out`. rows: (K + 2, N).
+        found: (K + 2,) amplitudes with their signs; lag in chips; relative clock.
+        unit_var: (K,) variance at unit noise. noise_var: per sample.
+    """
+
+    index: Index
+    bounds: Index
+    rows: Array
+    found: Array
+    unit_var: Array
+    noise_var: float
+
+
+@dataclass(eq=False)
+class Signs:
+    """Data signs (L, P), 0 where a short piece is not certain; amplitudes with sign and their variances, inf if absent.
+
+    ``lag`` and ``clock``: first corrections to the prior's. ``noise_var``: per sample.
+    """
+
+    signs: Array
+    soft: Array
+    soft_var: Array
+    lag: float
+    clock: float
+    noise_var: float
+
+
+def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
+    """Solve for the amplitude of each lamp in each code period touched, at the phases of the prior."""
+    n_lamps, length = prior.chips.shape
+    span = float(block.x[-1] - block.x[0])
+    periods = int(span / length) + 4  # a tail in front, and one spare for corrections of the clock
+    tail = int(TAIL_CHIPS / (block.x[1] - block.x[0]))
+    bounds, index = np.empty((n_lamps, periods + 1), np.int64), np.empty((4, n_lamps * periods), np.int64)
+    samples, lamps = rows_of(block.x, block.mask, block.clean), prior.lamps()
+    k = lay_out(prior.chips, lamps, samples, tail, bounds, index)
+    stack = stacked(block, k + 2)
+    drive = np.where(prior.amplitude > LEADER * np.max(prior.amplitude), prior.amplitude, 0.0)
+    cut(prior.chips, lamps, samples, index, k, table, drive, stack)
+    found, unit_var = np.empty(k + 2), np.empty(k)
+    noise_var = solve_rows(stack, index, k, len(block.q), found, unit_var)
+    return Pieces(index, bounds, stack[: k + 2], found, unit_var, noise_var)
+
+
+def stacked(block: Sampled, free: int) -> Array:
+    """Room for ``free`` rows (not initialised) above the block's mains rows and its y."""
+    stack = np.empty((free + len(block.q) + 1, len(block.y)))
+    stack[free:-1] = block.q
+    stack[-1] = block.y
+    return stack
+
+
+def without(block: Sampled, prior: Prior, table: Array) -> Array:
+    """What is left of a block when these lamps are taken out near these phases; (N,), mains taken out as well."""
+    pieces = solve_pieces(block, prior, table)
+    return block.project(block.y - mixed(pieces.found, pieces.rows))
+
+
+def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
+    """Data signs of a block, from this block and from what the last one said about the first period touched."""
+    pieces = solve_pieces(block, prior, table)
+    whole = prior.chips.shape[1] * len(block.x) / float(block.x[-1] - block.x[0])
+    found = rows_of(pieces.found[:-2], pieces.noise_var * pieces.unit_var)
+    told = np.empty((3, len(prior.phase), pieces.bounds.shape[1] - 1))
+    tell_signs(pieces.index, found, pieces.bounds, rows_of(prior.bit_sum, prior.bit_weight), LONG_PIECE * whole, told)
+    reach = REACH / float(block.x[-1])
+    lag, clock = pieces.found[-2:].tolist()
+    lag, clock = min(max(lag, -REACH), REACH), min(max(clock, -reach), reach)
+    return Signs(told[2], told[0], told[1], lag, clock, pieces.noise_var)
+
+
+SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])
+"""Chips: where a Manchester code has side lobes (-0.5 at half a chip)."""
+
+
+def side_lobe(block: Sampled, prior: Prior, fit: Fit, lamp: int, table: Array) -> float:
+    """Chips by which one lamp of a fit sits beside its correlation peak: 0, or one of the side lobes' distances."""
+    few = len(SHIFTS)
+    waves, signs, score = np.empty((2, few, len(block.x))), np.ones((few, fit.soft.shape[1])), np.empty(few)
+    phase = prior.phase[lamp] + SHIFTS + fit.phase[lamp] + fit.lag
+    lamps = rows_of(phase, np.full(few, prior.rate[lamp] * (1.0 + fit.clock)))
+    bounds = columns(prior.chips[[lamp] * few], lamps, block.samples, signs, table, waves)
+    bits = np.where(fit.soft[lamp] < 0, -1.0, 1.0) * fit.amplitude[lamp]
+    compare_shifts(waves[0], bounds[0], bits, fit.residual, score)
+    return float(SHIFTS[score.argmax()])

@@ -1,0 +1,78 @@
+"""What goes into the light decoder and what comes out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma.data_frame import LampFrame
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+
+class BlockFlag(IntFlag):
+    """What was wrong with a block; several may be."""
+
+    NONE = 0
+    CLIPPED = 1  # some samples at the rails; they were left out
+    SATURATED = 2  # too many at the rails: no amplitudes
+    FLAT = 4  # no variation at all: dark and unlit, or a dead converter
+    MALFORMED = 8  # words, a rate or times that cannot be
+    LENGTH = 16  # shorter than a code period, or longer than can be afforded
+    STALLED = 32  # the bus stood still inside; amplitudes are not to be used
+    MENDED = 64  # the bus stood still inside, and that was corrected
+    NOISY = 128  # far more left over than usual: something in the light is not explained
+
+
+UNUSABLE = BlockFlag.SATURATED | BlockFlag.FLAT | BlockFlag.MALFORMED | BlockFlag.LENGTH | BlockFlag.STALLED
+
+
+class LinkFlag(IntFlag):
+    """What is special about one link."""
+
+    NONE = 0
+    FAINT = 1  # amplitude not significant (occluded, or out of view); the phase is being remembered
+    TWIN = 2  # another lamp with the same code is in view: the ID alone does not tell which
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleBlock:
+    """One uninterrupted read of the converter.
+
+    Attributes:
+        t_begin, t_end: ``t_mono`` just before and just after the read. words: ADC words.
+        rate: samples per second, nominal.
+    """
+
+    t_begin: float
+    t_end: float
+    words: Array
+    rate: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightEpoch:
+    """Which lamps were seen over ``[t_begin, t_end]`` and how strongly; arrays have one element per link.
+
+    Attributes:
+        ids: code numbers; an ID may occur twice (see `LinkFlag.TWIN`). amplitude: A, amplitude of the modulated
+            photocurrent. variance: A^2. flags: of :class:`LinkFlag`.
+        lamps: what each lamp has said about itself, None until its first frame is complete.
+        block: of :class:`BlockFlag`; without a usable block there are no links. noise_a: A per sample.
+        clock_ppm: error of the sample clock, None until it is known.
+    """
+
+    t_begin: float
+    t_end: float
+    ids: Index
+    amplitude: Array
+    variance: Array
+    flags: Index
+    lamps: tuple[LampFrame | None, ...]
+    block: BlockFlag
+    noise_a: float
+    clock_ppm: float | None

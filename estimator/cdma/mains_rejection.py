@@ -1,0 +1,116 @@
+"""What is in the ADC words beside coded light: offset, slow drift, and the flicker of mains lamps.
+
+A subspace is projected out of every block: constant, ramp, parabola, harmonics of the flicker, and the fundamental
+times t, which covers a fundamental that is a little off or changes its strength. Its frequency is tracked in cycles per
+sample, so that it takes the error of the sample clock with it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma.correlation_kernels import gram, inner
+
+Array = npt.NDArray[np.float64]
+
+FUNDAMENTALS_HZ: Final = (100.0, 120.0)
+PULL: Final = 0.03
+"""A tracked frequency may leave its nominal value by so much (sample clock and grid together)."""
+
+REBUILD: Final = 3e-5
+"""Relative frequency step that is worth a new basis: 0.003 Hz, 0.001 rad of the second harmonic at a block's ends."""
+
+GAIN: Final = 0.5
+"""Share of the frequency error found in one block that is followed."""
+
+JUMP: Final = 5e-4
+"""Relative frequency error beyond which a block is believed to be disturbed rather than the grid to have moved."""
+
+_COS, _SIN, _T_COS, _T_SIN = 3, 4, 5, 6
+
+
+def basis(times: Array, frequency: float, harmonics: int) -> Array:
+    """Rows to be projected out, (5 + 2 * harmonics, N), not orthogonal; ``frequency`` in cycles per unit of time."""
+    middle = 0.5 * (times[0] + times[-1])
+    t = 2.0 * (times - middle) / (times[-1] - times[0])
+    tone = np.exp(2j * np.pi * frequency * (times - middle))
+    rows = [np.ones_like(t), t, t * t, tone.real, tone.imag, t * tone.real, t * tone.imag]
+    power = tone
+    for _ in range(2, harmonics + 1):
+        power = power * tone
+        rows += [power.real, power.imag]
+    return np.array(rows)
+
+
+def orthonormal(rows: Array) -> tuple[Array, Array]:
+    """Orthonormal rows q of the same span, and the lower matrix with ``q = lower @ rows`` (Cholesky of the Gram)."""
+    products = np.empty((len(rows), len(rows)))
+    gram(rows, len(rows), products)
+    lower = np.linalg.inv(np.linalg.cholesky(products))
+    return np.einsum("ij,jk->ik", lower, rows), np.asarray(lower, np.float64)
+
+
+class Mains:
+    """Follows the flicker's frequency and keeps the orthonormal basis for blocks of one size."""
+
+    def __init__(self, sample_rate: float, harmonics: int) -> None:
+        self._rate = sample_rate
+        self._harmonics = harmonics
+        self._frequency = 0.0
+        self._nominal = 0.0
+        self._built = (0, 0.0)
+        self._q: Array = np.empty((0, 0))
+        self._upper: Array = np.empty((0, 0))
+
+    @property
+    def hertz(self) -> float:
+        """Fundamental of the flicker by the nominal sample clock; 0 before the first block."""
+        return self._frequency * self._rate
+
+    def rows(self, y: Array) -> Array:
+        """Orthonormal rows (M, N) for a block; the first block decides between 50 and 60 Hz grids."""
+        if not self._frequency:
+            self._choose(y)
+        return self._fresh(len(y))
+
+    def learn(self, y: Array) -> None:
+        """Follow the flicker of an undisturbed block, for the next one."""
+        self._follow(inner(self.rows(y), y), GAIN, JUMP)
+
+    def masked(self, times: Array, mask: Array) -> Array:
+        """Orthonormal rows for a block with samples left out or a bent time base; ``times`` in samples."""
+        return orthonormal(basis(times, self._frequency, self._harmonics) * mask)[0]
+
+    def _fresh(self, size: int) -> Array:
+        moved = abs(self._frequency - self._built[1]) > REBUILD * self._frequency
+        if size != self._built[0] or moved:
+            rows = basis(np.arange(size, dtype=float), self._frequency, self._harmonics)
+            self._q, lower = orthonormal(rows)
+            self._upper = np.ascontiguousarray(lower.T)
+            self._built = (size, self._frequency)
+        return self._q
+
+    def _follow(self, coefficient: Array, gain: float, jump: float) -> None:
+        """First-order frequency correction: a sinusoid that is off by d looks like t times its quadrature."""
+        c = inner(self._upper, coefficient).tolist()
+        size, built = self._built
+        power = c[_COS] ** 2 + c[_SIN] ** 2 + c[_T_COS] ** 2 + c[_T_SIN] ** 2
+        if power > 0.0:
+            found = built + (c[_T_COS] * c[_SIN] - c[_T_SIN] * c[_COS]) / (np.pi * (size - 1) * power)
+            step = min(max(found - self._frequency, -jump * self._nominal), jump * self._nominal)
+            followed = self._frequency + gain * step
+            self._frequency = min(max(followed, (1 - PULL) * self._nominal), (1 + PULL) * self._nominal)
+
+    def _choose(self, y: Array) -> None:
+        """50 or 60 Hz grid, and its frequency to first order, from the first block."""
+        tried = []
+        for hertz in FUNDAMENTALS_HZ:
+            self._frequency = self._nominal = hertz / self._rate
+            for _ in range(3):
+                self._follow(inner(self._fresh(len(y)), y), 1.0, PULL)
+            left = inner(self._fresh(len(y)), y)
+            tried.append((float(y @ y - left @ left), self._frequency, self._nominal))
+        _, self._frequency, self._nominal = min(tried)

@@ -1,0 +1,114 @@
+"""A block of samples as the solvers see it, what is expected of it, and what came out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma.correlation_kernels import inner, mixed
+
+Array = npt.NDArray[np.float64]
+
+
+def rows_of(*rows: Array) -> Array:
+    """Rows of one length as an array; `np.stack` takes four times as long."""
+    out = np.empty((len(rows), len(rows[0])))
+    for k, row in enumerate(rows):
+        out[k] = row
+    return out
+
+
+@dataclass(eq=False)
+class Sampled:
+    """One block, ready to be solved.
+
+    Attributes:
+        y: (N,) photocurrent in ADC steps, 0 where masked. x: (N,) chips from the middle, by the clock's best estimate.
+        mask: (N,) 1, or 0 for samples left out. q: (M, N) orthonormal rows of the mains subspace.
+        steps: sample indices before which the bus stood still; ``x`` already contains the first guess of each pause.
+    """
+
+    y: Array
+    x: Array
+    mask: Array
+    q: Array
+    steps: tuple[int, ...] = ()
+
+    @cached_property
+    def samples(self) -> Array:
+        """(2, N) times and weights, as the kernels want them."""
+        return rows_of(self.x, self.mask)
+
+    @cached_property
+    def clean(self) -> Array:
+        """(N,) photocurrent without the mains subspace."""
+        return self.project(self.y)
+
+    def project(self, row: Array) -> Array:
+        """Take the mains subspace out of a row (not by a matrix product, which would wake BLAS threads)."""
+        return row - mixed(inner(self.q, row), self.q)
+
+
+@dataclass(eq=False)
+class Prior:
+    """What the tracks predict for the middle of the block; arrays (L,) except chips (L, C).
+
+    Attributes:
+        phase, rate: chips, and chips per nominal chip. phase_var: chips^2.
+        lag_var, clock_var: of the common lag (chips^2) and of the relative sample clock.
+        amplitude: ADC steps, as last seen; only says which lamps are strong.
+        bit_sum, bit_weight: what the last block already said about the first code period touched.
+    """
+
+    chips: Array
+    phase: Array
+    rate: Array
+    phase_var: Array
+    lag_var: float
+    clock_var: float
+    amplitude: Array
+    bit_sum: Array
+    bit_weight: Array
+
+    def lamps(self, more: Array | float = 0.0) -> Array:
+        """(2, L) phases, with a correction, and rates, as the kernels want them."""
+        return rows_of(self.phase + more, self.rate)
+
+
+@dataclass(eq=False)
+class Fit:
+    """Outcome; arrays (L,) unless said otherwise. Phases are corrections to the prior's, in chips.
+
+    Attributes:
+        amplitude, amplitude_var: ADC steps. phase, phase_var: of each lamp beyond the common lag.
+        lag, lag_var, clock, clock_var: common lag and relative clock, corrections to the prior's.
+        steps: size of each stall beyond what ``x`` held, chips.
+        residual: (N,) what is left. noise_var: per sample.
+        soft, soft_var: (L, P) amplitude times data sign of each code period touched; variance inf where not touched.
+        signs: (L, P) data signs used, 0 where left out.
+        mixed_slope: (N,) derivative of the whole signal by a common phase.
+    """
+
+    amplitude: Array
+    amplitude_var: Array
+    phase: Array
+    phase_var: Array
+    lag: float
+    lag_var: float
+    clock: float
+    clock_var: float
+    steps: Array
+    residual: Array
+    noise_var: float
+    soft: Array
+    soft_var: Array
+    signs: Array
+    mixed_slope: Array
+
+    @property
+    def clearest(self) -> float:
+        """Most significant amplitude, in standard deviations."""
+        return float(np.max(self.amplitude / np.sqrt(self.amplitude_var)))

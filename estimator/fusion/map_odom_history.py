@@ -1,0 +1,32 @@
+"""The tie of the odom frame to the map as it was a while ago: what light, under test since, is held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from estimator.measurements import Array
+
+FROZEN_M: Final = 10.0
+"""Way between two ties that are kept: the older one in use is between one and two times as old."""
+
+
+@dataclass(slots=True)
+class Frozen:
+    """At most two ties, the older first.
+
+    Attributes:
+        kept: T_map_odom, covariance of the pose (3, 3; map axes) and metres driven, of then.
+    """
+
+    kept: list[tuple[Array, Array, float]] = field(default_factory=list)
+
+    def take(self, T_map_odom: Array, P: Array, way: float) -> None:
+        """Keep a tie, if the newest is old enough."""
+        if not self.kept or way - self.kept[-1][2] >= FROZEN_M:
+            self.kept.append((T_map_odom, P, way))
+            del self.kept[:-2]
+
+    def forget(self) -> None:
+        """The place was found anew: what was before says nothing."""
+        self.kept.clear()

@@ -1,0 +1,243 @@
+"""What the `lights` filter knows, and its settings; the equations are in state_vector.py and measurement_update.py."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from estimator.light_filter.collinear_lamps import Under
+from estimator.light_filter.lambertian import LAMP_COLUMNS
+from estimator.light_filter.lamp_catalogue import Catalogue
+from estimator.light_filter.model_consistency import Bent
+from estimator.light_filter.state_vector import FIRST, OWN, SIZE, SLOTS
+from estimator.light_filter.survey import Survey
+from estimator.measurements import Array
+from estimator.numerics import se2
+from estimator.result import LightsResult
+
+
+class Pause(Enum):
+    """When light is not used at all."""
+
+    LINK = "each link for itself; as a whole only when none is left"
+    PAPER = "as a whole as soon as fewer than Link_n links are clear, the Link_n strongest being used"
+
+
+class Corrections(Protocol):
+    """A residual map: how the model errs for a lamp at a place (walls, shape of the luminaire)."""
+
+    def at(self, lamp_ids: Sequence[int], T_map_base: Array) -> Array:
+        """What to add to ln of the expected strengths.
+
+        Returns:
+            One row per lamp: mean and sigma of ln, the mean's gradient along x and y (1/m). A negative sigma: the map
+            does not know this lamp.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class MotionErrors:
+    """One-sigma errors of odometry, gyro and of constant velocity; random parts by the root of way, turn or time.
+
+    Attributes:
+        slip, side: m per root metre, along and across. turn: rad per root radian. wander: rad per root metre.
+        skid: m per root radian turned: what a robot turns about is known to centimetres only.
+        idle_m, idle_rad: per root second.
+        scale, turn_scale: share of the way and of the turn that wheels may be off for good. curve: rad per metre.
+        gyro: rad per root second. gyro_bias: rad/s.
+        acceleration, angular: m/s and rad/s per root second, without odometry. sideways: speed across, m/s.
+        speed: what a robot without odometry may go at, m/s.
+    """
+
+    slip: float = 0.009
+    side: float = 0.004
+    turn: float = 0.02
+    wander: float = 0.015
+    skid: float = 0.02
+    idle_m: float = 0.0005
+    idle_rad: float = 0.0005
+    scale: float = 0.04
+    turn_scale: float = 0.03
+    curve: float = 0.05
+    gyro: float = 0.001
+    gyro_bias: float = 0.02
+    acceleration: float = 0.4
+    angular: float = 0.3
+    sideways: float = 0.03
+    speed: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class ModelErrors:
+    """One-sigma errors of the optical model.
+
+    Attributes:
+        ln: of any link (walls, shape of the luminaire). floor: share of the diffuse part that differs from place to
+            place. lean: of a lamp beyond the survey, slope. white: ln, anew at every epoch (stamps, decoder).
+        edge: ln at the edge of view, falling off inward with the fourth power. order: of the receiver's Lambert order.
+        fade_m, fade_s: way and time after which they are others.
+        common: ln gain common to all lamps, at the start. floor_ln: ln of the diffuse share. tilt: receiver, slope.
+        gain_m, common_m, floor_m: how the lamps' gains, the common one and the floor wander, ln per root metre.
+    """
+
+    ln: float = 0.02
+    floor: float = 0.5
+    lean: float = 0.05
+    white: float = 0.005
+    edge: float = 0.06
+    order: float = 0.1
+    fade_m: float = 2.0
+    fade_s: float = 600.0
+    common: float = 0.25
+    floor_ln: float = 0.5
+    tilt: float = 0.005
+    gain_m: float = 0.003
+    common_m: float = 0.003
+    floor_m: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class LightsSettings:
+    """One set for every building and robot; what differs stands in the survey.
+
+    Attributes:
+        link_n: how many of the strongest links are used, 0 for all. pause: see :class:`Pause`.
+        wait_s, wait_m: how long and how far a link stays paused after it fits again.
+        rim_rad: links nearer to the edge of view are not used. faint: least amplitude in sigmas.
+        headings: hypotheses of a start. decided: share of the probability that ends one.
+    """
+
+    motion: MotionErrors = field(default_factory=MotionErrors)
+    model: ModelErrors = field(default_factory=ModelErrors)
+    link_n: int = 0
+    pause: Pause = Pause.LINK
+    wait_s: float = 0.5
+    wait_m: float = 0.15
+    rim_rad: float = 0.14
+    faint: float = 5.0
+    headings: int = 8
+    decided: float = 0.99
+
+
+@dataclass(slots=True)
+class Watch:
+    """The record of one lamp's links: since when it has been contradicting, and how steadily.
+
+    Attributes:
+        t_bad, way_bad: when it last did. t_run, way_run: when this run of contradictions began, inf if there is none.
+        count, total, square: of the residuals in the run. strikes: how often its gain was learned anew for that.
+        moved: it hangs elsewhere than the survey says, and is not used. paroles: how often that was taken back.
+        fitted: way on which it fitted, m, as far as it still counts. way_seen: when it was last compared.
+    """
+
+    t_bad: float = -math.inf
+    way_bad: float = -math.inf
+    t_run: float = math.inf
+    way_run: float = math.inf
+    count: int = 0
+    total: float = 0.0
+    square: float = 0.0
+    strikes: int = 0
+    moved: bool = False
+    paroles: int = 0
+    fitted: float = 0.0
+    way_seen: float = -math.inf
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """One hypothesis: a state with its covariance, and which lamps stand in its slots.
+
+    Attributes:
+        x, P: (SIZE,) and (SIZE, SIZE). used: slots in use. lamps: (SLOTS, 7) for the kernels. slots: by lamp ID.
+        seen: (SLOTS,) instant at which each was last received. weight: ln of its likelihood so far.
+        watches: by lamp ID.
+    """
+
+    x: Array = field(default_factory=lambda: np.zeros(SIZE))
+    P: Array = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
+    used: int = 0
+    lamps: Array = field(default_factory=lambda: np.zeros((SLOTS, LAMP_COLUMNS)))
+    slots: dict[int, int] = field(default_factory=dict)
+    seen: Array = field(default_factory=lambda: np.full(SLOTS, -math.inf))
+    weight: float = 0.0
+    watches: dict[int, Watch] = field(default_factory=dict)
+
+    @property
+    def n(self) -> int:
+        """Elements of the state in use."""
+        return FIRST + OWN * self.used
+
+
+@dataclass(slots=True, eq=False)
+class Course:
+    """How the robot has moved, whatever place it is in.
+
+    Attributes:
+        t_mono: instant of the tracks' poses. t_odometry: end of the latest odometry. t_gyro: of the latest gyro.
+        wheels: whether odometry is alive. matched: it was matches that told it last, not wheels. velocity: (v_x, v_y,
+            yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
+        gyro_turned, gyro_span: added up since the last odometry.
+        T, trail: dead-reckoned pose since the start, and its last second as (instant, pose).
+        way: metres driven.
+    """
+
+    t_mono: float = -math.inf
+    t_odometry: float = -math.inf
+    t_gyro: float = -math.inf
+    wheels: bool = False
+    matched: bool = False
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    ahead: Array = field(default_factory=se2.identity)
+    gyro_turned: float = 0.0
+    gyro_span: float = 0.0
+    T: Array = field(default_factory=se2.identity)
+    trail: list[tuple[float, Array]] = field(default_factory=list)
+    way: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Lights:
+    """All of the filter; made by `lights.new_lights`, changed only by the functions of that module.
+
+    Attributes:
+        tracks: hypotheses, likeliest first; one when the place is known, none before a start.
+        gains: by lamp ID, means and variances of (ln gain, lean x, lean y) of lamps that have left the slots.
+        t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: where the start began.
+        t_lost: since when most links contradict, inf if they do not. t_odd: since when several links are stronger than
+            they can be, which nothing in the way explains; way_odd: when it last was so.
+        under: the row that the lamps in use have become.
+        absent: by lamp ID, (instant, way) since which it should be received but is not.
+        corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
+        lost: the last start was made necessary by a contradiction.
+        before: what an earlier run knew of the sensors, for the first hypothesis. recalled: and of lamps, as ``gains``.
+        bent: how far lamps are taken for others than was expected (`lights_memory.bend`).
+    """
+
+    survey: Survey
+    settings: LightsSettings
+    catalogue: Catalogue
+    course: Course = field(default_factory=Course)
+    tracks: list[Track] = field(default_factory=list)
+    gains: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    t_epoch: float = -math.inf
+    way_epoch: float = 0.0
+    t_used: float = -math.inf
+    way_start: float = 0.0
+    t_lost: float = math.inf
+    t_odd: float = math.inf
+    way_odd: float = -math.inf
+    under: Under = field(default_factory=Under)
+    absent: dict[int, tuple[float, float]] = field(default_factory=dict)
+    corrections: Corrections | None = None
+    lean: tuple[float, float] = (0.0, 0.0)
+    lost: bool = False
+    before: Track | None = None
+    recalled: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    bent: Bent = field(default_factory=Bent)
+    result: LightsResult | None = None

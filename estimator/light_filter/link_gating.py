@@ -1,0 +1,404 @@
+"""From an epoch to links: which lamp each one is, what it differs by, and whether it is used or paused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.cdma.epoch import LightEpoch, LinkFlag
+from estimator.light_filter import measurement_update, state_vector
+from estimator.light_filter.filter_state import Lights, Pause, Track, Watch
+from estimator.light_filter.lambertian import pack_receiver
+from estimator.light_filter.survey import Lamp
+from estimator.measurements import Array
+from estimator.result import STRONG, WEAK, Link, LinkState
+
+ACCEPTED, OCCLUDED, REJECTED, RIM, FAINT, TWIN, UNSURVEYED = (
+    LinkState.ACCEPTED,
+    LinkState.OCCLUDED,
+    LinkState.REJECTED,
+    LinkState.RIM,
+    LinkState.FAINT,
+    LinkState.TWIN,
+    LinkState.UNSURVEYED,
+)
+FAINT_FLAG, TWIN_FLAG = int(LinkFlag.FAINT), int(LinkFlag.TWIN)  # an enum's lookups would be half of an update
+
+TWIN_SHARE = 0.1
+"""A second lamp of the same code adds to a link when it would be received at this share of the first or more."""
+NO_LIGHT_A = 1e-15
+"""A strength below that is rounding: one electron in a block is more."""
+DIFFUSE = 0.6
+"""A strength below this share of what the lamp gives at the edge of view has not come straight."""
+RELEARN_S, RELEARN_M = 15.0, 3.0
+"""A link that contradicts so long and far, and always by the same factor, is a lamp of another power: learn it anew."""
+HIDDEN = 1.4
+"""A lamp that has lost three quarters (ln) is hidden, not old: it is not learned as one of another power."""
+STEADY = 0.12
+"""Spread of its ln residual up to which a contradiction is called steady."""
+TOO_STRONG = 3.0
+"""Times what a lamp gives at the edge of view, which none near that edge can give."""
+MOVED_LEANS = 3.0
+"""So many sigmas of lean are what a lamp may have; more is a lamp in another place."""
+FIRST_ERROR = 5.0
+"""Variance of a model error at first sight: later, gain and lean have taken up what always is the same in it."""
+STRIKES = 2
+"""So often a lamp is learned anew; one that contradicts again stands somewhere else."""
+FADE_M = 100.0
+"""Way with a lamp that fits after which one time that it was learned anew is forgotten: lamps do age."""
+PAROLE_M, PAROLE = 5.0, 2.0
+"""A lamp called moved is used again when it has fitted so far, always within so many sigmas; every time that this is
+done, the next takes twice the way."""
+STRIDE_M = 0.2
+"""Way between two epochs that counts at most: what was driven out of a lamp's sight says nothing of it."""
+FORGET_S, DESCRIBED = 3600.0, 1024
+"""A lamp known by its own word only is forgotten when unheard for so long, or as the longest unheard of so many."""
+
+
+@dataclass(slots=True, eq=False)
+class Sight:
+    """One link of an epoch as a hypothesis sees it; the fields are those of `result.Link`."""
+
+    code: int
+    amplitude: float
+    variance: float
+    state: LinkState = UNSURVEYED
+    lamp: Lamp | None = None
+    contradicted: bool = False
+    slot: int = -1
+    residual: float | None = None
+    sigma: float | None = None
+
+    def link(self, learned: Learned) -> Link:
+        """As others are told."""
+        known = self.lamp is not None and self.state is not TWIN
+        link_id = self.lamp.lamp_id if self.lamp is not None and known else None
+        gain, spread = learned.gain(self.slot)
+        sigma = math.sqrt(max(spread, 0.0))
+        residual, of_it = self.residual, self.sigma
+        return Link(self.code, link_id, self.state, self.amplitude, residual, of_it, gain, sigma, self.contradicted)
+
+
+class Learned:
+    """What a hypothesis has learned of the lamps in its slots; None: there is no hypothesis."""
+
+    def __init__(self, track: Track | None) -> None:
+        """Take it out of the arrays at once: one number at a time costs as much as all of them."""
+        self._x: list[float] = []
+        if track is not None:  # with slots that are not in use: it may be younger than the sights
+            self._x = track.x.tolist()
+            self._variance, self._common = track.P.diagonal().tolist(), track.P[state_vector.COMMON].tolist()
+
+    def gain(self, slot: int) -> tuple[float, float]:
+        """Of the lamp in a slot (-1: none), common part included: ln gain and its variance."""
+        if slot < 0 or not self._x:
+            return 0.0, 0.0
+        at = state_vector.FIRST + state_vector.OWN * slot
+        spread = self._variance[at] + self._variance[state_vector.COMMON] + 2.0 * self._common[at]
+        return self._x[at] + self._x[state_vector.COMMON], spread
+
+
+def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
+    """The links of an epoch with the lamps they come from if the receiver is near a place, strongest first."""
+    rows = zip(
+        epoch.ids.tolist(),
+        epoch.amplitude.tolist(),
+        epoch.variance.tolist(),
+        epoch.flags.tolist(),
+        epoch.lamps,
+        strict=True,
+    )
+    found = []
+    for code, amplitude, variance, flags, frame in rows:
+        if not (NO_LIGHT_A < amplitude < math.inf and variance >= 0.0):
+            found.append(Sight(code, 0.0, math.inf, FAINT))
+            continue
+        sight = Sight(code, amplitude, variance)
+        found.append(sight)
+        if frame is not None:
+            sight.lamp, sight.contradicted = lights.catalogue.learn(frame, code, lights.course.t_mono)
+            alone = True
+        else:
+            sight.lamp, alone = nearest(lights, code, x, y)
+            alone = alone and not flags & TWIN_FLAG
+            if sight.lamp is not None:
+                lights.catalogue.touch(sight.lamp.lamp_id, lights.course.t_mono)
+        if sight.lamp is None:
+            continue
+        if flags & FAINT_FLAG or amplitude <= lights.settings.faint * math.sqrt(variance):
+            sight.state = FAINT
+        else:
+            sight.state = ACCEPTED if alone else TWIN
+    found.sort(key=lambda sight: -sight.amplitude)
+    return found
+
+
+def nearest(lights: Lights, code: int, x: float, y: float) -> tuple[Lamp | None, bool]:
+    """The lamp of a code nearest to a place, and whether it alone can be what is received there."""
+    lamps = lights.catalogue.candidates(code)
+    if len(lamps) < 2:
+        return (lamps[0], True) if lamps else (None, True)
+    ranked = sorted(lamps, key=lambda lamp: -below(lights, lamp, x, y))
+    first, second = (below(lights, lamp, x, y) for lamp in ranked[:2])
+    return ranked[0], second < TWIN_SHARE * first
+
+
+def below(lights: Lights, lamp: Lamp, x: float, y: float) -> float:
+    """Roughly how strong a lamp is at a place, level and without field of view: enough to rank lamps by."""
+    receiver = lights.survey.receiver
+    h2 = max(lamp.z - receiver.z, 0.1) ** 2
+    d2 = h2 + (lamp.x - x) ** 2 + (lamp.y - y) ** 2
+    fall = math.pow(h2 / d2, 0.5 * (lamp.order + receiver.order))
+    return lamp.power_w * fall / d2
+
+
+def slot_of(lights: Lights, track: Track, lamp: Lamp, busy: set[int]) -> int | None:
+    """The slot of a lamp in a hypothesis; the longest unseen lamp makes room for a new one; None if none can."""
+    slot = track.slots.get(lamp.lamp_id)
+    if slot is None:
+        if track.used < state_vector.SLOTS:
+            slot = track.used
+            track.used += 1
+        else:
+            free = [k for k in range(state_vector.SLOTS) if k not in busy]
+            if not free:
+                return None
+            slot = min(free, key=lambda k: float(track.seen[k]))
+            vacate(lights, track, slot)
+        occupy(lights, track, lamp, slot)
+    track.lamps[slot] = lights.catalogue.rows[lamp.lamp_id]
+    track.seen[slot] = lights.course.t_mono
+    return slot
+
+
+def vacate(lights: Lights, track: Track, slot: int) -> None:
+    """Remember what is known of the lamp in a slot and take it out."""
+    lamp_id = next(key for key, value in track.slots.items() if value == slot)
+    at = state_vector.FIRST + state_vector.OWN * slot
+    lights.gains[lamp_id] = track.x[at : at + 3].copy(), np.diag(track.P)[at : at + 3].copy()
+    del track.slots[lamp_id]
+
+
+def remembered(lights: Lights, lamp: Lamp) -> tuple[Array, Array]:
+    """Means and variances of a lamp's (ln gain, lean x, lean y) as known from before, else as surveyed."""
+    lean = lights.settings.model.lean
+    new = np.zeros(3), np.array((lamp.sigma_ln**2, lean**2, lean**2))
+    return lights.gains.get(lamp.lamp_id, new)
+
+
+def occupy(lights: Lights, track: Track, lamp: Lamp, slot: int) -> None:
+    """Give a lamp a slot, with what is known of its gain from before."""
+    at = state_vector.FIRST + state_vector.OWN * slot
+    mean, variance = remembered(lights, lamp)
+    for j in range(state_vector.OWN):
+        state_vector.cut(track.P, track.n, at + j)
+        track.x[at + j] = 0.0 if j == state_vector.ERROR else mean[j]
+        track.P[at + j, at + j] = FIRST_ERROR if j == state_vector.ERROR else variance[j]
+    track.slots[lamp.lamp_id] = slot
+
+
+def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight], Array]:
+    """The sights that can be compared with a hypothesis, and their rows for the kernels."""
+    kept, busy = list[Sight](), set[int]()
+    for sight in seen:
+        if sight.lamp is None or sight.state is not ACCEPTED:
+            continue
+        slot = slot_of(lights, track, sight.lamp, busy)
+        if slot is None or slot in busy:
+            continue
+        busy.add(slot)
+        sight.slot = slot
+        kept.append(sight)
+    links = np.zeros((len(kept), measurement_update.LINK_COLUMNS))
+    links[:, measurement_update.SLOT] = [sight.slot for sight in kept]
+    links[:, measurement_update.LN] = [math.log(sight.amplitude) for sight in kept]
+    links[:, measurement_update.NOISE] = [sight.variance / sight.amplitude**2 for sight in kept]
+    links[:, measurement_update.SIGMA] = -1.0
+    if lights.corrections is not None and kept:
+        ids = [sight.lamp.lamp_id for sight in kept if sight.lamp is not None]
+        links[:, measurement_update.SHIFT :] = lights.corrections.at(ids, track.x[:3])
+    return kept, links
+
+
+def view_of(lights: Lights, back: Array) -> Array:
+    """What the kernels need besides state and links."""
+    model, rx = lights.settings.model, pack_receiver(lights.survey.receiver)
+    rx[7:9] += lights.lean
+    return np.concatenate([rx, back, (model.ln, model.floor, model.white, model.edge)])
+
+
+def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, news: float) -> float:
+    """Decide on every link; what is not to be used gets an infinite noise, what may be an outlier a larger one.
+
+    Gating waits until the place is known well; before, a deviation is held against the link only softly, because it
+    may as well be the place or a gain that is wrong. A lamp that something hides would pull at the place twenty times a
+    second, though, and a robot that stands would be led to where it fits: it only counts against the hypothesis. Nor
+    does any other deviation say something new while wheels say that it stands: exchanged lamps would lead it away.
+
+    Args:
+        lights: all of the filter.
+        track: the hypothesis.
+        kept: its links.
+        out: what `ekf_links.linearise` says of them, changed.
+        news: how much of an epoch is news by the way driven since the one before, 0 to 1.
+
+    Returns:
+        ln of the likelihood of the links that are left out.
+    """
+    likelihood = 0.0
+    half, rim = lights.survey.receiver.half_fov_rad, lights.settings.rim_rad
+    cos_rim, cos_out = math.cos(max(half - rim, 0.1)), math.cos(half + rim)
+    news = news if lights.course.wheels else 1.0  # see `weak`
+    gating = settled(track) and len(lights.tracks) == 1  # hypotheses are compared by the same links
+    for i, (sight, row) in enumerate(zip(kept, out[:, : measurement_update.SLOPES].tolist(), strict=True)):
+        r, S = row[measurement_update.RESIDUAL], row[measurement_update.SPREAD] + row[measurement_update.WHITE]
+        sight.residual, sight.sigma = r, math.sqrt(max(S, 0.0))
+        if row[measurement_update.COS_BETA] < cos_rim or row[measurement_update.DIRECT] < 0.5:
+            most = (1.0 if row[measurement_update.COS_BETA] < cos_out else TOO_STRONG) * rim_of(lights, track, sight)
+            sight.state = REJECTED if gating and sight.amplitude > most else RIM
+        elif gating:
+            sight.state = gate(lights, track, sight)
+        elif r * r > 4.0 * S:
+            soft = 0.25 * r * r
+            out[i, measurement_update.WHITE] += soft / news - S if news > 0.0 else math.inf
+            if weak(lights, sight):
+                likelihood -= 0.5 * (4.0 + math.log(soft) + measurement_update.LOG_2PI)
+                sight.state = OCCLUDED
+        if sight.state is not ACCEPTED:
+            out[i, measurement_update.WHITE] = math.inf
+    shorten(lights, kept, out)
+    return likelihood
+
+
+def weak(lights: Lights, sight: Sight) -> bool:
+    """Whether a link is weaker than its lamp is anywhere in view, so that something hides it, wherever the receiver is.
+
+    Without wheels nothing holds a wrong hypothesis but such links: there they go on pulling.
+    """
+    if sight.lamp is None or not lights.course.wheels:
+        return False
+    gain = math.exp(float(remembered(lights, sight.lamp)[0][0]))
+    return sight.amplitude < DIFFUSE * gain * lights.catalogue.rims[sight.lamp.lamp_id]
+
+
+def rim_of(lights: Lights, track: Track, sight: Sight) -> float:
+    """What this link's lamp would give at the edge of view, with its gain as learned, A."""
+    if sight.lamp is None:
+        return math.inf
+    gain = float(track.x[state_vector.COMMON] + track.x[state_vector.FIRST + state_vector.OWN * sight.slot])
+    return lights.catalogue.rims[sight.lamp.lamp_id] * math.exp(gain)
+
+
+def settled(track: Track) -> bool:
+    """Whether the place is known well enough for a link that does not fit to be called wrong.
+
+    What a lamp is received as depends on the place and hardly on the heading, which without wheels is never known well.
+    """
+    return bool(track.P[0, 0] + track.P[1, 1] < 0.2**2)
+
+
+def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:
+    """One link's NIS gate, narrower downwards: things in the way only ever take light away."""
+    settings, t, way = lights.settings, lights.course.t_mono, lights.course.way
+    if sight.lamp is None or sight.residual is None or sight.sigma is None:
+        return RIM
+    r, sigma = sight.residual, sight.sigma
+    watch = track.watches.get(sight.lamp.lamp_id)
+    if watch is None:
+        watch = track.watches[sight.lamp.lamp_id] = Watch()
+    step, watch.way_seen = min(way - watch.way_seen, STRIDE_M), way
+    if watch.moved:
+        parole(watch, abs(r) < PAROLE * sigma, step)
+        return REJECTED
+    low, high = r < -WEAK * sigma, r > STRONG * sigma
+    if low or high:
+        watch.t_bad, watch.way_bad = t, way
+        if math.isinf(watch.t_run):
+            watch.t_run, watch.way_run, watch.count, watch.total, watch.square = t, way, 0, 0.0, 0.0
+        watch.count += 1
+        watch.total += r
+        watch.square += r * r
+        return REJECTED if high else OCCLUDED
+    if t - watch.t_bad < settings.wait_s or way - watch.way_bad < settings.wait_m:
+        return OCCLUDED
+    watch.t_run = math.inf
+    watch.fitted += step
+    if watch.fitted > FADE_M:
+        watch.fitted, watch.strikes = 0.0, max(watch.strikes - 1, 0)
+    return ACCEPTED
+
+
+def parole(watch: Watch, fits: bool, step: float) -> None:
+    """Take back that a lamp was moved when it has fitted for long: nothing else would ever say so."""
+    watch.fitted = watch.fitted + step if fits else 0.0
+    if watch.fitted > PAROLE_M * 2.0 ** min(watch.paroles, 10):
+        watch.moved, watch.fitted, watch.t_run = False, 0.0, math.inf
+        watch.paroles += 1
+
+
+def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
+    """The paper's selection: only the Link_n strongest clear links are used; with its pause rule, those or none."""
+    n = lights.settings.link_n
+    if n <= 0:
+        return
+    clear = [i for i, sight in enumerate(kept) if sight.state is ACCEPTED]
+    drop = clear if lights.settings.pause is Pause.PAPER and len(clear) < n else clear[n:]
+    for i in drop:
+        kept[i].state = LinkState.PAUSED
+        out[i, measurement_update.WHITE] = math.inf
+
+
+def distrust(lights: Lights, track: Track) -> None:
+    """A lamp whose strengths can only be explained by a lean that no lamp has hangs elsewhere: it is not used again."""
+    limit, n = MOVED_LEANS * lights.settings.model.lean, track.n
+    x, variance = track.x[:n].tolist(), track.P.diagonal()[:n].tolist()
+    for lamp_id, slot in track.slots.items():
+        at = state_vector.FIRST + state_vector.OWN * slot + state_vector.TILT_X
+        if math.hypot(x[at], x[at + 1]) < limit + 2.0 * math.sqrt(max(variance[at] + variance[at + 1], 0.0)):
+            continue
+        watch = track.watches.setdefault(lamp_id, Watch())
+        watch.moved, watch.fitted = True, 0.0
+        for j in (at, at + 1):
+            state_vector.cut(track.P, track.n, j)
+            track.x[j], track.P[j, j] = 0.0, lights.settings.model.lean**2
+
+
+def relearn(lights: Lights, track: Track) -> None:
+    """A lamp whose light has long been off by a constant factor is learned anew, unless that was tried before."""
+    for lamp_id, watch in track.watches.items():
+        long = lights.course.t_mono - watch.t_run > RELEARN_S and lights.course.way - watch.way_run > RELEARN_M
+        if not long or watch.strikes >= STRIKES or lamp_id not in track.slots:
+            continue
+        mean = watch.total / watch.count
+        if mean < -HIDDEN:
+            continue
+        if watch.square / watch.count - mean * mean < STEADY**2:
+            at = state_vector.FIRST + state_vector.OWN * track.slots[lamp_id]
+            state_vector.cut(track.P, track.n, at)
+            track.x[at] += mean
+            track.P[at, at] = 0.3**2
+            watch.t_bad = watch.way_bad = -math.inf
+        watch.strikes += 1
+        watch.t_run, watch.fitted = math.inf, 0.0
+
+
+def forget(lights: Lights) -> None:
+    """Let go of lamps known by their own word only and long unheard; those in a slot stay."""
+    heard, now = lights.catalogue.heard, lights.course.t_mono
+    oldest = next(iter(heard.values()), now)
+    if now - oldest <= FORGET_S and len(heard) <= DESCRIBED:
+        return
+    slotted = set[int]().union(*(track.slots for track in lights.tracks))
+    free = [lamp_id for lamp_id in heard if lamp_id not in slotted]
+    beyond = len(heard) - DESCRIBED
+    for k, lamp_id in enumerate(free):
+        if k >= beyond and now - heard[lamp_id] <= FORGET_S:
+            break
+        lights.catalogue.drop(lamp_id)
+        lights.gains.pop(lamp_id, None)
+        lights.recalled.pop(lamp_id, None)
+        lights.bent.lamps.pop(lamp_id, None)
+        for track in lights.tracks:
+            track.watches.pop(lamp_id, None)

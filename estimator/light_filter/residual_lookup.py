@@ -1,0 +1,49 @@
+"""Looks up what a residual map says of a place."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.light_filter.residual_map import ResidualMap
+from estimator.measurements import Array
+from estimator.numerics.jit import kernel
+
+
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1])")
+def look_up(mean: Array, sigma: Array, grid: Array, x: float, y: float, out: Array) -> None:
+    """Residual of one lamp with the photodiode at (x, y).
+
+    Args:
+        mean: (ny, nx) of the lamp.
+        sigma: (ny, nx) of the lamp.
+        grid: (4,) of the lamp.
+        x: m.
+        y: m.
+        out: (4,) is filled with mean and sigma (ln) and the mean's gradient (1/m); off the grid 0 and what the grid
+            says of places where nothing was learned.
+    """
+    u, v = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2]
+    ny, nx = mean.shape
+    if not (0.0 <= u < nx - 1 and 0.0 <= v < ny - 1):
+        out[0], out[1], out[2], out[3] = 0.0, grid[3], 0.0, 0.0
+        return
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    m00, m01, m10, m11 = mean[j, i], mean[j, i + 1], mean[j + 1, i], mean[j + 1, i + 1]
+    low, high = (1.0 - a) * m00 + a * m01, (1.0 - a) * m10 + a * m11
+    s_low = (1.0 - a) * sigma[j, i] + a * sigma[j, i + 1]
+    s_high = (1.0 - a) * sigma[j + 1, i] + a * sigma[j + 1, i + 1]
+    out[0], out[1] = (1.0 - b) * low + b * high, (1.0 - b) * s_low + b * s_high
+    out[2], out[3] = ((1.0 - b) * (m01 - m00) + b * (m11 - m10)) / grid[2], (high - low) / grid[2]
+
+
+def expected_ln(residuals: ResidualMap, lamp_index: int, x: float, y: float) -> tuple[float, float, Array]:
+    """What to add to ln of a lamp's expected strength with the photodiode at (x, y) in the survey's frame.
+
+    Returns:
+        Mean and one sigma of ln, and the mean's gradient (2,) in 1/m; off the map as :func:`look_up` says.
+    """
+    out = np.zeros(4)
+    k = lamp_index
+    look_up(residuals.mean[k], residuals.sigma[k], residuals.grid[k], x, y, out)
+    return float(out[0]), float(out[1]), out[2:].copy()

@@ -1,0 +1,1 @@
+"""Keyframes, submaps, loop closure and pose graph (Sect. 4.3)."""

@@ -1,0 +1,181 @@
+"""A scan that is kept: compact beams and the place they were seen from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING
+from weakref import WeakSet
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.measurements import Array, Scan
+from estimator.numerics import se2
+
+if TYPE_CHECKING:
+    from estimator.mapping.submap import Settled
+
+Square = tuple[int, int, int]
+Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
+"""Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
+
+ANYWHERE = np.diag((1e3, 1e3, 10.0))
+"""Covariance (m, m, rad) of a place that no way joins with the others."""
+
+NEAR_M, NEAR_RAD = 0.4, 0.25 * math.pi
+"""What lies nearer together shows the same (see `estimator.mapping.keyframe_selection.retire`)."""
+
+LONGEST_M = 1e6
+"""Ranges beyond are kept as this: they say the same, and fit into single precision."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Virtual:
+    """The paper's virtual consistent state components: what light alone said of the place, free of laser and drift.
+
+    Attributes:
+        T_map_base, covariance: of the `lights` filter, for the keyframe's instant. accepted: IDs of the lamps used (S).
+    """
+
+    T_map_base: Array
+    covariance: Array
+    accepted: frozenset[int]
+
+
+@dataclass(slots=True, eq=False, weakref_slot=True)
+class Submap:
+    """A stretch of the way, which corrections of the map move as one piece.
+
+    Attributes:
+        key: number, counted from 1. first: ID of its first keyframe, whose place is its own.
+        T_map_submap: follows every correction of the map. T_odom_submap: where it was laid, never changes.
+        way_m: driven until there. settled: what it consists of, once it is finished.
+        light: its place by what light alone said at its surest keyframe, with the covariance; None without.
+        lamps: IDs of the lamps used at any of its keyframes (the paper's S_M, of this stretch).
+        into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
+        hung: those that lie in this one and that something still hangs on.
+        strayed: what the way until there may have strayed, see `Atlas.strayed_since`; as given: no way is known.
+    """
+
+    key: int
+    first: int
+    T_map_submap: Array
+    T_odom_submap: Array
+    way_m: float = 0.0
+    settled: Settled | None = None
+    light: tuple[Array, Array] | None = None
+    lamps: frozenset[int] = frozenset()
+    into: tuple[Submap, Array] | None = None
+    hung: WeakSet[Submap] = field(default_factory=WeakSet)
+    strayed: Array = field(default_factory=lambda: -ANYWHERE)
+
+    def hang_on(self, hub: Submap, T_hub_submap: Array) -> None:
+        """Give up its place in the graph, and let what lies in it lie in ``hub`` at once.
+
+        Through years of laps each has taken the place of one before; none may be a link of a chain that only grows.
+        """
+        for other in (self, *self.hung):
+            T = T_hub_submap if other.into is None else se2.compose(T_hub_submap, other.into[1])
+            other.into = hub, T
+            hub.hung.add(other)
+        self.hung.clear()
+
+    def place(self) -> Array:
+        """``T_map_submap`` as corrected so far."""
+        if self.into is None:
+            return self.T_map_submap
+        other, T_other_submap = self.into
+        return se2.compose(other.place(), T_other_submap)
+
+
+@dataclass(slots=True, eq=False)
+class Keyframe:
+    """A scan kept.
+
+    Attributes:
+        submap: what it hangs on. T_odom_keyframe: where it was laid, never changes.
+        T_base_lidar: mount. bearing_rad: shared with the other keyframes of the same lidar.
+        turned_rad: yaw turned from the first to the last beam. range_m: float32. beam: uint8 of `Beam`.
+        virtual: what light said, None where it said nothing good.
+    """
+
+    key: int
+    submap: Submap
+    T_odom_keyframe: Array
+    T_base_lidar: Array
+    bearing_rad: Array
+    turned_rad: float
+    range_m: npt.NDArray[np.float32]
+    beam: npt.NDArray[np.uint8]
+    virtual: Virtual | None = None
+
+    @property
+    def T_map_keyframe(self) -> Array:
+        """Its place in the map as corrected so far."""
+        return se2.compose(self.submap.place(), se2.between(self.submap.T_odom_submap, self.T_odom_keyframe))
+
+    @property
+    def T_odom_lidar(self) -> Array:
+        """The lidar when the keyframe was laid."""
+        return se2.compose(self.T_odom_keyframe, self.T_base_lidar)
+
+    def beams(self) -> Beams:
+        """Beams as seen from the scan's end."""
+        return unturned(self.bearing_rad, self.turned_rad), self.range_m.astype(np.float64), self.beam
+
+
+def near(one: Array, other: Array) -> bool:
+    """Whether two keyframes look at the same from the same place; who drives along an axis is well within an eighth."""
+    x, y, yaw = (one - other).tolist()
+    return math.hypot(x, y) < NEAR_M and abs(se2.wrap(yaw)) < NEAR_RAD
+
+
+def square_of(T_map_keyframe: Array) -> Square:
+    """Half metre square and eighth of a turn, by which keyframes are listed."""
+    x, y, yaw = T_map_keyframe.tolist()
+    return math.floor(2.0 * x), math.floor(2.0 * y), math.floor(yaw * 4.0 / math.pi + 0.5) % 8
+
+
+def squares_about(T_map_keyframe: Array) -> list[Square]:
+    """The squares in which all are listed that are `near`."""
+    i, j, k = square_of(T_map_keyframe)
+    return [(i + a, j + b, (k + c) % 8) for a in (0, -1, 1) for b in (0, -1, 1) for c in (0, -1, 1)]
+
+
+def unturned(bearing_rad: Array, turned_rad: float) -> Array:
+    """Bearings as they would be had the lidar not turned during the scan, seen from its end."""
+    n = len(bearing_rad)
+    if turned_rad == 0.0 or n < 2:
+        return bearing_rad
+    return np.asarray(bearing_rad - turned_rad * _to_come(n))
+
+
+@lru_cache(maxsize=4)
+def _to_come(n: int) -> Array:
+    """Share of a scan that is still to come at each of its ``n`` beams."""
+    return np.asarray(1.0 - np.arange(n) / (n - 1))
+
+
+def hanging(frames: Iterable[Keyframe]) -> list[tuple[Submap, list[Keyframe]]]:
+    """Keyframes by what they hang on, in the order in which that was laid."""
+    groups: dict[int, tuple[Submap, list[Keyframe]]] = {}
+    for frame in frames:
+        groups.setdefault(frame.submap.first, (frame.submap, []))[1].append(frame)
+    return [groups[first] for first in sorted(groups)]
+
+
+def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -> Keyframe:
+    """Make a keyframe of a scan matched at ``T_odom``; it hangs on a submap of its own."""
+    return Keyframe(
+        key=key,
+        submap=Submap(0, key, T_map, T_odom),
+        T_odom_keyframe=T_odom,
+        T_base_lidar=scan.T_base_lidar,
+        bearing_rad=scan.bearing_rad,
+        turned_rad=turned_rad,
+        range_m=np.clip(scan.range_m, -LONGEST_M, LONGEST_M).astype(np.float32),
+        beam=scan.beam,
+    )

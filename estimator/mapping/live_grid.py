@@ -1,0 +1,319 @@
+"""The map as tiles that follow the submaps: only those are composed again on which a submap is new, moved or gone.
+
+The work is done by the background worker, a few patches and tiles at a time (:func:`advance`), and taken in within a
+cycle (:meth:`LiveMap.take`). Whoever shows the map asks for the tiles that have changed since the version that he has.
+The final map of a replay and the picture of a map file are made by the same code, at once (:func:`at_once`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from estimator.mapping.grid_patches import SIDE, UNIT, Cells, Patch, Seen, Tile, compose, render
+from estimator.mapping.keyframe import Keyframe, Submap, hanging
+from estimator.mapping.occupancy_grid import Grid, blank
+from estimator.measurements import Array
+from estimator.numerics import se2
+
+if TYPE_CHECKING:
+    from estimator.state import State
+
+DRAW: Final = 9
+"""Priority of the jobs: after all that the pose waits for."""
+
+RENDERS, TILES = 2, 4
+"""Patches rendered, and tiles composed, in one job: some 20 ms."""
+
+MOVED: Final = 0.3
+"""Cells by which a patch must have moved, at its farthest corner, before its tiles are composed again."""
+
+EVERY: Final = 4
+"""The submap that is being driven through is shown anew after so many keyframes."""
+
+SPENT: Final = 0.05
+"""Of what a submap says that is out of the graph, so much must still count, or its patch is let go, too."""
+
+
+class Drawn(NamedTuple):
+    """A patch as it lies in the tiles: where, on which, and how much of it counts in each."""
+
+    patch: Patch
+    T_map_submap: Array
+    tiles: frozenset[Tile]
+    used: dict[Tile, int]
+
+
+class Place(NamedTuple):
+    """Where a submap lies: in the map, or in another one that has taken its place in the graph."""
+
+    T_map_hub: Array
+    T_hub_submap: Array | None
+
+    def now(self) -> Array:
+        """T_map_submap."""
+        return self.T_map_hub if self.T_hub_submap is None else se2.compose(self.T_map_hub, self.T_hub_submap)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What a job does: fixed when it is handed out.
+
+    Attributes:
+        resolution: m per cell. drawn: patches as they lie in the tiles. places: of all submaps that have a patch or get
+            one. fresh: keyframes of those to be rendered. more: others wait for that, too. spare: keys of
+            submaps that are out of the graph. stale: tiles waiting to be composed.
+    """
+
+    resolution: float
+    drawn: dict[int, Drawn]
+    places: dict[int, Place]
+    fresh: dict[int, tuple[Seen, ...]]
+    more: bool
+    spare: frozenset[int]
+    stale: frozenset[Tile]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Progress:
+    """What a job has done: its task, patches drawn anew, tiles composed, tiles that are still stale, keys let go."""
+
+    task: Task
+    drawn: dict[int, Drawn]
+    tiles: dict[Tile, Cells]
+    stale: frozenset[Tile]
+    gone: tuple[int, ...]
+
+
+@dataclass(slots=True, eq=False)
+class LiveMap:
+    """A map that is kept up to date.
+
+    Attributes:
+        resolution: m per cell. version: counts changes. tiles: cells, and the version they are of.
+        submaps, drawn: by key, those whose patch lies in the tiles. fresh: keyframes of those to be rendered.
+        stale: tiles to be composed again. due: submaps may have moved. job: the one under way, 0 before the first.
+        rendered, composed: patches and tiles, counted.
+    """
+
+    resolution: float
+    version: int = 0
+    tiles: dict[Tile, tuple[int, Cells]] = field(default_factory=dict)
+    submaps: dict[int, Submap] = field(default_factory=dict)
+    drawn: dict[int, Drawn] = field(default_factory=dict)
+    fresh: dict[int, tuple[Seen, ...]] = field(default_factory=dict)
+    stale: frozenset[Tile] = frozenset()
+    due: bool = False
+    job: int = 0
+    rendered: int = 0
+    composed: int = 0
+
+    def laid(self, submap: Submap, frames: Sequence[Keyframe]) -> None:
+        """Show a submap with these keyframes from now on; again, if it has been shown with fewer."""
+        self.submaps[submap.key] = submap
+        self.due = True
+        self.fresh[submap.key] = tuple((se2.between(submap.T_odom_submap, f.T_odom_lidar), f) for f in frames)
+
+    def task(self, adrift: float = math.inf) -> Task:
+        """The next piece of work; it finds out itself what has moved. Submaps from key ``adrift`` on are left out."""
+        ready = sorted(key for key in self.fresh if key < adrift)
+        fresh = {key: self.fresh[key] for key in ready[:RENDERS]}
+        self.due = False
+        shown = self.drawn.keys() | fresh.keys()
+        places = {key: place_of(self.submaps[key]) for key in sorted(shown)}
+        spare = frozenset(key for key in shown if self.submaps[key].into is not None)
+        return Task(self.resolution, dict(self.drawn), places, fresh, len(ready) > RENDERS, spare, self.stale)
+
+    def take(self, done: Progress) -> None:
+        """Take in what a job has done."""
+        self.drawn.update(done.drawn)
+        for key, frames in done.task.fresh.items():
+            if self.fresh.get(key) is frames:  # nothing has been added to it meanwhile
+                del self.fresh[key]
+        for key in done.gone:
+            if key not in self.fresh:
+                del self.drawn[key], self.submaps[key]
+        self.stale = done.stale
+        self.rendered += len(done.task.fresh)
+        self.composed += len(done.tiles)
+        changed = {tile: cells for tile, cells in done.tiles.items() if self.differs(tile, cells)}
+        self.version += bool(changed)
+        self.tiles.update((tile, (self.version, cells)) for tile, cells in changed.items())
+
+    def differs(self, tile: Tile, cells: Cells) -> bool:
+        """Whether a tile has other cells than the ones that were shown."""
+        shown = self.tiles.get(tile)
+        return bool(cells.any()) if shown is None else not np.array_equal(shown[1], cells)
+
+    def busy(self, adrift: float = math.inf) -> bool:
+        """Whether there is work, or may be because submaps were moved; arguments as of :meth:`task`."""
+        return bool(self.stale) or self.due or any(key < adrift for key in self.fresh)
+
+    def clear(self) -> None:
+        """Forget the map; whoever has seen its tiles is told that they are empty."""
+        self.version += bool(self.tiles)
+        empty = np.zeros((SIDE, SIDE), np.int8)
+        self.tiles = dict.fromkeys(self.tiles, (self.version, empty))
+        self.submaps, self.drawn, self.fresh, self.stale, self.job = {}, {}, {}, frozenset(), 0
+        self.due = False
+
+    def changed(self, since: int) -> tuple[int, dict[Tile, Cells]]:
+        """The present version, and the tiles that have changed after version ``since``; 0: all of them."""
+        return self.version, {tile: cells for tile, (version, cells) in self.tiles.items() if version > since}
+
+    def grid(self) -> Grid:
+        """All tiles as one grid, without unknown edges.
+
+        Raises:
+            ValueError: it would have too many cells.
+        """
+        known = [(tile, cells) for tile, (_, cells) in self.tiles.items() if cells.any()]
+        if not known:
+            return Grid(np.zeros(2), self.resolution, np.zeros((0, 0), np.float32))
+        at = np.array([tile for tile, _ in known])
+        low, high = at.min(axis=0), at.max(axis=0) + 1
+        wide, tall = ((high - low) * SIDE).tolist()
+        whole = blank(tall, wide, self.resolution)
+        for (column, row), cells in known:
+            i, j = (column - low[0]) * SIDE, (row - low[1]) * SIDE
+            whole[j : j + SIDE, i : i + SIDE] = UNIT * cells
+        rows, columns = np.flatnonzero(whole.any(axis=1)), np.flatnonzero(whole.any(axis=0))
+        part = whole[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        origin = (low * SIDE + (columns[0], rows[0])) * self.resolution
+        return Grid(origin, self.resolution, np.ascontiguousarray(part))
+
+
+def follow(state: State, before: Submap | None, frames: Sequence[Keyframe]) -> None:
+    """A keyframe was laid; before it, ``before`` was the newest submap, with these keyframes."""
+    live, newest = state.live, state.atlas.newest
+    if live is None or newest is None:
+        return
+    if newest is not before:
+        if newest.key == state.atlas.adrift:  # what was adrift before has never been placed
+            live.fresh = {key: seen for key, seen in live.fresh.items() if key < newest.key}
+        if before is not None:
+            live.laid(before, frames)
+    if len(state.atlas.frames) % EVERY == 1:
+        live.laid(newest, state.atlas.frames)
+    live.due = True
+    go_on(state)
+
+
+def begin(state: State) -> None:
+    """Show what a restored map holds."""
+    if state.live is not None:
+        for submap, frames in hanging(state.keyframes.values()):
+            state.live.laid(submap, frames)
+
+
+def redraw(state: State) -> None:
+    """The map has become another one: show what it holds now; an answer that shows the other is not waited for."""
+    if state.live is not None:
+        state.atlas.asked.pop(state.live.job, None)
+        state.live.clear()
+        begin(state)
+
+
+def forget(state: State, first: int) -> None:
+    """The submaps from key ``first`` on are taken out of the map; an answer that still shows them is not waited for."""
+    live = state.live
+    if live is None:
+        return
+    state.atlas.asked.pop(live.job, None)
+    live.job = 0
+    for key in [key for key in live.drawn if key >= first]:
+        live.stale |= live.drawn.pop(key).tiles
+    live.submaps = {key: submap for key, submap in live.submaps.items() if key < first}
+    live.fresh = {key: seen for key, seen in live.fresh.items() if key < first}
+
+
+def go_on(state: State) -> None:
+    """Hand out the next piece of work, if there is any and none is under way."""
+    live, atlas = state.live, state.atlas
+    adrift = math.inf if atlas.adrift is None else atlas.adrift
+    if live is None or not live.busy(adrift) or live.job in atlas.asked:
+        return
+    task = live.task(adrift)
+
+    def then(payload: object) -> None:
+        assert isinstance(payload, Progress)
+        live.take(payload)
+
+    live.job = atlas.ask(DRAW, lambda: advance(task), then)
+
+
+def place_of(submap: Submap) -> Place:
+    """Where a submap lies now, without computing anything: places are replaced, never changed."""
+    if submap.into is None:
+        return Place(submap.T_map_submap, None)
+    hub, T_hub_submap = submap.into
+    if hub.into is None:
+        return Place(hub.T_map_submap, T_hub_submap)
+    return Place(submap.place(), None)
+
+
+def advance(task: Task) -> Progress:
+    """Render, find what has moved, compose some of the stale tiles. Changes nothing: the answer tells what is new."""
+    fresh = {}
+    stale = set(task.stale)
+    for key, place in task.places.items():
+        T, shown = place.now(), task.drawn.get(key)
+        if key in task.fresh:
+            patch = render(task.fresh[key], T, task.resolution)
+        elif shown is not None and shift(shown, T) > MOVED * task.resolution:
+            patch = shown.patch
+        else:
+            continue
+        touched = patch.touches(T, task.resolution)
+        fresh[key] = Drawn(patch, T, touched, {})
+        stale |= touched | (frozenset() if shown is None else shown.tiles)
+    return composed(task, fresh, stale)
+
+
+def composed(task: Task, fresh: dict[int, Drawn], stale: set[Tile]) -> Progress:
+    """Compose some of the stale tiles, with the patches as they lie from now on."""
+    lying = {**task.drawn, **fresh}
+    now = [] if task.more else sorted(stale)[:TILES]
+    order = [(key, one.patch, one.T_map_submap, one.tiles) for key, one in sorted(lying.items(), reverse=True)]
+    tiles, used = compose(now, order, task.resolution)
+    for (key, tile), count in used.items():
+        one = lying[key]
+        lying[key] = fresh[key] = one._replace(used={**one.used, tile: count})
+    rest = frozenset(stale.difference(now))
+    gone = tuple(key for key in sorted(task.spare) if spent(lying[key], rest))
+    return Progress(task, fresh, tiles, rest, gone)
+
+
+def shift(shown: Drawn, T_map_submap: Array) -> float:
+    """By how much, m, a patch lies elsewhere than it is drawn, at most."""
+    if T_map_submap is shown.T_map_submap:
+        return 0.0
+    x, y, yaw = T_map_submap.tolist()
+    u, v, w = shown.T_map_submap.tolist()
+    return math.hypot(x - u, y - v) + abs(se2.wrap(yaw - w)) * shown.patch.reach_m
+
+
+def spent(one: Drawn, stale: frozenset[Tile]) -> bool:
+    """Whether next to nothing that a patch says counts any more."""
+    return not one.tiles & stale and sum(one.used.values()) < SPENT * max(1, one.patch.weight)
+
+
+def at_once(pieces: Iterable[tuple[Submap, Sequence[Keyframe]]], resolution: float) -> Grid:
+    """The map of these submaps, oldest first, with the keyframes that hang on each, all in one go.
+
+    Raises:
+        ValueError: the resolution is not positive, or the map would have too many cells.
+    """
+    if not resolution > 0.0:
+        raise ValueError(f"map resolution is {resolution} m per cell; it must be positive")
+    live = LiveMap(resolution)
+    for number, (submap, frames) in enumerate(pieces, 1):
+        alone = Submap(number, submap.first, submap.place(), submap.T_odom_submap)
+        live.laid(alone, frames)
+    while live.busy():
+        live.take(advance(live.task()))
+    return live.grid()

@@ -1,0 +1,375 @@
+"""Closing loops (Sect. 4.3): what happens to the map when the robot comes back.
+
+Nothing here delays a cycle. What takes long is handed out as a job (settle a submap, look for a loop, solve the graph)
+whose answer comes back as a record of a later step. ``T_odom_base`` never hears of it. Without light the correction
+goes into ``T_map_odom``; with light that has placed the map, it moves what was laid before, and light moves the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from estimator.fusion import map_odom_filter
+from estimator.mapping import graph_pose_prior, live_grid
+from estimator.mapping.keyframe import Keyframe, Submap
+from estimator.mapping.loop_verification import Candidate, Found, LoopSettings, look, told_by_light
+from estimator.mapping.map_alignment_covariance import APART
+from estimator.mapping.map_frame import move_map
+from estimator.mapping.pose_graph import UPPER, Graph, Solution, optimise
+from estimator.mapping.relative_covariance import tied
+from estimator.mapping.submap_graph import LOOK, SOLVE, Atlas, Ints, Waiting
+from estimator.measurements import Answer, Array
+from estimator.numerics import se2
+from estimator.numerics.symmetric3 import invert3
+from estimator.result import SURPRISE, Loop, LoopReason
+from estimator.state import State
+
+PHI: Final = 25.0
+"""chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real rooms bend more than noise."""
+
+SETTLED: Final = 1e-5
+MOST: Final = 100
+TOGETHER: Final = 60
+"""Keyframes, at most, between two loops that support each other."""
+
+TURNED: Final = 1.05
+"""Turned by so much (rad), a lidar that sees half the horizon sees another part of the surroundings."""
+
+TREMBLE: Final = np.diag((0.005**2, 0.005**2, 0.003**2))
+"""What a correction of the map is uneven by."""
+
+AS_ONE: Final = 1e-6
+"""Rounding (m, rad) of submaps that were moved together."""
+
+
+def take_answer(state: State, answer: Answer) -> None:
+    """Take in what a job has found."""
+    state.atlas.answer(answer)
+    solve_graph(state, state.atlas)
+    live_grid.go_on(state)
+
+
+def keyframe_laid(state: State, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
+    """Hang a new keyframe on the map and look whether this place is known; arguments as of `Atlas.add`."""
+    atlas, told = state.atlas, state.settings.loops
+    before, frames = atlas.newest, atlas.frames
+    atlas.add(frame, P, sigma, anew)
+    live_grid.follow(state, before, frames)
+    if told is not None and not atlas.looking and atlas.since_look >= told.every:
+        look_back(state, told, frame)
+
+
+def look_back(state: State, told: LoopSettings, frame: Keyframe) -> None:
+    """Hand out the search for a keyframe in the submaps that may lie here."""
+    atlas = state.atlas
+    asked = candidates(state, told, frame)
+    if not asked:
+        return
+    atlas.since_look = 0
+
+    def then(payload: object) -> None:
+        assert isinstance(payload, tuple)
+        for found in payload:
+            found_again(atlas, told, frame, found)
+
+    atlas.look = atlas.ask(LOOK, lambda: look(frame, asked, told), then)
+
+
+def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
+    """The nearest submaps that may be where the keyframe is, and were not left only just now."""
+    T, atlas = frame.T_map_keyframe, state.atlas
+    here_x, here_y, _ = T.tolist()
+    near, left_before, most_m = [], atlas.way_m - told.recent_m, told.most_m
+    vaguest = placed_trace(state)  # no submap is less certain, so that most are passed over without knowing how much
+    for submap in atlas.of_part(frame.submap):
+        settled = submap.settled
+        if settled is None or submap.way_m >= left_before:
+            continue
+        x, y, _ = submap.T_map_submap.tolist()  # most of a large map is passed over here, so it is done by hand
+        u, v, _ = settled.witness.T_odom_keyframe.tolist()
+        if math.hypot(x - here_x, y - here_y) >= most_m + math.hypot(u, v):
+            continue
+        middle = se2.compose(submap.T_map_submap, settled.witness.T_odom_keyframe)
+        x, y, yaw = se2.between(middle, T).tolist()
+        far = math.hypot(x, y)
+        if far >= min(told.most_m, told.reach_m + 3.0 * math.sqrt(vaguest)):
+            continue
+        if far >= told.reach_m:
+            P = certainty(state, submap, frame)
+            if far >= told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])):
+                continue
+        # who looks the other way sees little of the same
+        near.append((far + told.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled))
+    near.sort(key=lambda one: one[:2])
+    made = []
+    for _, key, submap, settled in near[: told.candidates]:
+        R, P = se2.rotation(-submap.T_map_submap[2]), certainty(state, submap, frame)
+        said = told_by_light(frame, submap, told)
+        made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T, said))
+    return tuple(made)
+
+
+def certainty(state: State, submap: Submap, frame: Keyframe) -> Array:
+    """Covariance (map axes) of the newest keyframe relative to a submap: by the way, by loops, or by light."""
+    P = state.atlas.apart(submap, frame.T_odom_keyframe)
+    tie = state.absolute
+    if tie is not None and np.trace(P) > placed_trace(state):
+        P = tie.P
+    return turned(state, P)
+
+
+def placed_trace(state: State) -> float:
+    """Trace of the covariance (any axes) by which light has placed the pose; without end where it has not."""
+    tie = state.absolute
+    return float(np.trace(tie.P)) if tie is not None and tie.placed else math.inf
+
+
+def lit(state: State) -> bool:
+    """Whether light has told where the map lies, and so holds the pose in it."""
+    return state.absolute is not None and state.absolute.placed
+
+
+def turned(state: State, P_odom: Array) -> Array:
+    """A covariance of the odom frame in the axes of the map."""
+    R = se2.rotation(state.T_map_odom[2])
+    return np.asarray(R @ P_odom @ R.T)
+
+
+def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found) -> None:
+    """Accept a loop, or let it wait for others that agree where it would move the pose far."""
+    if found.key not in atlas.submaps or atlas.submaps.get(frame.submap.key) is not frame.submap:
+        return  # forgotten meanwhile, and its key may have been given to another
+    if not found.alone:  # places repeat here: what has agreed so far may have been the other one all along
+        atlas.waiting = []
+        return
+    one = Waiting(found, frame, se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe)))
+    if not within(found.moved, told, 1.0) and found.reason is not LoopReason.LIT:  # there light is the second witness
+        friends = supporters(atlas, told, one)
+        far = min(math.hypot(*found.moved[:2]), told.most_m)
+        if not friends or max(apart(one, other) for other in friends) < far:
+            atlas.waiting = [*atlas.waiting[-TOGETHER:], one]
+            return
+        atlas.waiting = [other for other in atlas.waiting if other not in friends]
+        for other in friends:
+            join(atlas, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
+        found = replace(found, reason=LoopReason.SUPPORTED)
+    atlas.waiting = [  # the others are refuted, or were left long ago
+        other for other in atlas.waiting if comparable(atlas, one, other) and within(off(atlas, one, other), told, 1.0)
+    ]
+    join(atlas, frame, found)
+
+
+def supporters(atlas: Atlas, told: LoopSettings, one: Waiting) -> list[Waiting]:
+    """The loops that agree with this one, newest first, as far back as none contradicts it."""
+    friends: list[Waiting] = []
+    for other in reversed(atlas.waiting):
+        if not comparable(atlas, one, other):
+            continue
+        if not within(off(atlas, one, other), told, 1.0):
+            break
+        if within(off(atlas, one, other), told, 0.5):
+            friends.append(other)
+    return friends
+
+
+def apart(one: Waiting, other: Waiting) -> float:
+    """How far apart (m) two keyframes lie; without end where the robot has turned to see what was behind it.
+
+    Where the surroundings repeat, a place that is off by a period fits as well as the true one while the latter is
+    beyond the end of the map. It no longer can once as much has been driven as the loop would move the pose: the place
+    that was found has then been reached by who had not been there yet, and is found as such.
+    """
+    x, y, yaw = se2.between(other.frame.T_odom_keyframe, one.frame.T_odom_keyframe).tolist()
+    return math.inf if abs(yaw) > TURNED else math.hypot(x, y)
+
+
+def comparable(atlas: Atlas, one: Waiting, other: Waiting) -> bool:
+    """Whether two loops tell of the same stretch of the way, in submaps that are still there."""
+    laid = other.frame.submap
+    there = one.found.key in atlas.submaps and other.found.key in atlas.submaps and atlas.submaps.get(laid.key) is laid
+    return there and one.frame.key - other.frame.key <= TOGETHER
+
+
+def off(atlas: Atlas, one: Waiting, other: Waiting) -> Array:
+    """How far (x, y, yaw) the place where one loop puts its keyframe is from where another one would put it."""
+    a, b = atlas.submaps[one.found.key], atlas.submaps[other.found.key]
+    T_b_a = se2.between(b.T_map_submap, a.T_map_submap)
+    there = se2.compose(other.T_found_odom, one.frame.T_odom_keyframe)
+    return se2.between(there, se2.compose(T_b_a, one.found.T_submap_keyframe))
+
+
+def within(moved: Array, told: LoopSettings, share: float) -> bool:
+    """Whether a pose is moved by less than this share of what asks for support."""
+    x, y, yaw = moved.tolist()
+    return math.hypot(x, y) <= share * told.supported_m and abs(yaw) <= share * told.supported_rad
+
+
+def join(atlas: Atlas, frame: Keyframe, found: Found) -> None:
+    """Add a loop to the graph: from the submap that was found to the one that the keyframe hangs on."""
+    T_keyframe_submap = se2.between(frame.T_odom_keyframe, frame.submap.T_odom_submap)
+    R, A = se2.rotation(-found.T_submap_keyframe[2]), se2.adjoint(se2.inverse(T_keyframe_submap))
+    P = A @ R @ found.P @ R.T @ A.T
+    atlas.constraints.add(found.key, frame.submap.key, se2.compose(found.T_submap_keyframe, T_keyframe_submap), P, True)
+    atlas.closures += 1
+    first = atlas.submaps[found.key].first
+    atlas.news = Loop(atlas.closures, frame.key, first, found.residual_m, found.reason)
+    atlas.stale = True
+
+
+def solve_graph(state: State, atlas: Atlas) -> None:
+    """Hand out the graph, if it has changed and is not being solved."""
+    newest = atlas.newest
+    begun = newest is not None and (atlas.adrift is None or newest.key >= atlas.adrift)
+    if atlas.solving or not atlas.stale or not begun:
+        return
+    atlas.stale = False
+    submaps = tuple(atlas.submaps.values())
+    graph = graph_of(state, atlas, submaps)
+
+    def then(payload: object) -> None:
+        assert isinstance(payload, tuple)
+        before, solution, ties = along(submaps, graph.poses, *payload[:2])
+        if correct(state, atlas, submaps, before, solution):
+            if payload[2] is not None and lit(state) and submaps[-1] is atlas.newest:
+                graph_pose_prior.take(state, payload[2])
+            R = se2.rotation(-state.T_map_odom[2])
+            atlas.tied = submaps[-1]
+            turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
+            atlas.ties = dict(zip([submap.key for submap in submaps], turned, strict=True))
+
+    atlas.solution = atlas.ask(SOLVE, lambda: solved(graph), then)
+
+
+def solved(graph: Graph) -> tuple[Solution, Array, graph_pose_prior.Said | None]:
+    """The graph's solution, how surely the newest submap lies to each (`tied`), and what the map says of its place."""
+    last = len(graph.poses) - 1
+    solution = optimise(graph, MOST, SETTLED, PHI, covariance_of=last)
+    ties = tied(graph, solution.poses, solution.trust, last)
+    return solution, ties, graph_pose_prior.said(graph, solution, ties, (MOST, SETTLED, PHI))
+
+
+def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
+    """The submaps as a graph: joined by the way and by loops, and anchored where light has told a place."""
+    joined = atlas.constraints
+    keys = np.array([submap.key for submap in submaps])
+    poses = np.array([submap.T_map_submap for submap in submaps])
+    edges = np.searchsorted(keys, joined.between)
+    if atlas.held:
+        held = np.array([atlas.is_held(submap) for submap in submaps])
+        return Graph(poses, edges, joined.T, joined.information, joined.loop, held=held)
+    if not lit(state):
+        return Graph(poses, edges, joined.T, joined.information, joined.loop)
+    anchored, at, certainty = anchors(state, atlas, keys)
+    return Graph(poses, edges, joined.T, joined.information, joined.loop, anchored, at, certainty)
+
+
+def anchors(state: State, atlas: Atlas, keys: Ints) -> tuple[Ints, Array, Array]:
+    """Absolute constraints: what light said at earlier submaps, and where the pose holds the newest."""
+    newest, tie = atlas.newest, state.absolute
+    assert newest is not None
+    assert tie is not None
+    told = [(submap.key, *submap.light) for submap in atlas.submaps.values() if submap.light and submap is not newest]
+    told = [(key, T, APART * P) for key, T, P in told]
+    told.append((newest.key, newest.T_map_submap, turned(state, tie.P)))
+    anchored, at = np.searchsorted(keys, [key for key, _, _ in told]), np.array([T for _, T, _ in told])
+    return anchored, at, information(at, np.array([P for _, _, P in told]))
+
+
+def information(at: Array, P_map: Array) -> Array:
+    """Of places (n, 3), upper triangles (n, 6) in their own axes, from their covariances (n, 3, 3) in the map's.
+
+    All at once: this is done in a cycle, and one by one it took 2 ms of it with a hundred places.
+    """
+    R, c, s = np.zeros(P_map.shape), np.cos(at[:, 2]), np.sin(at[:, 2])
+    R[:, 0, 0] = R[:, 1, 1] = c
+    R[:, 0, 1], R[:, 1, 0], R[:, 2, 2] = s, -s, 1.0
+    H = np.array([invert3(P) for P in R @ P_map @ R.transpose(0, 2, 1)])
+    rows, columns = np.array(UPPER).T
+    return np.ascontiguousarray(H[:, rows, columns])
+
+
+def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: Array) -> tuple[Array, Solution, Array]:
+    """Take a solution along where the whole map has moved as one since, as it does while light finds out where it lies.
+
+    Such a map may move with every epoch; if its solutions were thrown away for that, no loop would ever correct it.
+
+    ``before`` (n, 3) are the places of the submaps that the solution has begun from, ``ties`` (n, 3, 3) came with it.
+    Returns these, the solution and the ties as they would be had the map moved before; unchanged where it did not.
+    """
+    now = np.array([submap.T_map_submap for submap in submaps])
+    there = np.array([submap.into is None for submap in submaps[:-1]], np.bool_)
+    if not there.any() or np.array_equal(now, before):
+        return before, solution, ties
+    k = int(np.argmax(there))
+    moved = se2.compose(now[k], se2.inverse(before[k]))
+    places = se2.compose_all(moved, before)
+    off = places - now
+    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    near = np.abs(off).max(axis=1) < AS_ONE
+    if not near[:-1][there].all():
+        return before, solution, ties
+    places[near] = now[near]
+    R = se2.rotation(moved[2])
+    P = R @ solution.covariance @ R.T
+    solution = replace(solution, poses=se2.compose_all(moved, solution.poses), covariance=P)
+    return places, solution, np.asarray(R @ ties @ R.T)
+
+
+def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:
+    """Move the submaps to where the graph has them, and the robot with the newest one, unless light holds it.
+
+    Returns whether it did: a solution of what has been moved or forgotten meanwhile is thrown away, and the graph
+    solved once more.
+    """
+    newest = atlas.newest
+    held, last = lit(state) and not atlas.held, submaps[-1]
+    counts = np.array([submap.into is None and not (held and submap is last) for submap in submaps])
+    known = atlas.submaps.get
+    there = all(submap.into is not None or known(submap.key) is submap for submap in submaps)
+    same = there and np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
+    if newest is None or not same or not np.isfinite(solution.poses).all():
+        atlas.stale |= not same
+        return False
+    moved = se2.compose(solution.poses[-1], se2.inverse(last.T_map_submap))
+    first = se2.compose(solution.poses[0], se2.inverse(submaps[0].T_map_submap))
+    if state.live is not None:
+        state.live.due = True
+    for submap, T in zip(submaps, solution.poses, strict=True):
+        if not (held and submap is last):
+            submap.T_map_submap = T
+    state.T_map_start = se2.compose(first, state.T_map_start)
+    if held:
+        return True
+    for submap in atlas.submaps.values():
+        if submap.key > last.key:
+            submap.T_map_submap = se2.compose(moved, submap.T_map_submap)
+    before_map = state.T_map_odom
+    move_map(state, se2.compose(newest.T_map_submap, se2.inverse(newest.T_odom_submap)))
+    if newest is last:
+        R = se2.rotation(-state.T_map_odom[2])
+        atlas.marginal = R @ solution.covariance @ R.T
+        state.P_anchor = surer(state, atlas.spread(state.T_odom_anchor), before_map)
+        if state.absolute is not None and atlas.held:
+            map_odom_filter.hang_on_anchor(state)
+    else:
+        atlas.stale = True  # the newest one's certainty is not known yet
+    return True
+
+
+def surer(state: State, P_graph: Array, T_map_odom_before: Array) -> Array:
+    """Covariance (odom axes) of the newest keyframe's place in the map after the graph has moved it.
+
+    The graph reckons with what real rooms bend a stretch by at worst, so that its loops may be believed. A loop takes
+    nothing from what matching itself knew of the place, unless it finds it elsewhere than that allows.
+    """
+    T_anchor = state.T_odom_anchor
+    off = se2.compose(state.T_map_odom, T_anchor) - se2.compose(T_map_odom_before, T_anchor)
+    off[2] = se2.wrap(float(off[2]))
+    off = se2.rotation(-state.T_map_odom[2]) @ off
+    P_way = state.P_anchor
+    fits = float(off @ invert3(P_way + TREMBLE) @ off) <= SURPRISE
+    return P_way if fits and np.trace(P_way) < np.trace(P_graph) else P_graph

@@ -1,0 +1,112 @@
+"""How surely two submaps' places are known relative to each other: by the surest single path that joins them.
+
+The graph's own marginals are relative to its start: a robot that has just closed a loop far from there is sure of what
+is around it and not of where that lies as seen from the start. Covariances of relative poses add up along a path once
+each is carried to one place (the carry is linear: `se2.carry`), so the surest path to every submap is Dijkstra's. That
+ignores all other paths and so is a bound from above.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.mapping.pose_graph import Graph
+from estimator.measurements import Array
+from estimator.numerics.jit import kernel
+
+Ints = npt.NDArray[np.int64]
+
+BELIEVED: Final = 0.25
+"""A loop that the graph believes less than this joins nothing."""
+
+UNTIED: Final = 1e4
+"""Variance (m^2, rad^2) of what nothing joins."""
+
+
+def tied(graph: Graph, poses: Array, trust: Array, to: int) -> Array:
+    """(n, 3, 3) covariance, map axes, of pose ``to`` relative to each of ``poses``; ``trust`` in each constraint."""
+    used = np.flatnonzero(trust > BELIEVED)
+    edges = np.ascontiguousarray(graph.edges[used])
+    carried = carried_to(poses[to], poses[edges[:, 1]], graph.information[used])
+    start, order = rows_of(len(poses), edges)
+    out = np.empty((len(poses), 3, 3))
+    surest(to, edges, carried, (start, order), out)
+    return out
+
+
+def carried_to(there: Array, at: Array, information: Array) -> Array:
+    """(m, 3, 3) covariances, map axes, that constraints which end at poses ``at`` (m, 3) mean for a place ``there``."""
+    H = information[:, (0, 1, 2, 1, 3, 4, 2, 4, 5)].reshape(-1, 3, 3)
+    P = inverse3(H)
+    c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
+    A = np.zeros((len(at), 3, 3))
+    A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1], A[:, 2, 2] = c, -s, s, c, 1.0
+    A[:, 0, 2], A[:, 1, 2] = at[:, 1] - there[1], there[0] - at[:, 0]
+    return np.ascontiguousarray(A @ P @ A.transpose(0, 2, 1))
+
+
+def inverse3(H: Array) -> Array:
+    """Of (m, 3, 3) symmetric matrices, by their adjugates."""
+    a, b, c = H[:, 0], H[:, 1], H[:, 2]
+    adjugate = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)), axis=2)
+    return np.asarray(adjugate / np.einsum("ij,ij->i", a, adjugate[:, :, 0])[:, None, None])
+
+
+def rows_of(n: int, edges: Ints) -> tuple[Ints, Ints]:
+    """For each pose where its constraints begin, and the constraints, in compressed rows."""
+    ends = edges.T.ravel()
+    order = np.argsort(ends, kind="stable")
+    start = np.searchsorted(ends[order], np.arange(n + 1))
+    return start, order % max(1, len(edges))
+
+
+@kernel("void(i8, i8[:, ::1], f8[:, :, ::1], UniTuple(i8[::1], 2), f8[:, :, ::1])", aside=True)
+def surest(to: int, edges: Ints, carried: Array, rows: tuple[Ints, Ints], out: Array) -> None:
+    """Dijkstra from ``to``, a path being as long as the trace of its covariance; ``out`` gets the covariances."""
+    start, order = rows
+    n = len(out)
+    far, done = np.full(n, np.inf), np.zeros(n, np.bool_)
+    for i in range(n):
+        for r in range(3):
+            for c in range(3):
+                out[i, r, c] = UNTIED if r == c else 0.0
+    heap_key, heap_node = np.empty(2 * len(order) + 2), np.empty(2 * len(order) + 2, np.int64)
+    far[to], heap_key[0], heap_node[0], count = 0.0, 0.0, to, 1
+    out[to] = 0.0
+    while count > 0:
+        i = heap_node[0]
+        count -= 1
+        key, node = heap_key[count], heap_node[count]
+        k = 0
+        while True:  # sift the last one down from the top
+            child = 2 * k + 1
+            if child >= count:
+                break
+            if child + 1 < count and heap_key[child + 1] < heap_key[child]:
+                child += 1
+            if heap_key[child] >= key:
+                break
+            heap_key[k], heap_node[k] = heap_key[child], heap_node[child]
+            k = child
+        heap_key[k], heap_node[k] = key, node
+        if done[i]:
+            continue
+        done[i] = True
+        for e in order[start[i] : start[i + 1]]:
+            j = edges[e, 0] + edges[e, 1] - i
+            length = far[i] + carried[e, 0, 0] + carried[e, 1, 1] + carried[e, 2, 2]
+            if done[j] or length >= far[j]:
+                continue
+            far[j] = length
+            for r in range(3):
+                for c in range(3):
+                    out[j, r, c] = out[i, r, c] + carried[e, r, c]
+            k = count
+            count += 1
+            while k > 0 and heap_key[(k - 1) >> 1] > length:
+                heap_key[k], heap_node[k] = heap_key[(k - 1) >> 1], heap_node[(k - 1) >> 1]
+                k = (k - 1) >> 1
+            heap_key[k], heap_node[k] = length, j

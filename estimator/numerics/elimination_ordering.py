@@ -1,0 +1,245 @@
+"""In which order to eliminate the poses of a graph, and what each elimination fills in.
+
+Approximate minimum degree on the quotient graph (Amestoy, Davis, Duff: An Approximate Minimum Degree Ordering
+Algorithm, SIAM J. Matrix Anal. Appl. 17(4), 1996) over poses, not over scalars: a pose's three unknowns always go
+together, which makes the graph nine times smaller and its order better. The element that an elimination leaves behind
+is the pattern of its column in the factor, so that ordering and symbolic factorisation are one pass.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.numerics.jit import kernel
+
+Ints = npt.NDArray[np.int64]
+
+NONE = -1
+
+
+@kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1])", aside=True)
+def adjacency(n: int, edges: Ints) -> tuple[Ints, Ints]:
+    """Neighbours of each of ``n`` poses, both ways, without repetition: start (n + 1,) and list."""
+    start = np.zeros(n + 1, np.int64)
+    for k in range(len(edges)):
+        i, j = edges[k, 0], edges[k, 1]
+        if i != j and i >= 0 and j >= 0:
+            start[i + 1] += 1
+            start[j + 1] += 1
+    for i in range(n):
+        start[i + 1] += start[i]
+    fill = start[:n].copy()
+    near = np.empty(start[n], np.int64)
+    for k in range(len(edges)):
+        i, j = edges[k, 0], edges[k, 1]
+        if i != j and i >= 0 and j >= 0:
+            near[fill[i]] = j
+            near[fill[j]] = i
+            fill[i] += 1
+            fill[j] += 1
+    seen = np.full(n, NONE)
+    out = 0
+    first = np.zeros(n + 1, np.int64)
+    for i in range(n):
+        for at in range(start[i], start[i + 1]):
+            j = near[at]
+            if seen[j] != i:
+                seen[j] = i
+                near[out] = j
+                out += 1
+        first[i + 1] = out
+    return first, near[:out].copy()
+
+
+@kernel("void(i8, i8, i8[:, ::1], i8[::1])", inner=True)
+def bucket_in(i: int, degree: int, links: Ints, head: Ints) -> None:
+    """Put pose ``i`` at the head of the list of those of this degree; ``links``: (next, previous) of each."""
+    links[i, 0] = head[degree]
+    links[i, 1] = NONE
+    if head[degree] != NONE:
+        links[head[degree], 1] = i
+    head[degree] = i
+
+
+@kernel("void(i8, i8, i8[:, ::1], i8[::1])", inner=True)
+def bucket_out(i: int, degree: int, links: Ints, head: Ints) -> None:
+    """Take pose ``i`` out of the list of its degree."""
+    after, before = links[i, 0], links[i, 1]
+    if before == NONE:
+        head[degree] = after
+    else:
+        links[before, 0] = after
+    if after != NONE:
+        links[after, 1] = before
+
+
+Quotient = tuple[Ints, Ints, Ints, Ints]
+"""Of the quotient graph: slot of each pose in the list, the list, how many elements a slot begins with, its length."""
+
+Passed = tuple[Ints, Ints, Ints]
+"""What has been eliminated: step of each pose (NONE: not yet), whether its element was absorbed, element bounds."""
+
+QUOTIENT = "Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))"
+PASSED = "Tuple((i8[::1], i8[::1], i8[::1]))"
+
+
+@kernel(f"i8(i8, {QUOTIENT}, {PASSED})", inner=True)
+def reach_of(p: int, graph: Quotient, passed: Passed) -> int:
+    """How many places eliminating ``p`` can fill at most."""
+    first, near, elements, length = graph
+    place, _, start = passed
+    reach = length[p] - elements[p]
+    for at in range(first[p], first[p] + elements[p]):
+        reach += start[place[near[at]] + 1] - start[place[near[at]]]
+    return int(reach)
+
+
+@kernel(f"i8(i8, i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1])", inner=True)
+def gather(k: int, p: int, graph: Quotient, passed: Passed, mark: Ints, fill: Ints) -> int:
+    """Write the new element of pivot ``p``, neighbours and absorbed elements together; where it ends."""
+    first, near, elements, length = graph
+    place, gone, start = passed
+    mark[p] = k
+    end = start[k]
+    for at in range(first[p] + elements[p], first[p] + length[p]):
+        j = near[at]
+        if place[j] == NONE and mark[j] != k:
+            mark[j] = k
+            fill[end] = j
+            end += 1
+    for at in range(first[p], first[p] + elements[p]):
+        e = near[at]
+        if gone[e]:
+            continue
+        gone[e] = 1
+        for m in range(start[place[e]], start[place[e] + 1]):
+            j = fill[m]
+            if mark[j] != k and place[j] == NONE:
+                mark[j] = k
+                fill[end] = j
+                end += 1
+    return int(end)
+
+
+@kernel(f"void(i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1], i8)", inner=True)
+def weigh(k: int, graph: Quotient, passed: Passed, fill: Ints, weight: Ints, tag: int) -> None:
+    """How much of every element near the new one lies outside it: ``weight - tag``."""
+    first, near, elements, _ = graph
+    place, gone, start = passed
+    for m in range(start[k], start[k + 1]):
+        i = fill[m]
+        for at in range(first[i], first[i] + elements[i]):
+            e = near[at]
+            if not gone[e]:
+                if weight[e] < tag:
+                    weight[e] = tag + start[place[e] + 1] - start[place[e]]
+                weight[e] -= 1
+
+
+@kernel(f"i8(i8, i8, i8, {QUOTIENT}, {PASSED}, Tuple((i8[::1], i8[::1], i8)))", inner=True)
+def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[Ints, Ints, int]) -> int:
+    """Replace in the slot of ``i`` what the new element covers; a bound of its degree besides the new element."""
+    first, near, elements, length = graph
+    place, gone, _ = passed
+    mark, weight, tag = marks
+    out, bound = first[i], 0
+    rest, last = first[i] + elements[i], first[i] + length[i]
+    for at in range(first[i], rest):
+        e = near[at]
+        if gone[e]:
+            continue
+        if weight[e] == tag:
+            gone[e] = 1  # all of it lies in the new element
+            continue
+        near[out] = e
+        out += 1
+        bound += weight[e] - tag
+    if out == rest and rest < last:
+        # No element has made room for the new one, so a neighbour does that the new one covers: there is one, because
+        # otherwise i would not be in it.
+        for at in range(rest, last):
+            if near[at] == p or mark[near[at]] == k:
+                near[at] = near[rest]
+                break
+        rest += 1
+    near[out] = p
+    out += 1
+    elements[i] = out - first[i]
+    for at in range(rest, last):
+        j = near[at]
+        if mark[j] != k and place[j] == NONE:
+            near[out] = j
+            out += 1
+            bound += 1
+    length[i] = out - first[i]
+    return bound
+
+
+@kernel("Tuple((i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1])", aside=True)
+def minimum_degree(first: Ints, near: Ints) -> tuple[Ints, Ints, Ints]:
+    """Order of elimination (n,), and per pose eliminated: start (n + 1,) of the poses it fills in, by old number.
+
+    ``near`` is used up: a pose's slot holds its elements first, then the neighbours that are still there; both
+    together never outgrow it.
+    """
+    n = len(first) - 1
+    order, start = np.empty(n, np.int64), np.zeros(n + 1, np.int64)
+    fill = np.empty(max(16, 4 * len(near)), np.int64)
+    degree = first[1:] - first[:-1]
+    graph = (first, near, np.zeros(n, np.int64), degree.copy())
+    passed = (np.full(n, NONE), np.zeros(n, np.int64), start)
+    head, links = np.full(n + 1, NONE), np.full((n, 2), NONE)
+    for i in range(n - 1, -1, -1):
+        bucket_in(i, degree[i], links, head)
+    mark, weight, tag, least = np.full(n, NONE), np.zeros(n, np.int64), 1, 0
+    for k in range(n):
+        while head[least] == NONE:
+            least += 1
+        p = head[least]
+        bucket_out(p, degree[p], links, head)
+        reach = start[k] + reach_of(p, graph, passed)
+        if reach > len(fill):
+            larger = np.empty(2 * reach, np.int64)
+            larger[: start[k]] = fill[: start[k]]
+            fill = larger
+        start[k + 1] = gather(k, p, graph, passed, mark, fill)
+        order[k], passed[0][p] = p, k
+        size = start[k + 1] - start[k]
+        weigh(k, graph, passed, fill, weight, tag)
+        for m in range(start[k], start[k + 1]):
+            i = fill[m]
+            bound = renew(k, p, i, graph, passed, (mark, weight, tag))
+            bucket_out(i, degree[i], links, head)
+            degree[i] = max(0, min(bound + size - 1, degree[i] + size - 1, n - k - 2))
+            bucket_in(i, degree[i], links, head)
+            least = min(least, degree[i])
+        tag += n + 1
+    return order, start, fill[: start[n]].copy()
+
+
+@kernel("Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1], i8[::1])", aside=True)
+def columns(order: Ints, start: Ints, fill: Ints) -> tuple[Ints, Ints, Ints, Ints]:
+    """The factor's pattern in the new order, sorted: column start and rows; row start and columns."""
+    n, total = len(order), len(fill)
+    place = np.empty(n, np.int64)
+    for k in range(n):
+        place[order[k]] = k
+    row_start = np.zeros(n + 1, np.int64)
+    for m in range(total):
+        row_start[place[fill[m]] + 1] += 1
+    for k in range(n):
+        row_start[k + 1] += row_start[k]
+    at, across = row_start[:n].copy(), np.empty(total, np.int64)
+    for k in range(n):
+        for m in range(start[k], start[k + 1]):
+            i = place[fill[m]]
+            across[at[i]] = k
+            at[i] += 1
+    at, down = start[:n].copy(), np.empty(total, np.int64)
+    for i in range(n):
+        for m in range(row_start[i], row_start[i + 1]):
+            k = across[m]
+            down[at[k]] = i
+            at[k] += 1
+    return start, down, row_start, across

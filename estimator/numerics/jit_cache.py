@@ -1,0 +1,107 @@
+"""The one place where compiled kernels are kept, found without loading the compiler: is there anything to compile?
+
+A directory named by a hash of *all* kernel sources, of the compiler's versions and of its settings. numba's own key
+does not cover callees in other files, so an edited callee would leave a stale caller behind, nor the settings that come
+from the environment: a run with ``NUMBA_BOUNDSCHECK=1`` (every index is checked, `IndexError`) or
+``NUMBA_CPU_NAME=generic`` (no instructions beyond the architecture's first) has a directory of its own.
+
+This is the only module of the room that touches the file system; it does so once, when first imported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+KEPT: Final = 4
+"""Directories of other sources that are kept beside our own, the latest used ones."""
+KEPT_S: Final = 7 * 86400.0
+"""And all that were used more recently than this: their programs may be running..."""
+MOST: Final = 40
+"""...but no more than these in all, some 10 MB each. A running program has its kernels in memory and misses nothing."""
+
+SHAPING: Final = (
+    "BOUNDSCHECK",
+    "CPU_NAME",
+    "CPU_FEATURES",
+    "ENABLE_AVX",
+    "OPT",
+    "LOOP_VECTORIZE",
+    "SLP_VECTORIZE",
+    "DEBUGINFO_DEFAULT",
+)
+"""numba's settings (environment variables, without their prefix ``NUMBA_``) that shape the machine code."""
+
+
+def source_key() -> str:
+    """Hash of every source file of this room and of the versions and settings that turn it into machine code."""
+    digest = hashlib.sha256()
+    room = Path(__file__).parents[1]
+    for path in sorted(room.rglob("*.py")):
+        digest.update(path.relative_to(room).as_posix().encode())
+        digest.update(path.read_bytes())
+    versions = (sys.version_info[:2], *(version(name) for name in ("numba", "llvmlite", "numpy")))
+    digest.update(repr(versions).encode())
+    digest.update(repr([os.environ.get(f"NUMBA_{name}") or "" for name in SHAPING]).encode())
+    return digest.hexdigest()[:16]
+
+
+def _writable(directory: Path) -> bool:
+    """Whether a file can be made there: numba ignores a cache directory it cannot create a file in, silently."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            return True
+    except OSError:
+        return False
+
+
+def _cache_roots() -> list[Path]:
+    """Candidates in order: explicit, the service manager's CacheDirectory, the user's cache, a temporary directory."""
+    env = os.environ
+    named = [env[name] for name in ("NUMBA_CACHE_DIR", "CACHE_DIRECTORY") if env.get(name)]
+    home = env.get("XDG_CACHE_HOME") or (str(Path(env["HOME"]) / ".cache") if env.get("HOME") else "")
+    roots = [Path(name) for name in named]
+    if home:
+        roots.append(Path(home) / "lumiloop")
+    roots.append(Path(tempfile.gettempdir()) / f"lumiloop-{os.getuid()}")
+    return roots
+
+
+def _last_used(directory: Path) -> float:
+    try:
+        return directory.stat().st_mtime
+    except OSError:  # another process has removed it just now
+        return 0.0
+
+
+def _prune(root: Path, ours: Path) -> None:
+    """Remove what earlier versions left behind; whatever cannot be removed stays."""
+    now = _last_used(ours)
+    others = sorted((path for path in root.glob("kernels-*") if path != ours), key=_last_used, reverse=True)
+    for rank, path in enumerate(others):
+        if rank >= MOST or (rank >= KEPT and now - _last_used(path) > KEPT_S):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _choose_cache() -> Path:
+    key = source_key()
+    for root in _cache_roots():
+        directory = root / f"kernels-{key}"
+        is_new = not directory.exists()
+        if _writable(directory):
+            os.utime(directory)  # when it was last used
+            if is_new:
+                _prune(root, directory)
+            return directory
+    raise RuntimeError("no writable directory for compiled kernels; set NUMBA_CACHE_DIR to one")
+
+
+CACHE_DIR: Final = _choose_cache()
+"""Where compiled kernels of exactly these sources live."""

@@ -1,0 +1,94 @@
+"""Adaptive Link_n: which of the shortest links agree with each other, and how many of these to use.
+
+A link whose straight way is blocked is weak, so it looks long: the shortest links are seldom wrong. From the first few
+of them a set is grown, link by link, as long as each next one is consistent with the place that the others give; then
+the number of links is the one whose expected error is least for the solver at hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+
+from estimator.light_filter.survey import Survey
+from estimator.measurements import Array
+from estimator.paper.lateration_model import Links, Method, expected_error, spread
+from estimator.paper.lateration_solvers import DECIDED, SAME_M, Solution, Strengths, distinct, starts
+
+SEEDS: Final = 5
+"""Triples of the so many shortest links are tried until one is consistent with all other links."""
+WEAKER: Final = 25.0
+"""A link weaker than the others let expect is blocked when it raises the least chi2 by more (5 sigma)."""
+STRONGER: Final = 400.0
+"""One that is stronger has light from a near wall; it is wrong (moved, exchanged) only when it raises chi2 by more."""
+RIVALS: Final = 3
+"""Places that are carried along while they all fit."""
+
+
+def adapted(links: Links, survey: Survey, method: Method) -> list[int]:
+    """Which of ``links`` (shortest first) to use, in that order; all of them where there are fewer than four."""
+    if len(links.d) <= 3:
+        return list(range(len(links.d)))
+    agreeing, place = consistent(links, survey, method)
+    most = len(agreeing) if method.link_n is None else min(len(agreeing), method.link_n)
+    if place is None or most <= 3:
+        return agreeing[:most]
+    errors = [
+        float(np.trace(expected_error(links.pick(agreeing[:n]), survey, method, place))) for n in range(3, most + 1)
+    ]
+    return agreeing[: 3 + int(np.argmin(errors))]
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """Links that agree, with the places they fit, best first; ``score``: chi2 and what leaving out the others costs."""
+
+    links: list[int]
+    places: list[Solution]
+    score: float
+
+
+def consistent(links: Links, survey: Survey, method: Method) -> tuple[list[int], Array | None]:
+    """The set of links that explains most, shortest first, and the place (x, y) it gives (None: no triple fits)."""
+    best: Agreement | None = None
+    for triple in combinations(range(min(SEEDS, len(links.d))), 3):
+        if spread(links.pick(triple).xy)[0] < SAME_M:
+            continue
+        grown = _grown(links, survey, method, list(triple))
+        if grown is not None and (best is None or grown.score < best.score):
+            best = grown
+        if best is not None and best.score < WEAKER:  # leaving out anything would cost more
+            break
+    if best is None:
+        return list(range(len(links.d))), None
+    return sorted(best.links), best.places[0][1][:2]
+
+
+def _grown(links: Links, survey: Survey, method: Method, triple: list[int]) -> Agreement | None:
+    """A triple with every link that is consistent with it and with those taken before; None if it fits no place."""
+    few = links.pick(triple)
+    fit = Strengths(few, survey, method)
+    found = distinct([fit.descend(np.array((*s, 0.0, survey.floor))) for s in starts(few)], DECIDED)[:RIVALS]
+    if not found or found[0][0] > WEAKER:
+        return None
+    chosen, left_out = triple, 0.0
+    for i in range(len(links.d)):
+        if i not in triple:
+            fit = Strengths(links.pick([*chosen, i]), survey, method)
+            more = distinct([fit.descend(theta) for _, theta in found], DECIDED)
+            gate = WEAKER if _stronger(links, i, found[0][1]) < 0.0 else STRONGER
+            if more and more[0][0] - found[0][0] < gate:
+                chosen, found = [*chosen, i], more
+            else:
+                left_out += gate
+    return Agreement(chosen, found, found[0][0] + left_out)
+
+
+def _stronger(links: Links, i: int, theta: Array) -> float:
+    """Logarithm of a link's strength over what a place lets expect, all levelled."""
+    d2 = float(np.sum((theta[:2] - links.xy[i]) ** 2)) + links.h[i] ** 2
+    expected = (links.h[i] ** 2 / d2) ** (0.5 * links.exponent[i]) + theta[3]
+    return float(-np.log(links.diffuse[i] * expected) - theta[2])

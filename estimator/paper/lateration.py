@@ -1,0 +1,148 @@
+"""Eq. 3 and 4: from the strengths of a few lamps to a place, with shortest-link selection and its uncertainty.
+
+Eq. 3    (x_i - x)^2 + (y_i - y)^2 = d_i^2 - h_i^2,    d_i by inversion of Eq. 1, 2 for level lamps and receiver
+Eq. 4    place = argmin sum over the Link_n shortest links of [(x_i - x)^2 + (y_i - y)^2 - (d_i^2 - h_i^2)]^2
+
+Three solvers: `ls` is Eq. 4 as it stands; `lin` takes differences of Eq. 3, which are linear; `ml` fits logarithms of
+strengths, each weighted by how well it can be known, with the common gain and the diffuse floor as unknowns of their
+own. Places are those of the receiver (the photodiode), in the survey's frame, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from estimator.light_filter.survey import Survey
+from estimator.measurements import Array
+from estimator.paper.adaptive_link_selection import adapted
+from estimator.paper.lateration_model import (
+    LINK_N,
+    Doubt,
+    Links,
+    Method,
+    Received,
+    Solver,
+    expected_error,
+    shortest,
+    spread,
+    usable,
+    without_floor,
+)
+from estimator.paper.lateration_solvers import DECIDED, SAME_M, Strengths, solve
+
+
+class Why(Enum):
+    """What the places of a result are."""
+
+    PLACE = "one place fits"
+    MIRROR = "two places fit, the lamps alone do not tell which"
+    PRIOR = "two places fit, the prior knowledge tells which"
+    CIRCLE = "one lamp: every place on a circle around it fits"
+    NONE = "no usable link"
+    NO_FIT = "no descent settled"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What is known of the receiver's place beforehand: ``xy`` (2,) and ``covariance`` (2, 2)."""
+
+    xy: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """One place that fits.
+
+    Attributes:
+        xy: (2,) m. covariance: (2, 2) m^2, expected squared error under the :class:`Doubt`.
+        chi2, freedom: of the residuals of ln strength under the same; freedom 0 where nothing is left over to judge.
+        gain, floor: common ln gain and diffuse share; the survey's with `ls` and `lin`, which do not estimate them.
+    """
+
+    xy: Array
+    covariance: Array
+    chi2: float
+    freedom: int
+    gain: float
+    floor: float
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """Around a single lamp; ``sigma`` of the radius, m."""
+
+    x: float
+    y: float
+    radius: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """Result: places (best first; more than one only with `Why.MIRROR`), used links, shortest first."""
+
+    why: Why
+    places: tuple[Place, ...] = ()
+    circle: Circle | None = None
+    used: tuple[int, ...] = ()
+
+
+def locate(received: Received, survey: Survey, method: Method | None = None, prior: Prior | None = None) -> Located:
+    """Where the receiver is according to these strengths; never raises for bad geometry, but says what is not known.
+
+    With two links, or lamps in a line, two places fit that mirror each other: ``prior`` chooses, where it can.
+    """
+    method = Method() if method is None else method
+    links = usable(received, survey, method)
+    if method.adaptive:
+        links = links.pick(adapted(links, survey, method))
+    elif method.link_n is not None and len(links.d) > method.link_n:
+        links = links.pick(range(method.link_n))
+    used = tuple(links.at.tolist())
+    if not used:
+        return Located(Why.NONE)
+    if len(used) == 1 or spread(links.xy)[0] < SAME_M:
+        return Located(Why.CIRCLE, (), _circle(links, method.doubt), used)
+    places = [_place(links, survey, method, theta) for theta in solve(links, survey, method)]
+    return _decide(places, used, prior)
+
+
+def _decide(places: list[Place], used: tuple[int, ...], prior: Prior | None) -> Located:
+    """One place, or several that only the prior can tell apart."""
+    if not places:
+        return Located(Why.NO_FIT, used=used)
+    if len(places) == 1:
+        return Located(Why.PLACE, tuple(places), used=used)
+    if prior is None:
+        return Located(Why.MIRROR, tuple(places), used=used)
+    scores = []
+    for place in places:
+        off = place.xy - prior.xy
+        scores.append(place.chi2 + float(off @ np.linalg.solve(place.covariance + prior.covariance, off)))
+    order = np.argsort(scores, kind="stable")
+    best = tuple(places[i] for i in order if scores[i] - min(scores) < DECIDED)
+    return Located(Why.PRIOR if len(best) == 1 else Why.MIRROR, best, used=used)
+
+
+def _circle(links: Links, doubt: Doubt) -> Circle:
+    radius = float(np.sqrt(max(links.range2[0], 0.0)))
+    wide = 2.0 * links.d[0] ** 2 / links.exponent[0] * np.sqrt(links.covariance(doubt)[0, 0])  # of the squared radius
+    sigma = wide / (radius + np.sqrt(radius**2 + wide))
+    return Circle(float(links.xy[0, 0]), float(links.xy[0, 1]), radius, float(sigma))
+
+
+def _place(links: Links, survey: Survey, method: Method, theta: Array) -> Place:
+    """Uncertainty and fit at a solution."""
+    chi2 = Strengths(links, survey, method).chi2(theta)
+    covariance = expected_error(links, survey, method, theta[:2])
+    return Place(theta[:2].copy(), covariance, chi2, max(len(links.d) - 2, 0), float(theta[2]), float(theta[3]))
+
+
+__all__ = [
+    "LINK_N", "Circle", "Doubt", "Located", "Method", "Place", "Prior", "Received", "Solver", "Why", "locate",
+    "shortest", "without_floor",
+]  # fmt: skip

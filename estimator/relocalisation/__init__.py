@@ -1,0 +1,1 @@
+"""Where in the stored map the robot is, while that is in doubt."""

@@ -1,0 +1,148 @@
+"""From a scan to points: quality filter (Q, L of the paper), deskew, mount."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.measurements import Array, Beam, Scan
+from estimator.numerics import se2
+from estimator.numerics.jit import kernel
+
+HIT: int = int(Beam.HIT)
+NO_INTENSITY: Array = np.empty(0)
+
+FRESH = 64
+"""Every so many beams sine and cosine are taken afresh, so that rounding does not add up."""
+
+CHORD_M, SPARSE_M = 0.15, 0.3
+"""Length over which a point's tangent is taken: ten times the noise of a good range sensor."""
+
+
+@dataclass(slots=True, eq=False)
+class ScanPoints:
+    """Surface points of one scan in the base frame at the scan's end.
+
+    Attributes:
+        xy: (n, 2) metres, in order of measurement. origin: (x, y) of the lidar in the base frame.
+        turned_rad: yaw turned from the first to the last beam. sigma_m: one-sigma range noise.
+    """
+
+    xy: Array
+    origin: Array
+    turned_rad: float
+    sigma_m: float
+
+
+@kernel("i8(Tuple((f8[::1], f8[::1], u1[::1], f8[::1])), f8[::1], f8[::1], f8, f8, f8[:, ::1])")
+def place_beams(
+    beams: tuple[Array, Array, npt.NDArray[np.uint8], Array],
+    T_base_lidar: Array,
+    twist: Array,
+    far: float,
+    quality: float,
+    xy: Array,
+) -> int:
+    """Keep the beams that pass the filter and carry each from its own instant to the scan's end; count of points.
+
+    ``twist`` is the constant body motion over the scan; beam i of n is ``(n - 1 - i) / (n - 1)`` of it before the end.
+    Bearings of a device are evenly spaced, so their sines come from the one before by a rotation (a small difference is
+    taken by its first order, which leaves less than 1e-10; a large one afresh).
+    """
+    bearing, distance, kind, intensity = beams
+    n = len(bearing)
+    mx, my, myaw = T_base_lidar[0], T_base_lidar[1], T_base_lidar[2]
+    moving = n > 1 and (twist[0] != 0.0 or twist[1] != 0.0 or twist[2] != 0.0)
+    last = max(n - 1.0, 1.0)
+    step, turn = (bearing[n - 1] - bearing[0]) / last if n > 0 else 0.0, twist[2] / last
+    cos_step, sin_step, cos_turn, sin_turn = np.cos(step), np.sin(step), np.cos(turn), np.sin(turn)
+    even = cos_even = sin_even = c = s = 0.0
+    kept = 0
+    for i in range(n):
+        if i % FRESH == 0:
+            even, w = bearing[i] + myaw, (i - last) * turn
+            cos_even, sin_even, c, s = np.cos(even), np.sin(even), np.cos(w), np.sin(w)
+        else:
+            even += step
+            cos_even, sin_even = cos_even * cos_step - sin_even * sin_step, sin_even * cos_step + cos_even * sin_step
+            c, s = c * cos_turn - s * sin_turn, s * cos_turn + c * sin_turn
+        r = distance[i]
+        if kind[i] != HIT or not (0.0 < r <= far) or not np.isfinite(bearing[i]):
+            continue
+        if len(intensity) == n and intensity[i] < quality:
+            continue
+        d = bearing[i] + myaw - even
+        if abs(d) < 1e-5:
+            x = mx + r * (cos_even - d * sin_even)
+            y = my + r * (sin_even + d * cos_even)
+        else:
+            x, y = mx + r * np.cos(bearing[i] + myaw), my + r * np.sin(bearing[i] + myaw)
+        if moving:
+            f = (i - last) / last
+            w = f * twist[2]
+            u = f * (twist[0] - 0.5 * w * twist[1])
+            v = f * (twist[1] + 0.5 * w * twist[0])
+            x, y = u + c * x - s * y, v + s * x + c * y
+        xy[kept, 0] = x
+        xy[kept, 1] = y
+        kept += 1
+    return kept
+
+
+def points_of(scan: Scan, motion: Array, far: float, quality: float) -> ScanPoints:
+    """Filter, deskew with ``motion`` (base motion from the first to the last beam) and mount a scan.
+
+    Raises:
+        ValueError: the scan's arrays differ in length, which no device can cause.
+    """
+    n = len(scan.bearing_rad)
+    if len(scan.range_m) != n or len(scan.beam) != n:
+        raise ValueError(
+            f"scan {scan.seq} has {n} bearings, {len(scan.range_m)} ranges and {len(scan.beam)} beam kinds"
+        )
+    xy = np.empty((n, 2))
+    intensity = NO_INTENSITY if scan.intensity is None else scan.intensity
+    beams = (scan.bearing_rad, scan.range_m, scan.beam, intensity)
+    kept = place_beams(beams, scan.T_base_lidar, se2.log(motion), far, quality, xy)
+    return ScanPoints(xy[:kept], np.ascontiguousarray(scan.T_base_lidar[:2]), float(motion[2]), scan.sigma_m)
+
+
+@kernel("void(f8[:, ::1], i8, f8[:, ::1])")
+def orient(xy: Array, stride: int, out: Array) -> None:
+    """Every ``stride``-th point with the unit tangent of its surface: rows (x, y, t_x, t_y) of ``out``.
+
+    The tangent is the chord of the points around it, or of the next beams where they are sparse; it only has to tell
+    one wall of a corner from the other. It is (0, 0) where the chord is too short to say.
+    """
+    n = len(xy)
+    low = high = 0
+    for k in range(len(out)):
+        i = k * stride
+        x, y = xy[i, 0], xy[i, 1]
+        while low < i and (xy[low, 0] - x) ** 2 + (xy[low, 1] - y) ** 2 > 0.25 * CHORD_M * CHORD_M:
+            low += 1
+        high = max(high, i)
+        while high + 1 < n and (xy[high + 1, 0] - x) ** 2 + (xy[high + 1, 1] - y) ** 2 < 0.25 * CHORD_M * CHORD_M:
+            high += 1
+        a, b = low, high
+        if a == i and i > 0 and (xy[i - 1, 0] - x) ** 2 + (xy[i - 1, 1] - y) ** 2 < SPARSE_M * SPARSE_M:
+            a = i - 1
+        if b == i and i + 1 < n and (xy[i + 1, 0] - x) ** 2 + (xy[i + 1, 1] - y) ** 2 < SPARSE_M * SPARSE_M:
+            b = i + 1
+        dx, dy = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+        length = np.sqrt(dx * dx + dy * dy)
+        known = length > 0.4 * CHORD_M
+        out[k, 0], out[k, 1] = x, y
+        out[k, 2] = dx / length if known else 0.0
+        out[k, 3] = dy / length if known else 0.0
+
+
+def oriented(points: ScanPoints, most: int) -> Array:
+    """At most ``most`` of the points, evenly, with their tangents: (n, 4), see :func:`orient`."""
+    n = len(points.xy)
+    stride = max(1, -(-n // max(1, most)))
+    out = np.empty((-(-n // stride), 4))
+    orient(points.xy, stride, out)
+    return out

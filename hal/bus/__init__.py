@@ -1,0 +1,1 @@
+"""I2C buses: Linux device node, remote bus, memory bus."""

@@ -1,0 +1,1 @@
+"""Wire-true fake I2C converters and their bus, with orderable faults."""

@@ -1,0 +1,1 @@
+"""A wire-true fake HOKUYO lidar with orderable faults."""

@@ -1,0 +1,248 @@
+"""The command side of a fake sensor: lines from the host, one after the other, and their replies."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from hal.fake.lidar import info_replies, scip_encoder
+from hal.fake.lidar.commands import LINE_ENDS, SINGLES, STREAMS, Refusal, Request, letters, measure, parse
+from hal.fake.lidar.device_state import Core
+from hal.fake.lidar.dialect_grid import State, answer
+from hal.fake.lidar.measuring_head import Head
+
+MAX_LINE = 256
+"""Characters of a command line; what goes beyond is thrown away up to the line's end."""
+MAX_WAITING = 32
+"""Lines that wait for their turn; further ones are lost, as in a full input buffer."""
+REBOOT_PAIR_S = 1.0
+"""Two RB must come within this time; the reboot follows this long after the second."""
+BAUD_CHANGE_S = 0.01
+"""From the reply to SS (at the old rate) to the new rate."""
+BAUDS = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
+
+
+class Console:
+    """Reads commands and answers them in order, each after the sensor's latency.
+
+    Args:
+        core: the sensor's body. head: its measuring head. reboot: called when RB takes effect.
+    """
+
+    def __init__(self, core: Core, head: Head, reboot: Callable[[], None]) -> None:
+        self._core, self._head, self._reboot = core, head, reboot
+        self._text = bytearray()
+        self._lines: deque[bytes] = deque()
+        self._busy = False
+        self._last_rb = float("-inf")
+        self._sensitivity = b"0"
+        core.alien = lambda name: scip_encoder.reply(name.encode("ascii"), "00", self._text_body(name))
+        self._handlers: dict[str, Callable[[Request], None]] = {
+            "VV": self._ask, "PP": self._ask, "II": self._ask, "%ST": self._ask, "TM": self._time,
+            "BM": self._laser_on, "QT": self._quit, "RS": self._reset, "RT": self._reset, "RB": self._restart,
+            "SS": self._set_baud, "CR": self._set_speed, "HS": self._set_sensitivity, "%SL": self._sleep,
+            **dict.fromkeys(STREAMS, self._start_stream),
+            **dict.fromkeys(SINGLES, self._get_one),
+        }  # fmt: skip
+
+    def receive(self, data: bytes) -> None:
+        """Bytes from the host; noise when the host talks at another rate."""
+        if not self._core.at_same_rate():
+            return
+        self._text += data
+        *whole, rest = LINE_ENDS.split(bytes(self._text))
+        self._text = bytearray(rest[: MAX_LINE + 1])
+        lines = [line[: MAX_LINE + 1] for line in whole if line]
+        self._lines.extend(lines[: MAX_WAITING - len(self._lines)])
+        self._next()
+
+    def forget(self) -> None:
+        """Drop half a line and everything that waits (power off, host gone)."""
+        self._text.clear()
+        self._lines.clear()
+        self._busy = False
+        for name in ("command", "single", "reset"):
+            self._core.cancel(name)
+
+    def _next(self) -> None:
+        if self._busy or not self._lines:
+            return
+        self._busy = True
+        core = self._core
+        due = core.now() + core.model.latency_s + abs(core.chance.gauss(0.0, core.model.jitter_s))
+        core.at("command", core.clock.next_tick(due, core.model.tick_s), self._execute)
+
+    def _execute(self) -> None:
+        line = self._lines.popleft()
+        repeated = line != b"RB" and line in self._lines and self._core.state is not State.SCIP1
+        if repeated:
+            self._lines = deque(other for other in self._lines if other != line)
+        self._obey(line)
+        if repeated:
+            self._reply(line, "0B")
+
+    def _done(self) -> None:
+        self._busy = False
+        self._next()
+
+    def _reply(self, echo: bytes, status: str, body: bytes = b"") -> None:
+        """Answer the command in hand and turn to the next."""
+        lost = self._core.orders.strike("no_reply", command=letters(echo))
+        if not lost:
+            self._core.send(scip_encoder.reply(echo, status, body))
+        self._done()
+
+    def _obey(self, line: bytes) -> None:
+        core = self._core
+        if core.orders.strike("ignore", command=letters(line)):
+            return self._done()
+        if core.state is State.SCIP1:
+            return self._scip1(line)
+        request = parse(line, core.model)
+        if isinstance(request, Refusal):
+            return self._reply(line, request.status)
+        cell = answer(core.model.profile, core.state, request.name, request.parameters)
+        if cell == "--":
+            return self._done()
+        return self._handlers[request.name](request) if cell == "do" else self._reply(line, cell)
+
+    def _scip1(self, line: bytes) -> None:
+        core = self._core
+        if line == b"SCIP2.0":
+            core.state = State.IDLE
+            core.send(b"SCIP2.0\n0\n\n")
+        elif line == b"V":
+            core.send(b"V\n0\n" + info_replies.scip1(core.model, core.unit) + b"\n")
+        else:
+            core.send(line + b"\nE\n\n")
+        self._done()
+
+    def _ask(self, request: Request) -> None:
+        self._reply(request.echo, "00", self._text_body(request.name))
+
+    def _text_body(self, name: str) -> bytes:
+        core = self._core
+        variant = core.orders.on("text_sum")
+        line = scip_encoder.TEXT_SUMS[variant.text("variant") if variant else "plain"]
+        if name == "%ST":
+            return scip_encoder.summed_line(core.state.value.encode("ascii"))
+        if name == "VV":
+            pairs = info_replies.identity(core.model, core.unit, ";beta" if core.orders.on("semicolon") else "")
+        elif name == "PP":
+            fault = core.orders.on("dmax")
+            pairs = info_replies.parameters(core.model, int(fault.number("value")) if fault else core.model.dmax)
+        else:
+            pairs = info_replies.state(core.model, self._live())
+        return info_replies.lines(pairs, line)
+
+    def _live(self) -> info_replies.Live:
+        core = self._core
+        fault = core.orders.on("trouble")
+        trouble = fault.text("text") if fault else core.trouble
+        return info_replies.Live(core.state, core.laser, core.baud, core.clock.tick(core.now()), trouble)
+
+    def _time(self, request: Request) -> None:
+        core = self._core
+        if request.parameters == b"0":
+            self._stop(State.TIME_ADJUST)
+        elif request.parameters == b"2":
+            core.state = State.IDLE
+        elif core.state is not State.TIME_ADJUST and core.unit.strict_time:
+            return self._reply(request.echo, "04")
+        else:
+            stamp = scip_encoder.number(core.clock.tick(core.now()), 4)
+            return self._reply(request.echo, "00", scip_encoder.summed_line(stamp))
+        return self._reply(request.echo, "00")
+
+    def _stop(self, state: State) -> None:
+        self._head.halt()
+        self._core.dark(state)
+
+    def _laser_on(self, request: Request) -> None:
+        self._core.light(State.SINGLE)
+        self._reply(request.echo, "00")
+
+    def _quit(self, request: Request) -> None:
+        if self._core.state not in (State.BOOTING, State.TIME_ADJUST):
+            self._stop(State.IDLE)
+        self._reply(request.echo, "00")
+
+    def _sleep(self, request: Request) -> None:
+        self._stop(State.SLEEP)
+        self._reply(request.echo, "00")
+
+    def _start_stream(self, request: Request) -> None:
+        wanted = measure(request, self._core.model)
+        if isinstance(wanted, str):
+            return self._reply(request.echo, wanted)
+        self._head.halt()
+        self._core.light(State.MULTI)
+        self._head.stream(request, wanted)
+        return self._reply(request.echo, "00")
+
+    def _get_one(self, request: Request) -> None:
+        wanted = measure(request, self._core.model)
+        if isinstance(wanted, str):
+            return self._reply(request.echo, wanted)
+        return self._head.once(request, wanted, self._done)
+
+    def _reset(self, request: Request) -> None:
+        core = self._core
+        if core.state is not State.BOOTING:
+            self._stop(State.IDLE)
+
+        def complete() -> None:
+            core.clock.set(core.now())
+            self._reply(request.echo, "00")
+            if request.name == "RS":
+                self._head.turn(slower_percent=0)
+                self._sensitivity = b"0"
+                core.at("baud", core.now() + BAUD_CHANGE_S, lambda: core.use_baud(core.unit.baud))
+
+        core.at("reset", core.now() + core.model.reset_s, complete)
+
+    def _restart(self, request: Request) -> None:
+        now = self._core.now()
+        if now - self._last_rb > REBOOT_PAIR_S:
+            self._last_rb = now
+            return self._reply(request.echo, "01")
+        self._last_rb = float("-inf")
+        self._core.at("reboot", now + REBOOT_PAIR_S, self._reboot)
+        return self._reply(request.echo, "00")
+
+    def _set_baud(self, request: Request) -> None:
+        core = self._core
+        if core.model.link == "ethernet":
+            return self._reply(request.echo, "0F")
+        if not request.parameters.isdigit():
+            return self._reply(request.echo, "01")
+        baud = int(request.parameters)
+        if baud not in BAUDS:
+            return self._reply(request.echo, "02")
+        if baud == core.baud:
+            return self._reply(request.echo, "03")
+        self._reply(request.echo, "00")
+        return core.at("baud", core.now() + BAUD_CHANGE_S, lambda: core.use_baud(baud))
+
+    def _set_speed(self, request: Request) -> None:
+        """CR: 01 to 10 turn the motor 1 to 10 % slower, 00 and 99 as fast as it was made for."""
+        if not self._core.model.speeds:
+            return self._reply(request.echo, "04")
+        if not request.parameters.isdigit():
+            return self._reply(request.echo, "01")
+        code = int(request.parameters) % 99
+        if code > 10:
+            return self._reply(request.echo, "02")
+        if code == self._head.slower_percent:
+            return self._reply(request.echo, "03")
+        self._head.turn(slower_percent=code)
+        return self._reply(request.echo, "00")
+
+    def _set_sensitivity(self, request: Request) -> None:
+        """HS: kept and told apart, without effect on what is measured."""
+        if request.parameters not in (b"0", b"1"):
+            return self._reply(request.echo, "01")
+        if request.parameters == self._sensitivity:
+            return self._reply(request.echo, "02")
+        self._sensitivity = request.parameters
+        return self._reply(request.echo, "00")

@@ -1,0 +1,137 @@
+"""Follow a running stream: frames to scans, and a watch over all the ways in which a stream can go wrong."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Final
+
+from hal.clock import Clock
+from hal.errors import DataInvalid, DeviceFault, HalError
+from hal.hokuyo import scip
+from hal.hokuyo.scip import BadFrame, Reply, parse_reply
+from hal.hokuyo.scip_line import Line
+from hal.hokuyo.session import FIRST_SCAN_S, explain_status
+from hal.hokuyo.stream import ScanStream
+from hal.lidar import LidarStatus, RawScan
+
+_PATIENCE_S: Final = 1.0
+_PATIENCE_PERIODS: Final = 10
+_LOOK_S: Final = 0.25
+_SELF_CHECK_S: Final = 10.0  # a sensor that stopped to verify an error (status 21 to 49) takes seconds
+_WATCH_CABLE: Final = "check its cable and power; it is restarted by itself"
+
+
+class Follower:
+    """Takes the frames of one stream.
+
+    Args:
+        stream: decodes and times. line: whose port it is. clock: tells how long nothing has come.
+        status: counters and the latest error are kept there. on_scan: gets every valid scan.
+    """
+
+    def __init__(
+        self, stream: ScanStream, line: Line, clock: Clock, status: LidarStatus, on_scan: Callable[[RawScan], None]
+    ) -> None:
+        self._stream = stream
+        self._line = line
+        self._clock = clock
+        self._status = status
+        self._on_scan = on_scan
+        self._trouble: asyncio.Future[HalError] = asyncio.get_running_loop().create_future()
+        self._deadline = clock.now() + FIRST_SCAN_S
+        self._dropped = line.dropped_bytes
+        self._damaged = ""
+        self.scans = 0
+
+    @property
+    def has_scans(self) -> bool:
+        """True once a valid scan has come."""
+        return self.scans > 0
+
+    def take(self, frame: bytes, t_rx: float) -> None:
+        """One frame, as the line hands it over."""
+        self._note_dropped()
+        try:
+            reply = parse_reply(frame)
+            if reply.status == scip.DATA:
+                self._take_data(reply, t_rx)
+            elif reply.echo[:2] == self._stream.request.echo[:2]:
+                self._take_notice(reply)
+        except BadFrame as error:
+            self._reject(str(error))
+
+    async def watch(self) -> None:
+        """Return never; raise what ends the stream.
+
+        Raises:
+            DeviceMissing: the port has gone. DeviceFault: silence, a stuck clock, a status of trouble.
+            DataInvalid: frames come, but none is good.
+        """
+        self._line.when_lost(self._tell_lost)
+        try:
+            while True:
+                left = self._deadline - self._clock.now()
+                if left <= 0:
+                    raise self._silence()
+                await asyncio.wait({self._trouble}, timeout=min(left, _LOOK_S))
+                if self._trouble.done():
+                    raise self._trouble.result()
+        finally:
+            self._line.when_lost(None)
+
+    def _take_data(self, reply: Reply, t_rx: float) -> None:
+        status = self._status
+        seq = status.scans + status.invalid
+        scan = self._stream.take(reply, t_rx, seq)
+        if scan is None:
+            self._reject("a stamp that does not continue the sensor's clock")
+            if self._stream.stuck:
+                self._end(DeviceFault(self._line.port.name, "repeats one scan for ever (its clock stands)"))
+            return
+        status.scans += 1
+        status.error = None
+        self.scans += 1
+        self._damaged = ""
+        self._deadline = t_rx + max(_PATIENCE_S, _PATIENCE_PERIODS * self._stream.period_s)
+        self._on_scan(scan)
+
+    def _take_notice(self, reply: Reply) -> None:
+        """A status inside the stream: acknowledgement, self-check, trouble."""
+        if reply.status in (scip.ACCEPTED, scip.RESUMED, "0B", "0M"):
+            return
+        if reply.status.isdigit() and 21 <= int(reply.status) <= 49:
+            self._deadline = max(self._deadline, self._clock.now() + _SELF_CHECK_S)
+            self._status.error = explain_status(self._line.port.name, "stream", reply.status)
+            return
+        self._end(explain_status(self._line.port.name, "stream", reply.status))
+
+    def _reject(self, why: str) -> None:
+        self._status.invalid += 1
+        self._damaged = why
+        self._status.error = DataInvalid(self._line.port.name, f"a frame was dropped: {why}")
+
+    def _note_dropped(self) -> bool:
+        dropped = self._line.dropped_bytes
+        if dropped == self._dropped:
+            return False
+        self._dropped = dropped
+        self._status.resyncs += 1
+        return True
+
+    def _silence(self) -> HalError:
+        name = self._line.port.name
+        if self._note_dropped() and not self._damaged:
+            return DataInvalid(name, "only unreadable bytes come", "check its cable and, on RS-232, the line rate")
+        if self._damaged:
+            return DataInvalid(name, f"only damaged frames come ({self._damaged})", _WATCH_CABLE)
+        what = "has fallen silent" if self.scans else f"sends no scan within {FIRST_SCAN_S:g} s"
+        return DeviceFault(name, what, _WATCH_CABLE)
+
+    def _tell_lost(self) -> None:
+        if self._line.lost is not None:
+            self._end(self._line.lost)
+
+    def _end(self, error: HalError) -> None:
+        if not self._trouble.done():
+            self._trouble.set_result(error)

@@ -1,0 +1,1 @@
+"""Sockets: addresses, receive timestamps, odometry and IMU datagrams."""

@@ -1,0 +1,142 @@
+"""Internet addresses and sockets that this computer listens on; errors say what to do."""
+
+from __future__ import annotations
+
+import errno
+import socket
+from functools import partial
+from typing import Any, Final
+
+from hal.blocking_calls import beside
+from hal.errors import DeviceMissing, DeviceRefused, HalError
+
+Address = tuple[socket.AddressFamily, tuple[str, int] | tuple[str, int, int, int]]
+"""Family and what `bind` and `sendto` take; the longer one names the network interface (IPv6 scope), flow 0."""
+
+PRIVILEGED: Final = 1024
+
+
+def scope(address: Address) -> int:
+    """Number of the network interface that an address names, 0: none."""
+    where = address[1]
+    return where[3] if len(where) == 4 else 0
+
+
+def with_port(address: Address, port: int) -> Address:
+    """The same address with another port."""
+    family, where = address
+    return family, (where[0], port) if len(where) == 2 else (where[0], port, where[2], where[3])
+
+
+def _addresses(found: list[Any], index: int = 0) -> list[Address]:
+    """Addresses without repetitions; ``index``: of the interface, where the name had told one."""
+    addresses: list[Address] = []
+    for family, _, _, _, (host, port, *more) in found:
+        interface = index or (more[1] if more else 0)
+        where = (str(host), int(port), 0, interface) if family == socket.AF_INET6 and interface else (host, int(port))
+        addresses.append((family, where))
+    return list(dict.fromkeys(addresses))
+
+
+def _interface(host: str) -> tuple[str, int]:
+    """A host without its interface, and the number of that, 0: none (RFC 4007, 11).
+
+    The system's own look-up knows interfaces by name only behind addresses of one link, not behind groups of a site.
+
+    Raises:
+        OSError: there is no such interface (now).
+    """
+    bare, percent, name = host.partition("%")
+    if not percent:
+        return host, 0
+    return bare, int(name) if name.isascii() and name.isdigit() else socket.if_nametoindex(name)
+
+
+def _interfaces() -> str:
+    """Names of this computer's network interfaces, or how to find them."""
+    try:
+        return ", ".join(name for _, name in socket.if_nameindex())
+    except OSError:  # the service manager's RestrictAddressFamilies= leaves netlink out
+        return "ip link"
+
+
+def numeric(host: str, port: int, flags: int = 0) -> list[Address]:
+    """Addresses of a numeric host, without any look-up; none where it is a name, or names an interface not there."""
+    try:
+        bare, index = _interface(host)
+        flags |= socket.AI_NUMERICHOST
+        return _addresses(socket.getaddrinfo(bare or None, port, type=socket.SOCK_DGRAM, flags=flags), index)
+    except (OSError, UnicodeError):  # what getaddrinfo says of names, and of what cannot be one
+        return []
+
+
+async def resolve(host: str, port: int, *, passive: bool = False) -> list[Address]:
+    """Addresses of a host; a numeric one is never looked up, a name is looked up beside the event loop.
+
+    Args:
+        host: name or numeric address; empty with `passive`: every address of this computer.
+        port: goes into the addresses unchanged.
+        passive: whether the addresses are to be listened on.
+
+    Raises:
+        DeviceMissing: the name is not known (now) or cannot be one, or there is no such network interface.
+    """
+    flags = socket.AI_PASSIVE if passive else 0
+    if found := numeric(host, port, flags):
+        return found
+    try:
+        _interface(host)
+    except OSError as error:
+        problem = f"no network interface {host.partition('%')[2]} on this computer"
+        raise DeviceMissing(f"{host}:{port}", problem, f"name one that there is: {_interfaces()}") from error
+    look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_DGRAM, flags=flags)
+    try:
+        return _addresses(await beside(look_up, "names"))
+    except UnicodeError as error:
+        remedy = "its labels, between dots, have 1 to 63 characters each"
+        raise DeviceMissing(f"{host}:{port}", "not a host name", remedy) from error
+    except socket.gaierror as error:
+        remedy = "write a numeric address, or make the name resolvable on this computer"
+        raise DeviceMissing(f"{host}:{port}", f"host name not known: {error.strerror}", remedy) from error
+
+
+def listening(address: Address, kind: socket.SocketKind) -> socket.socket:
+    """A bound, non-blocking socket (an IPv6 one takes IPv6 only). Raises OSError, see :func:`refusal`."""
+    family, where = address
+    # asyncio switches Nagle's algorithm off only on sockets that were made with their protocol's number
+    protocol = socket.IPPROTO_TCP if kind == socket.SOCK_STREAM else socket.IPPROTO_UDP
+    sock = socket.socket(family, kind, protocol)
+    try:
+        sock.setblocking(False)
+        if kind == socket.SOCK_STREAM:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        sock.bind(where)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def refusal(device: str, option: str, port: int, error: OSError) -> HalError:
+    """The error to raise when a socket cannot be listened on.
+
+    Args:
+        device: what was to be opened, as a person knows it (``Modbus on 127.0.0.1:1502``).
+        option: configuration key of the port, named in the remedy.
+        port: the number that was asked for.
+        error: what the operating system said.
+    """
+    if error.errno == errno.EADDRINUSE:
+        return DeviceRefused(device, "the port is in use", f"stop the other program, or choose another {option}")
+    if error.errno in (errno.EACCES, errno.EPERM) and 0 < port < PRIVILEGED:
+        remedy = (
+            f"ports below {PRIVILEGED} need a capability: choose another {option} (Modbus: 1502), or give the service "
+            "AmbientCapabilities=CAP_NET_BIND_SERVICE"
+        )
+        return DeviceRefused(device, "permission denied", remedy)
+    if error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
+        remedy = "set bind to an address of this computer (0.0.0.0: all, 127.0.0.1: this computer only)"
+        return DeviceMissing(device, "this computer does not have that address", remedy)
+    return DeviceRefused(device, error.strerror or str(error), "see the system's log")

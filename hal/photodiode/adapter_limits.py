@@ -1,0 +1,144 @@
+"""What an adapter can do: how long a read it carries through without a pause, and at which SCL.
+
+Lengths are tried upwards, so that an adapter is never asked for far more than it can do (some need a time-out to find
+that out, and the transaction after it fails as well). A length is good when it comes without an error and takes no
+longer than theory: adapters behind USB read in pieces and let SCL rest between them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+from dataclasses import dataclass
+from statistics import median
+from typing import Final
+
+from hal.bus.i2c import MAX_LENGTH, AsyncBus, read
+from hal.errors import DeviceRefused
+from hal.photodiode.timebase import SHORT, scl_hz
+
+LENGTHS: Final = (60, 512, 2048, MAX_LENGTH)
+_REPEATS: Final = {SHORT: 16, 60: 8, 512: 5}
+_REPEATS_LONG: Final = 3
+_PAUSE: Final = 0.03
+"""Longer than theory by more than this share: the adapter pauses inside."""
+_UNFIT: Final = {
+    "i2c-gpio": "the processor clocks this bus bit by bit, and is interrupted",
+    "FT260": "USB: it reads 60 bytes at a time and pauses",
+    "MCP2221": "USB: it reads 60 bytes at a time and pauses",
+    "CP2112": "USB: it reads 61 bytes at a time and pauses",
+    "CH341": "USB: it reads 32 bytes at a time and pauses",
+}
+"""Adapters by a part of their names, whose samples are not evenly spaced: good for levels, not for decoding lights."""
+_LIMITS: Final = frozenset({errno.EOPNOTSUPP, errno.EINVAL, errno.ETIMEDOUT, errno.EIO, errno.EPROTO})
+_PASSING: Final = frozenset({errno.ENXIO, errno.EREMOTEIO, errno.EAGAIN, errno.EIO})
+_FAILURES: Final = 3
+_AGAIN_S: Final = 0.01
+_SCL_HZ: Final = (10e3, 5e6)
+
+
+@dataclass(frozen=True, slots=True)
+class Capability:
+    """What was found.
+
+    Attributes:
+        length: bytes of the blocks to read. span_s, short_s: shortest read of that length, and of 2 bytes.
+        spread_s: by how much a 2-byte read is longer than the shortest, median.
+        limit: why blocks are shorter than wanted, or not even; empty if they are neither.
+    """
+
+    length: int
+    span_s: float
+    short_s: float
+    spread_s: float = 0.0
+    limit: str = ""
+
+    @property
+    def scl_hz(self) -> float:
+        """SCL frequency as measured."""
+        return scl_hz(self.length, self.span_s, self.short_s)
+
+
+async def _spans(bus: AsyncBus, address: int, length: int) -> list[float]:
+    """Spans of several reads, the shortest first; raises `OSError` if one fails again and again."""
+    spans: list[float] = []
+    failures = 0
+    while len(spans) < _REPEATS.get(length, _REPEATS_LONG):
+        try:
+            done = await bus.transfer((read(address, length),))
+            if len(done.reads[0]) < length:
+                raise OSError(errno.EIO, f"{len(done.reads[0])} of {length} bytes")
+            spans.append(done.t1 - done.t0)
+            failures = 0
+        except OSError as error:
+            failures += 1
+            if error.errno not in _PASSING or failures > _FAILURES:
+                raise
+            await asyncio.sleep(_AGAIN_S)
+    return sorted(spans)
+
+
+async def measure(bus: AsyncBus, address: int, block_s: float) -> Capability:
+    """Find the longest read up to ``block_s`` seconds that comes through without a pause.
+
+    Raises:
+        OSError: already short reads fail. DeviceRefused: the adapter cannot even read 60 bytes in one go.
+    """
+    shorts = await _spans(bus, address, SHORT)
+    short_s, spread_s = shorts[0], median(shorts) - shorts[0]
+    found: Capability | None = None
+    limit = ""
+    for length in LENGTHS:
+        if found is not None:
+            length = min(length, _wanted(block_s, found.scl_hz))
+            if length <= found.length:
+                break
+        tried, limit = await _try(bus, address, length, short_s, found)
+        if tried is None:
+            break
+        found = tried
+    if found is None:
+        raise DeviceRefused(
+            bus.name,
+            f"adapter {bus.about} cannot read {LENGTHS[0]} bytes in one go ({limit})",
+            "end what else reads on this bus; if nothing does, use an I2C controller of the processor itself",
+        )
+    wanted = min(_wanted(block_s, found.scl_hz), MAX_LENGTH)
+    shorter = limit if found.length < wanted else ""
+    unfit = next((why for name, why in _UNFIT.items() if name in bus.about), "")
+    return Capability(found.length, found.span_s, short_s, spread_s, "; ".join(filter(None, (unfit, shorter))))
+
+
+def _wanted(block_s: float, hz: float) -> int:
+    """Bytes of whole words that fill ``block_s``."""
+    return 2 * max(2, round(block_s * hz / 18.0))
+
+
+async def _try(
+    bus: AsyncBus, address: int, length: int, short_s: float, before: Capability | None
+) -> tuple[Capability | None, str]:
+    """One length: what it shows, or None and why it is too long."""
+    try:
+        span, *_ = await _spans(bus, address, length)
+    except OSError as error:
+        if error.errno not in _LIMITS:
+            raise
+        await _calm(bus, address)
+        return None, f"{length} bytes: {os.strerror(error.errno or 0)}"
+    tried = Capability(length, span, short_s)
+    if not _SCL_HZ[0] < tried.scl_hz < _SCL_HZ[1]:
+        return None, f"{length} bytes in {1e3 * span:.2f} ms, 2 bytes in {1e3 * short_s:.2f} ms"
+    if before is not None and tried.scl_hz < (1.0 - _PAUSE) * before.scl_hz:
+        return None, f"it pauses inside {length} bytes"
+    return tried, ""
+
+
+async def _calm(bus: AsyncBus, address: int) -> None:
+    """A short read after a failed long one: it makes a STOP, and may itself fail once."""
+    for _ in range(2):
+        try:
+            await bus.transfer((read(address, SHORT),))
+            return
+        except OSError:
+            continue

@@ -1,0 +1,126 @@
+"""A bus that is listened to: silence shows after five blocks, whatever it is that keeps quiet."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import Final
+
+from hal.adc import BusStuck
+from hal.bus.i2c import NACKS, AsyncBus, Message, OnRead, Transferred
+from hal.errors import DeviceFault, HalError
+
+BLOCKS: Final = 5
+FLOOR_S: Final = 0.1
+"""Silence is not told before this, however short the blocks are."""
+HANG_S: Final = 3.0
+"""Without any transaction coming back for this long, one hangs in the kernel: whatever can time out has done so."""
+
+Explain = Callable[[OSError], HalError]
+OnSilence = Callable[[HalError, bool], None]
+"""What is wrong, and whether that is certain: a first silence may be over before anybody needs to read of it."""
+
+
+class WatchedBus:
+    """A :class:`hal.bus.i2c.AsyncBus` around another.
+
+    Args:
+        bus: the other. block_s: length of blocks.
+        explain: what an error of a transaction means. on_silence: told of silence and of its cause.
+    """
+
+    def __init__(self, bus: AsyncBus, block_s: float, explain: Explain, on_silence: OnSilence) -> None:
+        self._bus, self._patience_s = bus, max(FLOOR_S, BLOCKS * block_s)
+        self._explain, self._on_silence = explain, on_silence
+        self._loop = asyncio.get_running_loop()
+        self._t_read = self._t_back = self._loop.time()
+        self._failure: OSError | None = None
+        self._heard = asyncio.Event()
+        self._heard.set()
+
+    @property
+    def name(self) -> str:
+        """See :attr:`hal.bus.i2c.Bus.name`."""
+        return self._bus.name
+
+    @property
+    def about(self) -> str:
+        """See :attr:`hal.bus.i2c.Bus.about`."""
+        return self._bus.about
+
+    async def transfer(self, messages: tuple[Message, ...]) -> Transferred:
+        """Carry out one transaction; raises `OSError`."""
+        try:
+            done = await self._bus.transfer(messages)
+        except OSError as error:
+            if error.errno in NACKS and messages[0].data:  # a chip without registers says so in this way
+                self._came_back()
+            else:
+                self._failed(error)
+            raise
+        self._came_back()
+        return done
+
+    async def stream(self, messages: tuple[Message, ...], on_read: OnRead) -> None:
+        """Repeat one transaction until cancelled; raises `OSError`."""
+
+        def pass_on(done: Transferred, dropped: int) -> None:
+            self._came_back()
+            on_read(done, dropped)
+
+        try:
+            await self._bus.stream(messages, pass_on)
+        except OSError as error:
+            self._failed(error)
+            raise
+
+    async def close(self) -> None:
+        """Close; idempotent."""
+        await self._bus.close()
+
+    async def listen(self) -> None:
+        """Tell of silence until cancelled."""
+        while True:
+            left = self._t_read + self._patience_s - self._loop.time()
+            if left > 0.0:
+                await asyncio.sleep(left)
+                continue
+            self._heard.clear()
+            failure = self._failure
+            self._on_silence(self._explain(failure) if failure else self._say_silent(), failure is not None)
+            await self._until_heard()
+
+    async def _until_heard(self) -> None:
+        hangs = False
+        while not self._heard.is_set():
+            left = self._t_back + HANG_S - self._loop.time()
+            if left <= 0.0 and not hangs:
+                hangs = True
+                self._on_silence(self._say_hang(), True)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._heard.wait(), None if hangs else left)
+
+    def _came_back(self) -> None:
+        self._t_read = self._t_back = self._loop.time()
+        self._failure = None
+        self._heard.set()
+
+    def _failed(self, error: OSError) -> None:
+        self._t_back, self._failure = self._loop.time(), error
+        if not self._heard.is_set():
+            self._on_silence(self._explain(error), True)
+
+    def _say_silent(self) -> HalError:
+        return DeviceFault(
+            self.name,
+            f"nothing has been read for {BLOCKS} blocks",
+            "it is tried again by itself; if that lasts, look at the wiring and into the kernel log",
+        )
+
+    def _say_hang(self) -> HalError:
+        return BusStuck(
+            self.name,
+            f"a transaction has not returned for {HANG_S:g} s",
+            "the adapter's driver hangs: unbind and bind it, or restart the computer",
+        )

@@ -1,0 +1,1 @@
+"""Byte ports: serial, TCP, memory; opening and recovery."""

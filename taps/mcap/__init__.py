@@ -1,0 +1,1 @@
+"""MCAP files: live recording, conversion of recordings, recovery of cut files."""

@@ -1,0 +1,95 @@
+"""`lumiloop record-mcap OUT.mcap`: what a running daemon tells, as an MCAP file of ROS 2 messages, until interrupted.
+
+It ends while the disk still has room for the daemon's maps (``--reserve``). A recorder that is killed leaves a file
+without an index, which lacks at most half a second; `lumiloop export FILE.mcap --mcap WHOLE.mcap` makes a whole one of
+it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import Final
+
+from daemon.cli import parser
+from daemon.config.schema import Config
+from hal.run_server import work_until_told
+from taps.mcap.writer import FLUSH_S, McapFile, NoRoom
+from taps.ros.messages import Translator
+from taps.stream.client import Lost, Stream
+from taps.stream.messages import Hello, NotTheStream
+
+TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    if args.out.exists() and not args.force:
+        return parser.fail(f"{args.out} is there already; name another file, or replace it with --force", parser.USAGE)
+    if not args.out.parent.is_dir():
+        return parser.fail(
+            f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", parser.USAGE
+        )
+    stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
+    file = None
+    try:
+        with McapFile(args.out, reserve=round(args.reserve * (1 << 20))) as file:
+            asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))
+    except NotTheStream as error:
+        return parser.fail(str(error))
+    except NoRoom as error:
+        whole = "the file is whole up to here; " if file is not None and file.messages else ""
+        return parser.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
+    except OSError as error:
+        return parser.fail(f"{args.out}: {error.strerror}; free space or name another file")
+    finally:
+        if file is not None and not file.messages:
+            _leave_none(args.out)
+    if not file.messages:
+        return parser.fail("nothing was told, and no file is left; is the daemon running?")
+    parser.say(f"{args.out}: {file.messages} messages")
+    return parser.OK
+
+
+def _leave_none(path: Path) -> None:
+    """An empty file is worth nothing, and who keeps so many of the latest files would give up a full one for it."""
+    if path.is_file():  # and no device
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+async def record(stream: Stream, settings: Config, file: McapFile) -> None:
+    """Write all that is told, until cancelled.
+
+    Raises:
+        NotTheStream: the other end is no daemon of this version.
+        OSError: the file cannot be written.
+        NoRoom: its disk has no room but what is to stay free.
+    """
+    translator = Translator(settings.lidar.mount)
+    flushing = asyncio.ensure_future(_flush(file))
+    try:
+        async with contextlib.aclosing(stream.frames()) as frames:
+            async for frame in frames:
+                if isinstance(frame, Lost):
+                    parser.say(f"{frame.text}; waiting")
+                elif isinstance(frame, Hello):
+                    parser.say(f"recording {frame.name} into {file.path}")
+                    translator = Translator(settings.lidar.mount)
+                else:
+                    for out in translator.take(frame):
+                        file.write(out)
+    finally:
+        flushing.cancel()
+        await asyncio.gather(flushing, return_exceptions=True)
+
+
+async def _flush(file: McapFile) -> None:
+    """What has been told reaches the kernel also when nothing more comes."""
+    while True:
+        await asyncio.sleep(FLUSH_S)
+        if file.waiting:
+            with contextlib.suppress(NoRoom):  # the next message says it
+                file.flush()

@@ -1,0 +1,1 @@
+"""Prometheus metrics and the VDA 5050 position object over HTTP."""

@@ -1,0 +1,196 @@
+"""What the daemon tells, as Prometheus reads it: text exposition format 0.0.4. Records in, text out, no I/O."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+
+from daemon.snapshot import LinkUse, Part, Stage, State
+from taps.stream.client import Lost
+from taps.stream.messages import Faults, Frame, Hello, Lights, Pose, Statistics
+
+OLD_S: Final = 3.0
+"""A daemon that has told no pose for so long does not know where the robot is; without any word it stands."""
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+_QUANTILES: Final = ("0.5", "0.99", "1")
+_COUNTERS: Final = {
+    "cycles": "cycles of the estimate",
+    "overruns": "cycles that took longer than their budget",
+    "scans": "scans received",
+    "scans_missed": "scans lost",
+    "scans_invalid": "scans received and unusable",
+    "scans_dropped": "scans that a later one replaced",
+    "resyncs": "times the lidar's bytes were searched for a new beginning",
+    "reconnects": "times the lidar was opened again",
+    "blocks": "blocks of photodiode samples",
+    "blocks_lost": "of those, of no use",
+    "odometry_jumps": "jumps of wheel odometry",
+    "jobs_failed": "background jobs that failed",
+}
+Labels = dict[str, str]
+Sample = tuple[Labels, float]
+
+
+@dataclass(slots=True)
+class Told:
+    """The latest of everything.
+
+    Attributes:
+        up: whether the daemon is there. held: the last frame with a pose of this run of it, also when it has gone.
+        t_heard: when the latest pose came. t_spoke: when anything came.
+    """
+
+    up: bool = False
+    hello: Hello | None = None
+    pose: Pose | None = None
+    held: Pose | None = None
+    lights: Lights | None = None
+    faults: Faults | None = None
+    statistics: Statistics | None = None
+    t_heard: float = -math.inf
+    t_spoke: float = -math.inf
+
+    def answers(self, now: float) -> bool:
+        """Whether the daemon is there and speaks; one that stands keeps its connection, and says nothing."""
+        return self.up and now - self.t_spoke <= OLD_S
+
+    def latest(self, now: float) -> Pose | None:
+        """The pose told last; once the daemon has gone, or stood for :data:`OLD_S`, without a place in the map."""
+        if self.pose is not None and now - self.t_heard <= OLD_S:
+            return self.pose
+        return None if self.held is None else msgspec.structs.replace(self.held, pose=None)
+
+    def take(self, frame: Frame | Lost, now: float) -> None:
+        """Take one in, at ``now`` of our own clock (CLOCK_MONOTONIC, which is also the daemon's)."""
+        self.t_spoke = now
+        match frame:
+            case Lost():
+                self.up, self.pose, self.lights, self.faults, self.statistics = False, None, None, None, None
+            case Hello():  # of another run: where the one before lost its pose says nothing of where the robot is now
+                self.up, self.hello, self.held = True, frame, None
+            case Pose():
+                self.pose, self.t_heard = frame, now
+                self.held = frame if frame.pose is not None else self.held
+            case Lights():
+                self.lights = frame
+            case Faults():
+                self.faults = frame
+            case Statistics():
+                self.statistics = frame
+            case _:
+                return
+
+
+def exposition(told: Told, now: float) -> str:
+    """Every series, with help and type."""
+    return "".join(_family(*family) for family in _families(told, now))
+
+
+def _families(told: Told, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
+    answers = told.answers(now)
+    yield "lumiloop_up", "gauge", "whether the daemon answers", [({}, float(answers))]
+    if not answers:
+        return
+    if told.hello is not None:
+        yield "lumiloop_info", "gauge", "name of the robot", [({"robot": told.hello.name}, 1.0)]
+    if told.pose is not None:
+        yield from _of_pose(told.pose, now)
+    if told.lights is not None and told.lights.t_mono is not None:
+        yield from _of_lights(told.lights)
+    if told.faults is not None:
+        present = [({"fault": str(one.fault), "meaning": one.meaning}, 1.0) for one in told.faults.present]
+        yield "lumiloop_fault", "gauge", "1 for each fault that is present", present
+        yield "lumiloop_faults_present", "gauge", "how many are", [({}, float(len(present)))]
+    if told.statistics is not None:
+        yield from _of_statistics(told.statistics)
+
+
+def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
+    states = [({"state": state.name}, float(state == pose.state)) for state in State]
+    yield "lumiloop_state", "gauge", "1 for the state that is", states
+    yield "lumiloop_pose_age_seconds", "gauge", "since the instant that the pose is true for", [({}, now - pose.t_mono)]
+    if pose.pose is not None:
+        x, y, yaw = pose.pose
+        place = [({"axis": "x"}, x), ({"axis": "y"}, y)]
+        yield "lumiloop_pose_metres", "gauge", "the pose in the map", place
+        yield "lumiloop_pose_yaw_radians", "gauge", "its heading", [({}, yaw)]
+    if pose.covariance is not None:
+        xx, _, yy, _, _, turn = (max(0.0, value) for value in pose.covariance)
+        sigma = [({"axis": "x"}, math.sqrt(xx)), ({"axis": "y"}, math.sqrt(yy))]
+        yield "lumiloop_pose_sigma_metres", "gauge", "its deviation", sigma
+        yield "lumiloop_pose_sigma_yaw_radians", "gauge", "that of its heading", [({}, math.sqrt(turn))]
+    known = [({"axis": axis}, float(so)) for axis, so in zip(("x", "y", "yaw"), pose.known, strict=True)]
+    yield "lumiloop_axis_known", "gauge", "whether an axis is observed", known
+    if pose.trust.horizontal_m is not None:
+        level: list[Sample] = [({}, pose.trust.horizontal_m)]
+        yield "lumiloop_protection_level_metres", "gauge", "bound on the error of the pose", level
+    yield "lumiloop_alert", "gauge", "the bound is above its limit, or there is none", [({}, float(pose.trust.alert))]
+    yield "lumiloop_jumps_total", "counter", "jumps of the map pose", [({}, float(pose.jumps))]
+    yield "lumiloop_loops_total", "counter", "loop closures", [({}, float(pose.loop_counter))]
+    if pose.scan_rate is not None:
+        yield "lumiloop_scan_rate_hertz", "gauge", "scans a second", [({}, pose.scan_rate)]
+    if pose.pulse is not None:
+        yield "lumiloop_rung", "gauge", "what is left out for lack of time", [({}, float(pose.pulse.rung))]
+        yield "lumiloop_stalls_total", "counter", "times no cycle began in time", [({}, float(pose.pulse.stalls))]
+        yield "lumiloop_cycle_seconds", "gauge", "computing time of recent cycles", _spread(pose.pulse.cycle)
+        yield "lumiloop_late_seconds", "gauge", "how late recent cycles began", _spread(pose.pulse.late)
+        stages = [
+            ({"stage": stage.name.lower(), **labels}, value)
+            for stage, spread in zip(Stage, pose.pulse.stages, strict=False)
+            for labels, value in _spread(spread)
+        ]
+        yield "lumiloop_stage_seconds", "gauge", "computing time of each stage", stages
+    if pose.condition is not None:
+        restarts = [
+            ({"part": part.name.lower()}, float(n)) for part, n in zip(Part, pose.condition.restarts, strict=False)
+        ]
+        yield "lumiloop_part_restarts_total", "counter", "restarts of a part", restarts
+
+
+def _of_lights(lights: Lights) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
+    uses = [link.use for link in lights.links]
+    counted = [({"use": use.name.lower()}, float(uses.count(use))) for use in LinkUse]
+    yield "lumiloop_links", "gauge", "lamps in view, by what they are used for", counted
+    lamps = [
+        ({"lamp": str(link.lamp_id), "code": str(link.code)}, link.residual)
+        for link in lights.links
+        if link.lamp_id is not None and link.residual is not None
+    ]
+    yield "lumiloop_lamp_residual", "gauge", "ln of received over expected", lamps
+
+
+def _of_statistics(statistics: Statistics) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
+    for name, what in _COUNTERS.items():
+        value = getattr(statistics, name)
+        if value is not None:
+            yield f"lumiloop_{name}_total", "counter", what, [({}, float(value))]
+    yield "lumiloop_uptime_seconds", "gauge", "since the daemon's start", [({}, statistics.uptime)]
+    yield "lumiloop_resident_memory_bytes", "gauge", "memory of the daemon", [({}, 1e6 * statistics.memory_mb)]
+
+
+def _spread(spread: tuple[int, int, int] | None) -> list[Sample]:
+    if spread is None:
+        return []
+    return [({"quantile": q}, 1e-6 * value) for q, value in zip(_QUANTILES, spread, strict=True)]
+
+
+def _family(name: str, kind: str, what: str, samples: Iterable[Sample]) -> str:
+    lines = [f"{name}{_labels(labels)} {_number(value)}\n" for labels, value in samples]
+    return f"# HELP {name} {what}\n# TYPE {name} {kind}\n{''.join(lines)}" if lines else ""
+
+
+def _labels(labels: Labels) -> str:
+    told = ",".join(f'{key}="{_escaped(value)}"' for key, value in labels.items())
+    return f"{{{told}}}" if told else ""
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}" if math.isfinite(value) else "NaN" if math.isnan(value) else "+Inf" if value > 0 else "-Inf"

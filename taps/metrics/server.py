@@ -1,0 +1,142 @@
+"""`lumiloop metrics`: Prometheus' /metrics and VDA 5050's position object, over HTTP, on this computer only by default.
+
+A server of its own in a few lines: two documents that are made when somebody asks, one request a connection.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import time
+from typing import Final
+
+from daemon.cli import parser
+from daemon.config.endpoints import in_url, parse_endpoint
+from hal.run_server import work_until_told
+from taps.metrics import vda5050
+from taps.metrics.metrics import CONTENT_TYPE, Told, exposition
+from taps.stream.client import Stream
+from taps.stream.messages import NotTheStream
+from taps.view.access_guard import Guard
+
+LONGEST_REQUEST: Final = 8192
+PATIENCE_S: Final = 5.0
+CLIENTS: Final = 32
+TOPICS: Final = ("pose", "lights", "faults", "statistics")
+_JSON: Final = "application/json"
+_REASONS: Final = {
+    200: "OK",
+    400: "Bad Request",
+    403: "Forbidden",
+    404: "Not Found",
+    405: "Method Not Allowed",
+    503: "Service Unavailable",
+}
+INDEX: Final = "/metrics: Prometheus\n/vda5050: position, version 3\n/vda5050/2: position, version 2\n"
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command's body; returns the exit code."""
+    try:
+        host, port = parse_endpoint(args.listen)
+        stream = Stream(args.stream or args.settings.name, TOPICS)
+        asyncio.run(work_until_told(serve(stream, host, port)))
+    except ValueError as error:
+        return parser.fail(f"--listen: {error}", parser.USAGE)
+    except NotTheStream as error:
+        return parser.fail(str(error))
+    except OSError as error:
+        return parser.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
+    return parser.OK
+
+
+async def serve(stream: Stream, host: str, port: int) -> None:
+    """Listen to the daemon and answer until cancelled.
+
+    Raises:
+        OSError: it cannot be listened there. NotTheStream: the other end is no daemon of this version.
+    """
+    told = Told()
+    answering = Answering(told, Guard(bind=host))
+    server = await asyncio.start_server(answering, host, port, limit=LONGEST_REQUEST)
+    parser.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
+    try:
+        async with contextlib.aclosing(stream.frames()) as frames:
+            async for frame in frames:
+                told.take(frame, time.monotonic())
+    finally:
+        server.close()
+
+
+class Answering:
+    """Answers requests of what has been told; not those that somebody's web page makes a browser here send."""
+
+    def __init__(self, told: Told, guard: Guard) -> None:
+        self._told, self._guard = told, guard
+        self._clients = 0
+
+    async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One request; whoever sends none in time, or is one too many, is let go."""
+        self._clients += 1
+        try:
+            if self._clients <= CLIENTS:
+                async with asyncio.timeout(PATIENCE_S):
+                    request = await reader.readuntil(b"\r\n\r\n")
+                    writer.write(self._answer(request))
+                    await writer.drain()
+        except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
+            return
+        finally:
+            self._clients -= 1
+            writer.close()
+
+    def _answer(self, request: bytes) -> bytes:
+        words = request.partition(b"\r\n")[0].decode("latin-1").split(" ")
+        if len(words) != 3 or not words[2].startswith("HTTP/1."):
+            return _response(400, "text/plain", "not a request of HTTP/1\n")
+        if not self._is_ours(request):
+            return _response(
+                403, "text/plain", "this computer is asked under a name that is not its own: use its address\n"
+            )
+        method, path = words[0], words[1].partition("?")[0]
+        if method not in ("GET", "HEAD"):
+            return _response(405, "text/plain", "this only tells: GET\n")
+        status, kind, body = self._document(path)
+        return _response(status, kind, body, head=method == "HEAD")
+
+    def _is_ours(self, request: bytes) -> bool:
+        """Browsers always say which name they ask; other programs need not."""
+        named = [line.partition(b":")[2] for line in request.split(b"\r\n")[1:] if line.lower().startswith(b"host:")]
+        return all(not self._guard.local or self._guard.host_ok(one.decode("latin-1").strip()) for one in named)
+
+    def _document(self, path: str) -> tuple[int, str, str]:
+        told = self._told
+        match path:
+            case "/metrics":
+                return 200, CONTENT_TYPE, exposition(told, time.monotonic())
+            case "/vda5050" | "/vda5050/2":
+                second = path.endswith("2")
+                make = vda5050.position_v2 if second else vda5050.position
+                latest = told.latest(time.monotonic())
+                made = None if latest is None else make(latest, told.held)
+                if made is None:
+                    why = "the daemon does not answer" if not told.up else "there is no pose yet"
+                    return 503, _JSON, json.dumps({"error": why}) + "\n"
+                return 200, _JSON, json.dumps({"agvPosition" if second else "mobileRobotPosition": made}) + "\n"
+            case "/":
+                return 200, "text/plain", INDEX
+        return 404, "text/plain", INDEX
+
+
+def _response(status: int, kind: str, body: str, head: bool = False) -> bytes:
+    content = body.encode()
+    lines = (
+        f"HTTP/1.1 {status} {_REASONS[status]}",
+        f"Content-Type: {kind}",
+        f"Content-Length: {len(content)}",
+        "Cache-Control: no-store",
+        "Connection: close",
+    )
+    return "\r\n".join(lines).encode() + b"\r\n\r\n" + (b"" if head else content)

@@ -1,0 +1,328 @@
+"""What the stream tells, as ROS 2 messages: one translation for files, live servers and replayed recordings.
+
+Frames of coordinates after REP-103 and REP-105: ``map`` > ``odom`` > ``base_link`` > ``laser``. The pose in the map may
+jump, the one in ``odom`` does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from daemon.config.schema import Mount
+from daemon.snapshot import GUESSED, State
+from taps.ros import types as ros
+from taps.stream.messages import Faults, Frame, Lights, Loop, MapTiles, Pose, Raw, Scan, StateChange, Statistics, Triple
+from taps.stream.tiles import Tiles, trinary
+
+MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
+
+STEP_S: Final = 0.5
+"""The computer's calendar may be put right by less without the stamps jumping."""
+AGAIN_S: Final = 5.0
+"""What stands still is said again so often, for those who came later."""
+SLOWEST_HZ: Final = 1.0
+"""Of diagnostics."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic: type, what it is, whether a late listener gets the last one (transient local)."""
+
+    kind: str
+    what: str
+    latched: bool = False
+
+
+TOPICS: Final = {
+    "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan after REP-117; the stamp is the first beam's"),
+    "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while the place is known"),
+    "/odom": Topic("nav_msgs/msg/Odometry", "the pose in odom, smooth, with the velocity"),
+    "/tf": Topic("tf2_msgs/msg/TFMessage", "map > odom > base_link"),
+    "/tf_static": Topic("tf2_msgs/msg/TFMessage", "base_link > laser", latched=True),
+    "/map": Topic("nav_msgs/msg/OccupancyGrid", "the map", latched=True),
+    "/diagnostics": Topic("diagnostic_msgs/msg/DiagnosticArray", "state, faults with remedy, cycle, devices, lights"),
+    "/lumiloop/state": Topic("lumiloop_msgs/msg/State", "each change of state", latched=True),
+    "/lumiloop/lights": Topic("lumiloop_msgs/msg/Lights", "every lamp in view"),
+    "/lumiloop/loop": Topic("lumiloop_msgs/msg/Loop", "each loop closure"),
+    "/lumiloop/raw": Topic("lumiloop_msgs/msg/Raw", "bytes between daemon and devices"),
+}
+
+WELL: Final = (State.TRACKING, State.MAPPING)
+POOR: Final = (State.DEGRADED, State.STARTING, State.RELOCATING)
+OK, WARN, ERROR = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Out:
+    """One message: where to, when (ns since the Unix epoch), and its bytes."""
+
+    topic: str
+    t_ns: int
+    data: bytes
+
+
+def beside(T: Triple, odom: Triple) -> Triple:
+    """``T_map_odom`` of ``T_map_base`` and ``T_odom_base``."""
+    turn = math.remainder(T[2] - odom[2], 2.0 * math.pi)
+    c, s = math.cos(turn), math.sin(turn)
+    return T[0] - c * odom[0] + s * odom[1], T[1] - s * odom[0] - c * odom[1], turn
+
+
+class Translator:
+    """Frames of the stream in, messages out.
+
+    Args:
+        mount: of the lidar. utc: of an instant of the daemon's clock; None: as the poses say, and nothing before the
+            first of them.
+    """
+
+    def __init__(self, mount: Mount, utc: Callable[[float], float] | None = None) -> None:
+        self._mount = mount
+        self._utc = utc
+        self._offset: float | None = None
+        self._static = self._diagnosed = -math.inf
+        self._state: tuple[int, int] | None = None
+        self._faults: Faults | None = None
+        self._statistics: Statistics | None = None
+        self._lights: Lights | None = None
+        self._tiles = Tiles()
+        self._drawn = -math.inf
+        self._now = 0.0
+
+    def take(self, frame: Frame) -> Iterator[Out]:
+        """Every message that comes of a frame."""
+        match frame:
+            case Pose():
+                yield from self._pose(frame)
+            case Scan():
+                yield from self._scan(frame)
+            case Lights():
+                yield from self._told_by_light(frame)
+            case Loop():
+                yield from self._loop(frame)
+            case Raw():
+                yield from self._raw(frame)
+            case StateChange():
+                self._diagnosed = -math.inf
+            case Faults():
+                self._faults, self._diagnosed = frame, -math.inf
+            case Statistics():
+                self._statistics = frame
+            case MapTiles():
+                self._tiles.take(frame)
+
+    def grid(self, t_mono: float, origin: tuple[float, float], resolution: float, log_odds: Any) -> Iterator[Out]:
+        """The map as a whole: (rows, columns) log-odds, rows from below, 0 not known."""
+        t = self._at(t_mono)
+        if t is None or log_odds.size == 0:
+            return
+        cells = trinary(log_odds)
+        info = ros.make(
+            "nav_msgs/msg/MapMetaData",
+            map_load_time=ros.time(t),
+            resolution=resolution,
+            width=cells.shape[1],
+            height=cells.shape[0],
+            origin=ros.pose(*origin, 0.0),
+        )
+        yield self._out("/map", t, header=ros.header(t, MAP), info=info, data=cells.ravel())
+
+    def _at(self, t_mono: float) -> float | None:
+        """UTC of an instant; None while it is not known."""
+        if self._utc is not None:
+            return self._utc(t_mono)
+        return None if self._offset is None else self._offset + t_mono
+
+    def _out(self, topic: str, t: float, **fields: Any) -> Out:
+        kind = TOPICS[topic].kind
+        return Out(topic, ros.nanoseconds(t), ros.encode(kind, ros.make(kind, **fields)))
+
+    def _pose(self, frame: Pose) -> Iterator[Out]:
+        offset = frame.utc(0.0)
+        if self._offset is None or abs(offset - self._offset) > STEP_S:
+            self._offset = offset
+        t = self._at(frame.t_mono)
+        assert t is not None
+        self._now = frame.t_mono
+        yield from self._standing(t)
+        yield from self._map()
+        if frame.odom is not None:
+            yield self._odom(t, frame, frame.odom)
+            moving = [ros.transform(t, ODOM, BASE, frame.odom)]
+            if frame.pose is not None:
+                moving.insert(0, ros.transform(t, MAP, ODOM, beside(frame.pose, frame.odom)))
+            yield self._out("/tf", t, transforms=moving)
+        if frame.pose is not None and frame.covariance is not None and frame.state not in GUESSED:
+            place = ros.make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=ros.pose(*frame.pose),
+                covariance=ros.planar(frame.covariance),
+            )
+            yield self._out("/pose", t, header=ros.header(t, MAP), pose=place)
+        if (frame.state, frame.reason) != self._state:
+            self._state, self._diagnosed = (frame.state, frame.reason), -math.inf
+            yield self._changed(t, frame)
+        if frame.t_mono - self._diagnosed >= 1.0 / SLOWEST_HZ:
+            self._diagnosed = frame.t_mono
+            yield self._out("/diagnostics", t, header=ros.header(t, ""), status=self._statuses(frame))
+
+    def _standing(self, t: float) -> Iterator[Out]:
+        if not 0.0 <= self._now - self._static < AGAIN_S:
+            self._static = self._now
+            T = (self._mount.x, self._mount.y, math.radians(self._mount.yaw))
+            yield self._out("/tf_static", t, transforms=[ros.transform(t, BASE, LASER, T, self._mount.inverted)])
+
+    def _odom(self, t: float, frame: Pose, odom: Triple) -> Out:
+        nothing = np.zeros(36)
+        vx, vy, turning = frame.velocity or (0.0, 0.0, 0.0)
+        twist = ros.make(
+            "geometry_msgs/msg/Twist",
+            linear=ros.make("geometry_msgs/msg/Vector3", x=vx, y=vy, z=0.0),
+            angular=ros.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=turning),
+        )
+        return self._out(
+            "/odom",
+            t,
+            header=ros.header(t, ODOM),
+            child_frame_id=BASE,
+            pose=ros.make("geometry_msgs/msg/PoseWithCovariance", pose=ros.pose(*odom), covariance=nothing),
+            twist=ros.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=nothing),
+        )
+
+    def _changed(self, t: float, frame: Pose) -> Out:
+        level = frame.trust.horizontal_m
+        return self._out(
+            "/lumiloop/state",
+            t,
+            header=ros.header(t, MAP),
+            state=frame.state & 0xFF,
+            state_name=frame.state_name,
+            meaning=frame.meaning,
+            remedy=frame.remedy,
+            protection_level_m=math.nan if level is None else level,
+            alert=frame.trust.alert,
+        )
+
+    def _scan(self, frame: Scan) -> Iterator[Out]:
+        t = self._at(frame.t_mono)
+        if t is None:
+            return
+        ranges = frame.ranges_m()
+        yield self._out(
+            "/scan",
+            t,
+            header=ros.header(t, LASER),
+            angle_min=frame.bearing_first,
+            angle_max=frame.bearing_first + frame.bearing_step * max(0, len(ranges) - 1),
+            angle_increment=frame.bearing_step,
+            time_increment=frame.beam_dt,
+            scan_time=frame.period,
+            range_min=frame.range_min,
+            range_max=frame.range_max,
+            ranges=ranges,
+            intensities=np.empty(0, np.float32),
+        )
+
+    def _told_by_light(self, frame: Lights) -> Iterator[Out]:
+        known = frame.t_mono is not None and (self._lights is None or frame.t_mono != self._lights.t_mono)
+        self._lights = frame
+        t = None if frame.t_mono is None else self._at(frame.t_mono)
+        if not known or t is None:
+            return
+        x, y, yaw = frame.pose or (math.nan,) * 3
+        links = [
+            ros.make(
+                "lumiloop_msgs/msg/Link",
+                code=link.code & 0xFFFF,
+                lamp_id=-1 if link.lamp_id is None else link.lamp_id,
+                use=link.use & 0xFF,
+                strength=link.strength,
+                residual=math.nan if link.residual is None else link.residual,
+            )
+            for link in frame.links
+        ]
+        yield self._out(
+            "/lumiloop/lights",
+            t,
+            header=ros.header(t, MAP),
+            fix=frame.fix & 0xFF,
+            used=frame.used & 0xFF,
+            pose=ros.make("geometry_msgs/msg/Pose2D", x=x, y=y, theta=yaw),
+            sigma=np.array(frame.sigma or (math.nan,) * 3),
+            blocks=frame.blocks & 0xFFFFFFFF,
+            blocks_lost=frame.blocks_lost & 0xFFFFFFFF,
+            links=links,
+        )
+
+    def _loop(self, frame: Loop) -> Iterator[Out]:
+        t = self._at(frame.t_mono)
+        if t is not None:
+            yield self._out(
+                "/lumiloop/loop",
+                t,
+                header=ros.header(t, MAP),
+                counter=frame.counter & 0xFFFFFFFF,
+                keyframe_new=-1 if frame.keyframe_new is None else frame.keyframe_new,
+                keyframe_old=-1 if frame.keyframe_old is None else frame.keyframe_old,
+                reason=(frame.reason or 0) & 0xFF,
+                residual=math.nan if frame.residual is None else frame.residual,
+            )
+
+    def _raw(self, frame: Raw) -> Iterator[Out]:
+        t = self._at(frame.t_mono)
+        if t is not None:
+            yield self._out(
+                "/lumiloop/raw",
+                t,
+                header=ros.header(t, LASER if frame.device == "lidar" else BASE),
+                device=frame.device,
+                kind=frame.kind,
+                rate=frame.rate or 0.0,
+                bits=frame.bits or 8,
+                data=np.frombuffer(frame.data, np.uint8),
+            )
+
+    def _map(self) -> Iterator[Out]:
+        """The map, when it has changed and some time has gone by."""
+        if self._tiles.fresh and not 0.0 <= self._now - self._drawn < AGAIN_S:
+            self._drawn = self._now
+            corner, whole = self._tiles.whole()
+            yield from self.grid(self._now, corner, self._tiles.resolution, whole)
+
+    def _statuses(self, frame: Pose) -> list[Any]:
+        level = OK if frame.state in WELL else WARN if frame.state in POOR else ERROR
+        said = f"{frame.state_name}: {frame.meaning}" if frame.meaning else frame.state_name
+        found = [_status(level, "state", said, {"remedy": frame.remedy, "jumps": frame.jumps, "map": frame.map_id})]
+        present = () if self._faults is None else self._faults.present
+        found += [_status(ERROR, f"fault {one.fault}", one.meaning, {"remedy": one.remedy}) for one in present]
+        pulse = frame.pulse
+        if pulse is not None:
+            late = {"rung": pulse.rung, "stalls": pulse.stalls, "overruns": frame.overruns, "cycle_us": frame.cycle_us}
+            found.append(_status(WARN if pulse.rung else OK, "cycle", f"rung {pulse.rung}", late))
+        if self._statistics is not None:
+            figures = {name: getattr(self._statistics, name) for name in self._statistics.__struct_fields__}
+            found.append(_status(OK, "counters", "since the start", figures))
+        if self._lights is not None and self._lights.t_mono is not None:
+            lights = {"in view": len(self._lights.links), "blocks": self._lights.blocks}
+            found.append(_status(OK, "lights", f"{self._lights.used} used", lights))
+        return found
+
+
+def _status(level: int, name: str, message: str, values: dict[str, Any]) -> Any:
+    told = [
+        ros.make("diagnostic_msgs/msg/KeyValue", key=key, value="" if value is None else str(value))
+        for key, value in values.items()
+    ]
+    return ros.make(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=level,
+        name=f"lumiloop: {name}",
+        message=message,
+        hardware_id="",
+        values=told,
+    )

@@ -1,0 +1,1 @@
+"""Client of the daemon's local stream and the typed messages on it."""

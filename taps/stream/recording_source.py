@@ -1,0 +1,94 @@
+"""A recording, told as its daemon's stream would have told it: what reads the stream reads recordings, too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from daemon.cli.replay import NOTHING_GIVEN, Given, config_for, lights_for, start_for
+from daemon.config.schema import Config
+from daemon.health.reasons import REASONS, Reason
+from daemon.publish import stream_server
+from daemon.publish.stream_server import Client, StreamServer
+from daemon.publish.stream_ticker import BEAT_S, in_words
+from daemon.replay.runner import Rerun
+from daemon.replay.sources import Source, open_log
+from hal.adc import RawSamples
+from hal.lidar import RawScan
+from hal.replay.recording import Kind, open_recording
+from hal.replay.report import LogReport
+from taps.stream import messages
+from taps.stream.messages import Frame, Raw
+
+PASSED = {Kind.RX: "rx", Kind.TX: "tx", Kind.OPEN: "open", Kind.LOST: "lost", Kind.BAUD: "baud"}
+
+
+class Listener(Client):
+    """A client of the stream without a socket."""
+
+    def __init__(self, server: StreamServer, take: Callable[[Frame], object]) -> None:
+        super().__init__(server)
+        self.wants = frozenset({*stream_server.LATEST, *stream_server.ONCE, *stream_server.RAW})
+        self._take = take
+        server.clients.add(self)
+
+    def tell(self, topic: str, body: bytes) -> None:
+        """Take it at once."""
+        self._take(messages.read(topic, body))
+
+
+class Retold:
+    """A log that is played through the daemon's own cycle.
+
+    Attributes:
+        source, config, rerun: as `daemon.cli.replay` has them.
+
+    Raises:
+        HalError: the log, or what it was made with, cannot be used.
+    """
+
+    def __init__(self, path: Path, config: Config, given: Given = NOTHING_GIVEN) -> None:
+        self.source: Source = open_log(path)
+        self.config = config_for(self.source, config, given)
+        lights = lights_for(self.source, self.config, given)
+        start = start_for(self.source, self.config, lights, given)
+        self.rerun = Rerun(self.source, self.config, lights, None, start)
+        self._heard: list[Frame] = []
+        self._server = StreamServer(Path(), self.config.name, lambda reason: REASONS[Reason(reason)])
+        Listener(self._server, self._heard.append)
+        self.rerun.watch = lambda record: self._server.publish(record.snapshot)
+
+    def frames(self, raw: bool = True) -> Iterator[Frame]:
+        """Everything in order, up to the end; ``raw``: also the bytes between daemon and devices.
+
+        Raises:
+            HalError: the log cannot be read on.
+        """
+        passed = self._raw() if raw and self.source.recorded else iter(())
+        waiting, beat_at = next(passed, None), -1.0
+        for event in self.source.events():
+            if isinstance(event, RawScan):
+                self._server.on_scan(event)
+            elif isinstance(event, RawSamples) and raw:
+                self._server.on_samples(event)
+            self.rerun.feed(event)
+            if self.rerun.t_mono >= beat_at:
+                beat_at = self.rerun.t_mono + BEAT_S
+                self._server.on_faults(self.rerun.t_mono, in_words(self.rerun.faults))
+            while waiting is not None and waiting.t_mono <= self.rerun.t_mono:
+                yield waiting
+                waiting = next(passed, None)
+            yield from self._heard
+            self._heard.clear()
+        while waiting is not None:  # after the last scan: often why there was none
+            yield waiting
+            waiting = next(passed, None)
+        self.rerun.finish()
+
+    def _raw(self) -> Iterator[Raw]:
+        """What passed through the lidar's port, from where the replay begins."""
+        since = -1.0 if self.source.begin is None else self.source.begin.t_mono
+        for frame in open_recording(self.source.path).frames(LogReport()):
+            if frame.kind in PASSED and frame.channel == 0 and frame.t_mono >= since:
+                kind = PASSED[Kind(frame.kind)]
+                yield Raw(device="lidar", kind=kind, t_mono=frame.t_mono, data=frame.payload)

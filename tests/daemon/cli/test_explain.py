@@ -1,0 +1,121 @@
+"""`lumiloop explain`: everything that has a name or a number can be asked about, and is found."""
+
+from __future__ import annotations
+
+import pytest
+
+from daemon.cli.explain import entries, find
+from daemon.cli.parser import FAILED, OK, main, parser
+from daemon.config.loader import options
+from daemon.config.schema import Config
+from daemon.health.faults import FAULTS
+from daemon.health.reasons import REASONS
+from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
+from daemon.publish.modbus import holding
+from daemon.snapshot import LightFix, LinkUse, LoopReason, State
+
+
+def _told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert main(["explain", *words]) == OK
+    return capsys.readouterr().out
+
+
+def test_a_key_by_its_path_and_by_its_last_part(capsys: pytest.CaptureFixture[str]) -> None:
+    by_path = _told(capsys, "integrity.alert_m")
+    assert "configuration key: integrity.alert_m" in by_path
+    assert "default 0.0" in by_path
+    assert _told(capsys, "alert_m") == by_path
+    assert _told(capsys, "`alert_m`") == by_path
+
+
+def test_a_table_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, "photodiode")
+    assert all(option.path in told for option in options() if option.path.startswith("photodiode."))
+
+
+def test_a_key_of_an_earlier_version_says_what_to_write(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "/dev/ttyUSB0@115200" in _told(capsys, "lidar.baud")
+
+
+def test_faults_and_reasons_by_number(capsys: pytest.CaptureFixture[str]) -> None:
+    text, remedy = FAULTS[next(code for code in FAULTS if code == 302)]
+    told = _told(capsys, "fault", "302")
+    assert text in told
+    assert remedy in told
+    assert told.count("\n\n") == 0
+    assert REASONS[next(code for code in REASONS if code == 6)][0] in _told(capsys, "reason 6")
+
+
+def test_a_bare_number_gives_all_that_it_stands_for(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, "202")
+    assert "fault 202" in told
+    assert "input register" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["view"], "port"),
+        (["foxglove"], "listen"),
+        (["metrics"], "listen"),
+        (["ros2"], "router"),
+        (["fleet"], "router"),
+        (["run"], None),
+    ],
+)
+def test_a_port_says_who_uses_it(words: list[str], option: str | None, capsys: pytest.CaptureFixture[str]) -> None:
+    default = Config().modbus.port if option is None else getattr(parser().parse_args(words), option)
+    port = str(default[1] if isinstance(default, tuple) else default).rpartition(":")[2]
+    told = _told(capsys, port)
+    assert f"port {port}: " in told
+    assert "sets another" in told
+    if option is not None:
+        assert f"`lumiloop {words[0]}`" in told
+
+
+def test_a_register_in_the_middle_of_a_value_is_that_value(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "map_x" in _told(capsys, "register", "19")
+    assert "acknowledge" in _told(capsys, "holding register", str(holding.COMMAND_ADDRESS + 8))
+
+
+def test_names_in_any_case(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "two witnesses agree" in _told(capsys, "tracking")
+    assert "weaker than it can be here" in _told(capsys, "OCCLUDED")
+
+
+def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "sigma_jaw"]) == FAILED
+    assert "sigma_yaw" in capsys.readouterr().err
+    for strange in ("99999", "nonsense"):
+        assert main(["explain", strange]) == FAILED
+        assert "ask for" in capsys.readouterr().err
+
+
+def test_a_kind_alone_wants_its_number(capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in ("register", "Input register"):
+        assert main(["explain", kind]) == FAILED
+        example = capsys.readouterr().err.rpartition("as in: ")[2]
+        assert example.startswith(f"{kind.lower()} ")
+        assert _told(capsys, *example.split())
+
+
+def test_what_the_documents_show_below_is_named_by_what_to_ask(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "lumiloop explain bit NUMBER" in _told(capsys, "flags")
+    assert "lumiloop explain link use NUMBER" in _told(capsys, "link_1_use")
+    assert not any("see below" in entry.text.lower() for entry in entries())
+
+
+def test_every_published_number_has_its_words() -> None:
+    assert set(STATES) == set(State)
+    assert set(FIXES) == set(LightFix)
+    assert set(USES) == set(LinkUse)
+    assert set(LOOPS) == set(LoopReason)
+    assert set(COMMANDS) == set(holding.CommandCode)
+
+
+def test_every_entry_can_be_asked_for() -> None:
+    everything = list(entries())
+    for entry in everything:
+        assert entry in find(f"{entry.kind} {entry.name}", everything)
+        for number in entry.numbers:
+            assert entry in find(f"{entry.kind} {number}", everything)

@@ -1,0 +1,406 @@
+"""`lumiloop status` against a running publisher, a silent host, a stranger."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.cli import status as cli_status
+from daemon.config.schema import Config, ModbusConfig
+from daemon.publish.modbus import lights_block, registers
+from daemon.snapshot import Snapshot, State
+from tests.daemon.publish.modbus.test_lights_block import picture
+from tests.daemon.publish.modbus.test_registers import snapshot
+from tests.daemon.publish.network import publishing
+
+
+def status(address: str | None, settings: Config | None = None, **options: bool) -> int:
+    return cli_status.main(
+        argparse.Namespace(**{"address": address, "settings": settings, "json": False, "watch": False} | options)
+    )
+
+
+def run_against(taken: Snapshot, advance: bool = True, **options: bool) -> int:
+    """Exit code of the command against a publisher that shows a snapshot (again and again, newly numbered)."""
+
+    async def run() -> int:
+        async with publishing() as publisher:
+            publisher.publish(taken)
+            command = asyncio.create_task(asyncio.to_thread(status, f"127.0.0.1:{publisher.port}", **options))
+            number = taken.seq
+            while not command.done():
+                await asyncio.sleep(0.02)
+                number += advance
+                publisher.publish(snapshot(seq=number, reason=0, fault=0) if advance else taken)
+            return await command
+
+    return asyncio.run(run())
+
+
+def test_a_person_reads_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=0, fault=0)) == 0
+    shown = capsys.readouterr().out
+    for line in (
+        "state      TRACKING\n",
+        "map pose   x 1.2345 m, y -2.3456 m, yaw 171.89 deg  (not observed: y)\n",
+        "sigma      0.0200 m, 0.0100 m, 0.57 deg\n",
+        "loops      2, latest: keyframe 70001 to 12\n",
+        "lights     4 in view, strongest lamp 77\n",
+        "scans      39.92 Hz, 100000 missed\n",
+        "devices    lidar ok, odometry NOT OK\n",
+        "2023-11-14 22:13:20 UTC\n",
+    ):
+        assert line in shown
+    assert "STANDS STILL" not in shown
+
+
+def test_a_person_sees_the_links_beside_the_pose(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(light=picture(), links=3), advance=False) == 0
+    shown = capsys.readouterr().out
+    for line in (
+        "map pose   x 1.2345 m, y -2.3456 m, yaw 171.89 deg",
+        "light fix  GOOD, 5 used, age 0.0500 s\n",
+        "light pose x -1.2345 m, y 7.2500 m, yaw -159.46 deg\n",
+        "           sigma 0.0211 m, 0.0300 m, 0.57 deg\n",
+        "links        lamp  code     strength  residual  use\n",
+        "             1017    17   1250.00 nA    -3.1 %  ACCEPTED\n",
+        "                -    60    500.00 nA         -  TWIN\n",
+        "            65000   101      3.10 nA   -96.2 %  OCCLUDED\n",
+    ):
+        assert line in shown, shown
+
+
+@pytest.mark.parametrize("state", [State.AMBIGUOUS, State.RELOCATING, State.LOST])
+def test_a_pose_whose_place_is_not_known_is_marked_as_a_guess(state: State, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(state=state, map_id=0xC0FFEE), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "yaw 171.89 deg  (a guess: the place is not known)\n" in shown
+    assert "map        id 00c0ffee, " in shown
+
+
+def test_a_daemon_of_a_version_without_the_block_of_lights_is_read_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(lights_block.BLOCK, "encode", lambda snapshot: b"")
+    assert run_against(snapshot(light=picture(), links=3), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "lights     3 in view" in shown
+    assert "light fix" not in shown
+
+
+def test_a_daemon_whose_cycle_stands_still_is_shown_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=0, fault=0), advance=False) == 0
+    assert "STANDS STILL" in capsys.readouterr().out
+
+
+def test_before_the_first_cycle_no_device_is_judged_and_nothing_is_said_to_stand_still(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run_against(snapshot(state=State.STARTING), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "devices    lidar, odometry: told from the first cycle on\n" in shown
+    assert "STANDS STILL" not in shown
+    assert "NOT OK" not in shown
+
+
+def test_what_is_not_known_reads_so(capsys: pytest.CaptureFixture[str]) -> None:
+    empty = Snapshot(seq=0, t_mono=0.0, t_sent=0.0, t_utc=0.0, state=State.STARTING, reason=0)
+    assert run_against(empty, advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "map pose   not known\n" in shown
+    assert "lights     no photodiode configured\n" in shown
+    assert "devices    none configured\n" in shown
+    assert "None" not in shown
+
+
+def test_reasons_and_faults_come_with_a_remedy(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=4, fault=101), advance=False) == 0
+    shown = capsys.readouterr().out
+    silent = "no valid scan for three scan periods, or not steadily again"
+    assert f"reason     4: {silent} (check the lidar's power and cable)\n" in shown
+    assert "fault      101: the lidar is not there (" in shown
+
+
+def test_numbers_of_a_newer_daemon_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=60_000, fault=60_001), advance=False) == 0
+    shown = capsys.readouterr().out
+    assert "reason     60000: unknown to this reader" in shown
+    assert "fault      60001: unknown to this reader" in shown
+
+
+def test_a_program_reads_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=0, fault=0), json=True) == 0
+    reading = json.loads(capsys.readouterr().out)
+    assert reading["state"] == "TRACKING"
+    assert reading["map_x"] == 1.2345
+    assert reading["flags"]["loop_closed"] is True
+    assert reading["devices"]["adc_fitted"] is False
+    assert reading["stalled"] is False
+
+
+def test_a_program_reads_the_links(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_against(snapshot(reason=0, fault=0, light=picture()), advance=False, json=True) == 0
+    reading = json.loads(capsys.readouterr().out)
+    assert reading["light_fix"] == "GOOD"
+    assert reading["light_x"] == -1.2345
+    assert reading["light_links"][1] == {"code": 60, "lamp": None, "use": "TWIN", "strength": 5e-7, "residual": None}
+    assert len(reading["light_links"]) == 3
+    assert not [key for key in reading if key.startswith("link_")]
+
+
+def test_watching_goes_on_until_interrupted(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    naps = iter(range(3))
+
+    def nap(_: float) -> None:
+        if next(naps, None) is None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
+        status(address, watch=True, json=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert [json.loads(line)["stalled"] for line in lines] == [False, True, True, True]
+
+
+@contextmanager
+def stranger(block: bytes, head: bytes = b"\x00\x00\x00\x83\x01\x04\x80", silent: int = 0) -> Iterator[str]:
+    """Something that answers every datagram with the same, but for the first few."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+
+    def serve() -> None:
+        for number in range(1000):
+            data, peer = sock.recvfrom(512)
+            if not data:
+                return
+            if number >= silent:
+                sock.sendto(b"\xff\xff" + head + block, peer)  # an answer to nothing that was asked
+                sock.sendto(data[:2] + head + block, peer)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"127.0.0.1:{sock.getsockname()[1]}"
+    finally:
+        sock.sendto(b"", sock.getsockname())
+        thread.join()
+        sock.close()
+
+
+def test_a_lost_datagram_is_asked_for_again(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_status, "_TIMEOUT_S", 0.1)
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0)), silent=2) as address:
+        assert status(address) == 0
+    assert "TRACKING" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("block", "head", "words"),
+    [
+        (bytes(128), b"\x00\x00\x00\x83\x01\x04\x80", "not a lumiloop register block"),
+        (b"", b"\x00\x00\x00\x03\x01\x84\x02", "exception 2; that is another kind of device"),
+        (b"\x4c\x4c\x00\x09" + bytes(124), b"\x00\x00\x00\x83\x01\x04\x80", "version 9, this reader knows version 1"),
+        (bytes(20), b"\x00\x00\x00\x17\x01\x04\x14", "64 registers, got 10"),
+        (b"", b"", "64 registers, got 0"),
+    ],
+)
+def test_a_stranger_is_told_apart(block: bytes, head: bytes, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with stranger(block, head) as address:
+        assert status(address) == 1
+    assert words in capsys.readouterr().err
+
+
+def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port = sock.getsockname()[1]
+    assert status(f"127.0.0.1:{port}") == 1
+    told = capsys.readouterr().err
+    assert f"127.0.0.1:{port}" in told
+    assert "lumiloop run" in told
+
+
+@contextmanager
+def another_process(path: Path) -> Iterator[int]:
+    """A process that listens at a local stream; yields its id."""
+    listening = f"import socket; s = socket.socket(socket.AF_UNIX); s.bind({str(path)!r}); s.listen()"
+    program = f"{listening}; print(flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield process.pid
+        process.terminate()
+
+
+def test_whose_registers_are_shown_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modbus answers at the configured port: another daemon, or the one of the configured name."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address:
+        settings = Config(name="agv", modbus=ModbusConfig(port=int(address.rpartition(":")[2])))
+        assert status(None, settings) == 0, "whoever is meant does not run, or cannot be seen"
+        assert capsys.readouterr().out.startswith(f"daemon     process {os.getpid()}: ")
+        assert status(None, settings, json=True) == 0
+        assert json.loads(capsys.readouterr().out)["process"] == os.getpid()
+        with another_process(tmp_path / "agv.stream") as meant:
+            assert status(None, settings) == 1
+            said = capsys.readouterr()
+            assert not said.out
+            assert f"{address} is answered by process {os.getpid()}" in said.err
+            assert f"not by `agv` (process {meant})" in said.err
+            assert "modbus.port" in said.err
+            assert status(address, settings) == 0, "who names an address means whoever answers there"
+            assert capsys.readouterr().out.startswith("state")
+        (tmp_path / "agv.stream").unlink()
+        with socket.socket(socket.AF_UNIX) as ours:
+            ours.bind(str(tmp_path / "agv.stream"))
+            ours.listen()
+            assert status(None, settings) == 0
+
+
+def test_silence(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli_status, "_TIMEOUT_S", 0.02)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        assert status(f"127.0.0.1:{sock.getsockname()[1]}") == 1
+    assert "firewall" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "expected"),
+    [
+        (None, None, ("127.0.0.1", 1502)),
+        (None, Config(), ("127.0.0.1", 1502)),
+        (None, Config(bind="0.0.0.0", modbus=ModbusConfig(port=5020)), ("127.0.0.1", 5020)),
+        (None, Config(bind="::"), ("::1", 1502)),
+        (None, Config(bind="192.168.0.10"), ("192.168.0.10", 1502)),
+        ("robot", Config(modbus=ModbusConfig(port=7)), ("robot", 1502)),
+        ("robot:7", None, ("robot", 7)),
+        (":7", None, ("127.0.0.1", 7)),
+        ("::1", None, ("::1", 1502)),
+        ("[::1]", None, ("::1", 1502)),
+        ("[::1]:7", None, ("::1", 7)),
+    ],
+)
+def test_where_to_look(text: str | None, settings: Config | None, expected: tuple[str, int]) -> None:
+    assert cli_status.address_of(text, settings) == expected
+
+
+@pytest.mark.parametrize("text", ["robot:", "robot:x", "robot:0", "robot:65536"])
+def test_a_wrong_address_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status(text) == 1
+    assert "HOST:PORT" in capsys.readouterr().err
+
+
+def test_modbus_switched_off(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status(None, Config(modbus=ModbusConfig(port=0))) == 1
+    assert "modbus.port is 0" in capsys.readouterr().err
+
+
+def test_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
+    for host in ("no-such-host.invalid", "robot..local"):
+        assert status(host) == 1
+        assert "check the address" in capsys.readouterr().err
+
+
+def test_watching_shows_when_the_daemon_is_away(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    naps = iter(range(2))
+
+    def nap(_: float) -> None:
+        if next(naps, None) is None:
+            raise KeyboardInterrupt
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port = sock.getsockname()[1]
+    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
+    with pytest.raises(KeyboardInterrupt):
+        status(f"127.0.0.1:{port}", watch=True)
+    assert capsys.readouterr().err.count("nothing serves Modbus there") == 1  # of three looks
+
+
+def test_watching_says_anew_what_is_new(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    away, refused = cli_status.NoAnswer("away"), cli_status.NoAnswer("refused")
+    looks = iter([away, away, refused, {"seq": 1}, refused])
+
+    def read(_: cli_status.Reader) -> Any:
+        look = next(looks, KeyboardInterrupt())
+        if isinstance(look, BaseException):
+            raise look
+        return look
+
+    monkeypatch.setattr(cli_status.Reader, "read", read)
+    monkeypatch.setattr("daemon.cli.status.time.sleep", lambda _: None)
+    monkeypatch.setattr("daemon.cli.status._show", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        status("127.0.0.1:1", watch=True)
+    said = [line.removeprefix("lumiloop: ") for line in capsys.readouterr().err.splitlines()]
+    assert said == ["away; waiting", "refused; waiting", "refused; waiting"]
+
+
+def test_on_a_small_terminal_watching_keeps_the_first_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nap(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setattr("shutil.get_terminal_size", lambda *_: os.terminal_size((40, 8)))
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
+        status(address, watch=True)
+    lines = capsys.readouterr().out.removeprefix("\x1b[H\x1b[2J").splitlines()
+    assert lines[0] == "state      TRACKING"
+    assert len(lines) == 7  # and the cursor's
+    assert max(map(len, lines)) <= 40
+    assert lines[-1] == "... 9 more lines: a higher window"
+
+
+def test_on_a_terminal_watching_repaints(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def nap(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
+        status(address, watch=True)
+    assert capsys.readouterr().out.startswith("\x1b[H\x1b[2Jstate      TRACKING\n")
+
+
+def test_a_time_that_is_none_is_not_made_up() -> None:
+    reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0)))
+    assert "no time" in cli_status.as_table(reading | {"t_utc": None}, stalled=False)
+    assert cli_status.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
+
+
+def test_an_age_or_a_sigma_at_the_end_of_its_register_may_be_any_larger() -> None:
+    old = snapshot(reason=0, fault=0, t_sent=1300.0, covariance=(100.0, 0.0, 1e-4, 0.0, 0.0, 1e-4))
+    shown = cli_status.as_table(registers.decode_block(registers.encode_block(old)), stalled=False)
+    assert "age        > 6.5 s\n" in shown
+    assert "sigma      > 6.5 m, 0.0100 m, 0.57 deg\n" in shown
+
+
+def test_a_state_of_a_newer_daemon_is_shown_by_number() -> None:
+    reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0))) | {"state": 99}
+    assert "unknown to this reader (99)" in cli_status.as_table(reading, stalled=False)

@@ -1,0 +1,369 @@
+"""The doctor, on a computer on which one thing after the other is broken."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import re
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import parser
+from daemon.cli.doctor import examine
+from daemon.diagnosis.host import Heard, Host, Mute
+from daemon.maps.store import Store
+from hal.errors import DeviceFault
+from hal.lidar import LidarGeometry
+from hal.photodiode.probe import BusFinding, Chip
+from hal.probe import Finding
+from taps.stream.messages import Fault, Faults, Pose
+from tests.taps.serving import served
+
+ROOT = Path(__file__).parents[3]
+GEOMETRY = LidarGeometry("UTM-30LX", "H0906091", "f", 1440.0, 540.0, 0, 1080, 23, 60000, 0.001, 0.025, 0.0)
+BUS = "/dev/i2c-1"
+CONFIG = f'lidar.device = "auto"\nodometry.port = 7000\nphotodiode.bus = "{BUS}"\nlights.survey = "lights.toml"\n'
+POSE = Pose(seq=1, t_mono=1.0, t_sent=1.0, t_utc=1.7e9, state=3, state_name="TRACKING", reason=0, pose=(0.0, 0.0, 0.0))
+
+
+@dataclass
+class Computer(Host):
+    """One on which all is well, until something is changed."""
+
+    heard: Heard | Mute | str = "nobody listens there"
+    ttys: list[str] = field(default_factory=lambda: ["/dev/ttyACM0"])
+    missing: set[str] = field(default_factory=set)
+    closed: set[str] = field(default_factory=set)
+    bus: BusFinding = field(default_factory=lambda: BusFinding(BUS, "i2c", (Chip(0x4D, "MCP3221", True),)))
+    lidar: Finding = field(default_factory=lambda: Finding("/dev/ttyACM0", GEOMETRY, "p", "SCIP 2.0"))
+    t_utc: float = 1.76e9
+    follows: bool | None = True
+    room: int = 10 << 30
+    ports: dict[int, int] = field(default_factory=dict)
+    compiled: bool = True
+    no_cache: str = ""
+    rights: bool = True
+
+    def utc(self) -> float:
+        return self.t_utc
+
+    def synchronised(self) -> bool | None:
+        return self.follows
+
+    def user(self) -> str:
+        return "anna"
+
+    def exists(self, path: str) -> bool:
+        return path not in self.missing
+
+    def usable(self, path: str) -> bool:
+        return path not in self.closed
+
+    def lidars(self) -> list[str]:
+        return self.ttys
+
+    def lidar_at(self, device: str) -> Finding:
+        return self.lidar
+
+    def chips_on(self, bus: str) -> BusFinding:
+        return self.bus
+
+    def free_bytes(self, folder: Path) -> int:
+        return self.room
+
+    def taken(self, kind: socket.SocketKind, host: str, port: int) -> OSError | None:
+        return OSError(self.ports[port], os.strerror(self.ports[port])) if port in self.ports else None
+
+    def resolved(self, host: str) -> str:
+        return "Name or service not known" if host == "nohost" else ""
+
+    def warm(self, lights: bool) -> bool:
+        if self.no_cache:
+            raise RuntimeError(self.no_cache)
+        return self.compiled
+
+    def realtime(self) -> bool:
+        return self.rights
+
+    def listen(self, path: Path) -> Heard | Mute | str:
+        return self.heard
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """A configuration with everything in it."""
+    (tmp_path / "lights.toml").write_text((ROOT / "systemd/lights/room-of-16.toml").read_text())
+    (tmp_path / "lumiloop.toml").write_text(CONFIG)
+    return tmp_path / "lumiloop.toml"
+
+
+def asked(file: Path | None, host: Host, *words: str, as_json: bool = False) -> int:
+    return examine(argparse.Namespace(config=file, set=list(words), stream=None, json=as_json), host)
+
+
+def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(file, Computer()) == parser.OK
+    said = capsys.readouterr().out
+    assert said.endswith("nothing has to be fixed\n")
+    assert "FIX" not in said
+    assert re.search(r"good +lidar +/dev/ttyACM0: UTM-30LX", said)
+    assert re.search(r"good +survey .* 16 lamps", said)
+
+
+def test_a_survey_that_is_not_there_is_named_with_its_line(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file.parent / "lights.toml").unlink()
+    assert asked(file, Computer()) == parser.FAILED
+    said = capsys.readouterr().out
+    assert f"no such survey (`lumiloop survey` makes one from a drive) ({file}:4 names it: `lights.survey`)" in said
+    assert "-> put it there, or name another; `lumiloop check` reads it again" in said
+
+
+def test_a_survey_by_a_name_that_no_file_can_have_is_told_as_any_other(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(CONFIG.replace("lights.toml", "x" * 300))
+    assert asked(file, Computer()) == parser.FAILED
+    assert re.search(r"FIX +survey", capsys.readouterr().out)
+
+
+def broken(**changes: object) -> Callable[[], Computer]:
+    return lambda: Computer(**changes)  # type: ignore[arg-type]  # fields by name
+
+
+TORN = BusFinding(BUS, error=DeviceFault(BUS, "SDA is held low", "switch the converter off and on"))
+WRONG = BusFinding(BUS, "i2c", (Chip(0x4D, "ADC121C021", True),))
+EMPTY = BusFinding(BUS, "i2c", (Chip(0x48, "ADS1015 or ADS1115"),))
+AWRY = Faults(present=tuple(Fault(fault=number, meaning="a lamp", remedy="look") for number in (174, 175)))
+ODD = Heard("agv", 7, POSE, AWRY, lamps={(5, 3): 1, (9, None): 7, (6, 4): 8, (7, 5): 3, (8, 6): 6})
+FAULTY = Heard("agv", 7, POSE, Faults(present=(Fault(fault=104, meaning="no valid scan", remedy="check the cable"),)))
+
+CASES = {
+    "no lidar": (broken(ttys=[]), "lidar", "no serial device", "plug it in and give it power"),
+    "no right to it": (
+        broken(closed={"/dev/ttyACM0"}),
+        "lidar",
+        "may not be opened by anna",
+        "usermod -aG dialout anna",
+    ),
+    "no answer": (
+        broken(lidar=Finding("/dev/ttyACM0", error=DeviceFault("/dev/ttyACM0", "does not answer", "power it"))),
+        *("lidar", "does not answer", "power it"),
+    ),
+    "no bus": (broken(missing={BUS}), "photodiode", "not there", "may have to be enabled first"),
+    "no right to the bus": (broken(closed={BUS}), "photodiode", "may not be opened", "usermod -aG i2c anna"),
+    "bus stuck": (broken(bus=TORN), "photodiode", "SDA is held low", "off and on"),
+    "other converter": (
+        broken(bus=WRONG),
+        "photodiode",
+        "ADC121C021, configured is mcp3221",
+        "set photodiode.converter",
+    ),
+    "no converter": (broken(bus=EMPTY), "photodiode", "no mcp3221 at 0x4d; there is 0x48", "check power, SDA and SCL"),
+    "no time": (broken(t_utc=12.0), "clock", "before 2025", "timedatectl set-ntp true"),
+    "disk full": (broken(room=5 << 20), "disk", "5 MB are free", "free some space"),
+    "port taken": (broken(ports={1502: errno.EADDRINUSE}), "ports", "TCP 127.0.0.1:1502", "`ss -lnp` says who"),
+    "no such address": (
+        broken(ports={1502: errno.EADDRNOTAVAIL}),
+        *("ports", "does not have that address", "set bind to an address of this computer"),
+    ),
+    "no right to the port": (broken(ports={1502: errno.EACCES}), "ports", "Permission denied", "log"),
+    "odometry port taken": (
+        broken(ports={7000: errno.EADDRINUSE}),
+        "ports",
+        "UDP 127.0.0.1:7000",
+        "odometry.port",
+    ),
+    "no cache": (broken(no_cache="no writable directory"), "kernels", "no writable directory", "a folder of its own"),
+    "a fault of the daemon": (broken(heard=FAULTY), "daemon", "fault 104: no valid scan", "check the cable"),
+    "not heard": (broken(heard=Mute("may not listen", "usermod")), "daemon", "may not listen", "usermod"),
+    "no pose": (broken(heard=Heard("agv", 7)), "daemon", "tells no pose", "see its log"),
+    "no lamps": (broken(heard=Heard("agv", 7, POSE)), "lamps", "none is received", "covered"),
+    "lamps that are all dead": (
+        broken(heard=Heard("agv", 7, POSE, lamps={(6, 4): 8, (7, 5): 8})),
+        "lamps",
+        "none is received",
+        "covered",
+    ),
+    "unsurveyed lamp": (broken(heard=ODD), "lamps", "code 9 is received, and no lamp", "add it"),
+    "dead lamp": (broken(heard=ODD), "lamps", "code 6 (lamp 4) should be received", "exchange it"),
+    "moved lamp": (broken(heard=ODD), "lamps", "code 7 (lamp 5) does not shine as surveyed", "survey it anew"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_broken_is_named_with_what_to_do(name: str, file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make, about, text, remedy = CASES[name]
+    assert asked(file, make(), as_json=True) == parser.FAILED
+    found = json.loads(capsys.readouterr().out)
+    wrong = [one for one in found if one["level"] == "fix"]
+    assert any(one["about"] == about and text in one["text"] and remedy in one["remedy"] for one in wrong), wrong
+    assert all(one["remedy"] for one in wrong)
+
+
+def test_a_lamp_that_is_missing_is_not_in_view(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(file, Computer(heard=ODD)) == parser.FAILED
+    assert "4 in view, 1 used" in capsys.readouterr().out
+
+
+REMARKS = {
+    "cold": (broken(compiled=False), "kernels", "lumiloop warm"),
+    "not synchronised": (broken(follows=False), "clock", "timedatectl"),
+    "no real time": (broken(rights=False), "real time", "LimitRTPRIO"),
+    "not running": (broken(), "lamps", "start it"),
+}
+
+
+@pytest.mark.parametrize("name", REMARKS)
+def test_what_works_worse_than_it_could_is_a_note(name: str, file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make, about, remedy = REMARKS[name]
+    assert asked(file, make(), as_json=True) == parser.OK
+    found = json.loads(capsys.readouterr().out)
+    assert any(f["about"] == about and f["level"] == "remark" and remedy in f["remedy"] for f in found)
+
+
+def test_the_first_to_fix_is_named_last(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(file, Computer(ttys=[], room=0, ports={1502: errno.EADDRINUSE})) == parser.FAILED
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("4 to fix; first: disk: free some space")
+
+
+def test_files_that_are_wrong(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file.write_text(CONFIG + "lidar.devise = 3\n")
+    assert asked(file, Computer()) == parser.USAGE
+    assert "devise" in capsys.readouterr().out
+    file.write_text(CONFIG + 'map.folder = "lumiloop.toml"\n')
+    assert asked(file, Computer()) == parser.FAILED
+    assert "is no folder" in capsys.readouterr().out
+    (tmp_path / "lights.toml").write_text("lamp = 5")
+    file.write_text(CONFIG)
+    assert asked(file, Computer()) == parser.FAILED
+    assert re.search(r"FIX +survey", capsys.readouterr().out)
+
+
+def test_another_sensor_than_the_one_configured(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(file, Computer(), "lidar.device=auto:H1") == parser.FAILED
+    assert "serial H0906091, configured is H1" in capsys.readouterr().out
+
+
+def test_lines_receivers_and_mounts_are_looked_at(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("modbus.serial=/dev/ttyS99@9600,8N1", 'pose.receivers=["nohost:5600", "*:5601"]', "lidar.mount.x=20")
+    assert asked(file, Computer(missing={"/dev/ttyS99"}), *words) == parser.FAILED
+    said = capsys.readouterr().out
+    assert re.search(r"FIX +modbus +/dev/ttyS99: not there", said)
+    assert re.search(r"FIX +receivers +nohost:5600: Name or service not known", said)
+    assert re.search(r"note +configuration +`lidar.mount.x` = 20: metres", said)
+    assert asked(file, Computer(), words[0]) == parser.OK
+
+
+def test_a_folder_that_cannot_be_made_is_not_a_full_disk(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file.write_text(CONFIG + 'map.folder = "/proc/maps"\n')
+    assert asked(file, Computer(room=0)) == parser.FAILED
+    said = capsys.readouterr().out
+    assert "FIX  maps" in said
+    assert "/proc/maps: cannot be made by this user" in said
+    assert "where /proc" not in said
+
+
+@pytest.mark.parametrize(("heard", "verdict"), [("nobody listens there", "FIX"), (Heard("lumiloop", 77, POSE), "good")])
+def test_a_folder_that_another_daemon_has_is_to_be_fixed_and_our_own_daemons_is_not(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], heard: Heard | str, verdict: str
+) -> None:
+    other = Store(tmp_path / "maps")
+    other.claim()
+    asked(file, Computer(heard=heard), f"map.folder={tmp_path / 'maps'}")
+    words = rf"{verdict} +maps +.*process {os.getpid()} keeps its maps there"
+    assert re.search(words, capsys.readouterr().out)
+    other.close()
+
+
+def test_maps_are_judged_by_what_they_are_and_not_by_their_names(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "rooms that cannot be entered"
+    folder.mkdir()
+    file.write_text(f'{CONFIG}map.folder = "{folder}"\n')
+    assert asked(file, Computer()) == parser.OK
+    assert re.search(r"good +maps +.*no map in it yet", capsys.readouterr().out)
+    (folder / "00000001-1.lumimap").write_bytes(b"no map")
+    assert asked(file, Computer()) == parser.FAILED
+    assert re.search(r"FIX +maps +.*no map in it can be used", capsys.readouterr().out)
+
+
+def test_a_running_daemon_is_listened_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.diagnosis.host.LISTEN_S", 1.0)
+    with served(tmp_path / "s"):
+        heard = Host().listen(tmp_path / "s")
+    assert isinstance(heard, Heard)
+    assert heard.name == "agv"
+    assert heard.pose is not None
+    assert heard.lamps == {(5, 12): 1, (6, None): 7}
+    why = Host().listen(tmp_path / "none")
+    assert isinstance(why, str)
+    assert "nobody listens" in why
+
+
+def test_the_computer_itself_answers() -> None:
+    host = Host()
+    assert host.synchronised() in (True, False, None)
+    assert host.free_bytes(Path("/no/such/folder")) > 0
+    assert host.user()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port = sock.getsockname()[1]
+        why = host.taken(socket.SOCK_DGRAM, "127.0.0.1", port)
+        assert why is not None
+        assert why.errno == errno.EADDRINUSE
+    assert host.taken(socket.SOCK_DGRAM, "127.0.0.1", port) is None
+    assert host.resolved("127.0.0.1") == ""
+    assert host.resolved("no host") != ""
+    assert host.realtime() in (True, False)
+    assert isinstance(host.lidars(), list)
+    assert isinstance(host.buses(), list)
+
+
+def test_a_daemon_that_cannot_be_heard_is_there_all_the_same(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its devices are in use: to open them would disturb a robot that drives."""
+    monkeypatch.setattr("daemon.diagnosis.host.LISTEN_S", 0.2)
+    with socket.socket(socket.AF_UNIX) as hung:
+        hung.bind(str(tmp_path / "s"))
+        hung.listen()
+        heard = Host().listen(tmp_path / "s")
+    assert isinstance(heard, Mute)
+    assert "a daemon is there and says nothing" in heard.text
+    assert isinstance(Host().listen(tmp_path / "s"), str), "a socket that is left over is no daemon"
+
+    def closed(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr("daemon.diagnosis.host._reach", closed)
+    heard = Host().listen(tmp_path / "none")
+    assert isinstance(heard, Mute)
+    assert "usermod -aG lumiloop-stream" in heard.remedy
+
+    class Opened(Computer):
+        def lidar_at(self, device: str) -> Finding:
+            raise AssertionError("the daemon's lidar was opened")
+
+        def chips_on(self, bus: str) -> BusFinding:
+            raise AssertionError("the daemon's bus was opened")
+
+    assert asked(file, Opened(heard=heard)) == parser.FAILED
+    said = capsys.readouterr().out
+    assert "1 to fix; first: daemon: sudo usermod" in said
+
+
+@pytest.mark.parametrize("use", [3, 8])
+def test_a_lamp_in_a_passing_shadow_is_nothing_to_fix(file: Path, capsys: pytest.CaptureFixture[str], use: int) -> None:
+    shaded = Heard("agv", 7, POSE, lamps={(5, 3): 1, (7, 5): use})
+    asked(file, Computer(heard=shaded))
+    said = capsys.readouterr().out
+    assert not re.search(r"FIX +lamps", said)
+    assert "at this moment" in said

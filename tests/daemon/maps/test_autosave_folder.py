@@ -1,0 +1,155 @@
+"""A folder of maps that cannot be used: told from the start, tried again, and no fault any more when it is free."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+from pathlib import Path
+
+import pytest
+
+from daemon.maps.autosave import EVERY_S, FIRST_S, LOOK_S, RETRY_S, About, Keeper
+from daemon.maps.store import Store
+from estimator.state import new_state
+from tests.daemon.keeping import Bench
+
+
+def second(folder: Path) -> tuple[Store, Bench]:
+    """A store that holds a folder of maps, and a bench that has asked for it in vain."""
+    other, bench = Store(folder), Bench(folder)
+    other.claim()
+    assert bench.store is not None
+    bench.store.claim()
+    return other, bench
+
+
+def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) -> None:
+    async def run() -> None:
+        tmp_path.joinpath("map-00000077-00000001.lumimap").write_bytes(b"x")
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        bench.store.load()
+        assert bench.keeper.refused
+        bench.drive()
+        await bench.turn(FIRST_S)
+        assert not bench.keeper.refused
+
+    asyncio.run(run())
+
+
+def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_done(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        other, bench = second(tmp_path)
+        keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
+        assert keeper.fault
+        bench.keeper = keeper
+        bench.drive()
+        await bench.turn(FIRST_S)
+        assert keeper.fault
+        assert caplog.text.count("another process keeps its maps there") == 1
+        await keeper.finish()
+        assert "it is tried again" not in caplog.text
+        other.close()
+        bench.drive()
+        await bench.turn(RETRY_S)
+        assert not keeper.fault
+        assert bench.files == 1
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("loaded", [True, False])
+def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_nothing_to_save(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, loaded: bool
+) -> None:
+    async def run() -> None:
+        other = Store(tmp_path)
+        other.claim()
+        bench = Bench(tmp_path, state=new_state() if loaded else None)
+        assert bench.store is not None
+        bench.store.claim()
+        bench.keeper = keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
+        for _ in range(3):
+            await bench.turn(LOOK_S)
+            assert keeper.fault
+        assert caplog.text.count("another process keeps its maps there") == 1
+        other.close()
+        await bench.turn(LOOK_S)
+        assert not keeper.fault
+        assert (bench.files, keeper.busy_since) == (0, None)
+        third = Store(tmp_path)
+        third.claim()
+        assert "another process" in third.trouble, "it is ours now"
+        await keeper.finish()
+
+    with caplog.at_level(logging.INFO):
+        asyncio.run(run())
+    assert f"maps can be kept in {tmp_path} from now on" in caplog.text
+
+
+def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:
+    async def run() -> None:
+        folder = tmp_path / "maps"
+        folder.write_text("no folder")
+        bench = Bench(folder)
+        assert bench.store is not None
+        bench.store.claim()
+        bench.keeper = Keeper(bench.store, None, lambda: None, lambda: 0x77, About(), bench.clock)
+        first = bench.keeper.error
+        folder.unlink()
+        other = Store(folder)
+        other.claim()
+        await bench.turn(LOOK_S)
+        assert bench.keeper.error not in ("", first)
+        assert "another process" in bench.keeper.error
+        other.close()
+        await bench.turn(LOOK_S)
+        assert bench.keeper.error == ""
+        await bench.keeper.finish()
+
+    asyncio.run(run())
+
+
+def test_a_save_that_was_asked_for_and_failed_is_tried_again_though_nothing_is_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def run() -> None:
+        bench = Bench(tmp_path)
+        assert bench.store is not None
+        bench.drive()
+        await bench.turn(FIRST_S)
+
+        def full(data: bytes, map_id: int) -> Path:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        with monkeypatch.context() as without:
+            without.setattr(bench.store, "save", full)
+            bench.keeper.ask(bench.told.append)
+            await bench.turn()
+            await bench.turn(RETRY_S)
+        assert bench.keeper.fault
+        await bench.turn(RETRY_S)
+        assert not bench.keeper.fault
+        assert bench.keeper.saves == 2
+        await bench.turn(10.0 * EVERY_S)
+        assert bench.keeper.saves == 2
+
+    asyncio.run(run())
+
+
+def test_at_the_stop_what_there_is_is_saved_though_the_folder_has_not_been_looked_at(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        other, bench = second(tmp_path)
+        other.close()
+        bench.drive()
+        bench.clock.t += LOOK_S
+        await bench.keeper.finish()
+        assert bench.files == 1
+
+    asyncio.run(run())
+    assert "could not be saved" not in caplog.text

@@ -1,0 +1,169 @@
+"""Maps of map_server and nav2: every field and mode, pictures as Pillow writes them, and what is wrong said clearly."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from daemon.maps.grey_image import BadPicture, Picture, read_picture
+from daemon.maps.map_server import BadMapServer, cells_of, describe, load
+
+YAML = (
+    "image: map.pgm\nresolution: 0.05\norigin: [-1.0, 2.0, 0.5]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+)
+HERE = Path("floor.yaml")
+GREYS = np.array([[0, 254, 205], [100, 88, 255]], np.uint8)
+MOST = 10_000
+
+
+def test_every_field_is_read() -> None:
+    told = describe(HERE, YAML + "mode: scale\n")
+    assert told.image == Path("map.pgm")
+    assert (told.resolution, told.origin, told.negate, told.mode) == (0.05, (-1.0, 2.0, 0.5), False, "scale")
+    assert (told.occupied, told.free) == (0.65, 0.196)
+
+
+def test_other_ways_to_write_it() -> None:
+    head = '%YAML 1.2\n---\nimage: "a #1.png"  # the floor\nresolution: 5e-2\n'
+    text = f"{head}origin:\n- -1\n- 2\n- 0\nnegate: true\nfoo: bar\n"
+    told = describe(Path("maps/x.yaml"), text)
+    assert told.image == Path("maps/a #1.png")
+    assert (told.origin, told.negate, told.mode, told.occupied) == ((-1.0, 2.0, 0.0), True, "trinary", 0.65)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("image: map.pgm\n", ""), "has no `image`"),
+        (("0.05", "0"), "`resolution` is 0 m"),
+        (("0.05", "five"), "`resolution` is five; it must be a number"),
+        (("[-1.0, 2.0, 0.5]", "[1]"), "`origin` must be"),
+        (("[-1.0, 2.0, 0.5]", "[1, 2, x]"), "`origin` is x"),
+        (("[-1.0, 2.0, 0.5]", "[1, 2,"), "has no end"),
+        (("negate: 0", "negate: 2"), "`negate` is 2"),
+        (("free_thresh: 0.196", "free_thresh: 0.7"), "free the smaller"),
+        (("negate: 0", "negate: 0\nmode: fancy"), "`mode` is fancy"),
+        (("negate: 0", "nonsense"), "line 4 is not `key: value`: nonsense"),
+        (("negate: 0", "image: b.pgm"), "says `image` a second time"),
+    ],
+)
+def test_what_is_wrong_is_said(change: tuple[str, str], says: str) -> None:
+    with pytest.raises(BadMapServer, match=says) as caught:
+        describe(HERE, YAML.replace(*change))
+    assert str(HERE) in str(caught.value)
+
+
+def test_pictures_as_pillow_writes_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.integers(0, 256, (37, 53), np.uint8)
+    smooth = (np.add.outer(np.arange(40), np.arange(60)) * 2).astype(np.uint8)
+    colour = rng.integers(0, 256, (20, 31, 3), np.uint8)
+    clear = rng.integers(0, 256, (20, 31, 4), np.uint8)
+    for array in (grey, smooth):
+        for name in ("a.pgm", "a.png"):
+            Image.fromarray(array).save(tmp_path / name)
+            found = read_picture((tmp_path / name).read_bytes(), MOST)
+            np.testing.assert_allclose(found.grey, array / 255.0)
+    Image.fromarray(colour).save(tmp_path / "c.png")
+    found = read_picture((tmp_path / "c.png").read_bytes(), MOST)
+    np.testing.assert_allclose(found.grey, colour.mean(axis=2) / 255.0)
+    Image.fromarray(clear).save(tmp_path / "d.png")
+    found = read_picture((tmp_path / "d.png").read_bytes(), MOST)
+    assert found.alpha is not None
+    np.testing.assert_allclose(found.alpha, clear[..., 3] / 255.0)
+    Image.fromarray(grey).quantize(16).save(tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as again:
+        expected = np.array(again.convert("RGB")).mean(axis=2) / 255.0
+    np.testing.assert_allclose(read_picture((tmp_path / "p.png").read_bytes(), MOST).grey, expected)
+    Image.fromarray(grey > 100).save(tmp_path / "b.png")
+    np.testing.assert_array_equal(read_picture((tmp_path / "b.png").read_bytes(), MOST).grey, grey > 100)
+    Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "w.png")
+    np.testing.assert_allclose(read_picture((tmp_path / "w.png").read_bytes(), MOST).grey, grey / 255.0, atol=1e-9)
+
+
+def test_plain_pgm_and_comments() -> None:
+    found = read_picture(b"P2\n# by hand\n3 2\n255\n0 254 205\n# more\n100 88 255\n", MOST)
+    np.testing.assert_allclose(found.grey, GREYS / 255.0)
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (b"GIF89a", "neither PGM nor PNG"),
+        (b"P5 3", "its head is not that of a PGM"),
+        (b"P5\n3 2\n255\n12345", "ends after 5 of its 6 pixels"),
+        (b"P5\n30000 20000\n255\n", "30000 x 20000 pixels"),
+        (b"P5\n3 2\n70000\n", "largest value"),
+        (b"P2\n1 1\n255\nx", "something else than whole numbers"),
+        (b"P2\n1 1\n9\n10", "beyond its largest"),
+    ],
+)
+def test_pictures_that_are_none(data: bytes, says: str) -> None:
+    with pytest.raises(BadPicture, match=says):
+        read_picture(data, MOST)
+
+
+def test_a_png_that_is_cut_off_or_damaged(tmp_path: Path) -> None:
+    Image.fromarray(GREYS).save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    for cut in range(8, len(data)):
+        with pytest.raises(BadPicture):
+            read_picture(data[:cut], MOST)
+    for at in range(8, len(data), 3):
+        with pytest.raises(BadPicture):
+            read_picture(data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :], MOST)
+
+
+def cells(mode: str, grey: object, alpha: object = None, negate: int = 0) -> list[list[int]]:
+    told = describe(HERE, YAML.replace("negate: 0", f"negate: {negate}") + f"mode: {mode}\n")
+    shades = np.atleast_2d(np.array(grey, dtype=np.float64)) / 255.0
+    clear = None if alpha is None else np.atleast_2d(np.array(alpha, dtype=np.float64)) / 255.0
+    return cells_of(told, Picture(shades, clear)).tolist()
+
+
+def test_the_rules_of_each_mode() -> None:
+    assert cells("trinary", GREYS) == [[-1, 1, 0], [1, 0, -1]]  # bottom row first; 100: p 0.61, 88: 0.655
+    assert cells("trinary", GREYS, negate=1) == [[-1, -1, 1], [0, 1, 1]]
+    assert cells("scale", [0, 254, 0], alpha=[255, 255, 128]) == [[1, 0, -1]]
+    assert cells("trinary", [0, 254], alpha=[255, 255]) == [[-1, 0]]  # transparency counts as a colour there
+    assert cells("raw", [100, 0, 255, 50]) == [[1, 0, -1, -1]]
+
+
+def test_a_map_of_two_files(tmp_path: Path) -> None:
+    (tmp_path / "floor.yaml").write_text(YAML)
+    with pytest.raises(BadMapServer, match="No such file"):
+        load(tmp_path / "floor.yaml")
+    (tmp_path / "map.pgm").write_bytes(b"P5\n3 2\n255\n12345")
+    with pytest.raises(BadMapServer, match=r"map.pgm: ends after 5"):
+        load(tmp_path / "floor.yaml")
+    Image.fromarray(GREYS).save(tmp_path / "map.pgm")
+    assert load(tmp_path / "floor.yaml")[1].tolist() == [[-1, 1, 0], [1, 0, -1]]
+    (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(BadMapServer, match="is not text"):
+        load(tmp_path / "x.yaml")
+    with pytest.raises(BadMapServer, match="cannot be read"):
+        load(tmp_path / "none.yaml")
+
+
+@given(st.text(alphabet="image:resolutnrgdc_ths-[],.0123456789#'\"\n \t%", max_size=300))
+def test_no_text_does_more_than_be_refused(text: str) -> None:
+    with contextlib.suppress(BadMapServer):
+        assert describe(HERE, text).resolution > 0.0
+
+
+@given(st.sampled_from((b"P5\n", b"P2\n", b"P5 4 4 255\n", b"P2 2 2 9\n")), st.binary(max_size=80))
+def test_no_bytes_do_more_than_be_refused(head: bytes, data: bytes) -> None:
+    with contextlib.suppress(BadPicture):
+        assert read_picture(head + data, MOST).grey.max() <= 1.0
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_bytes(b"image: a\0b.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(BadMapServer, match="`image` must be the name of a picture"):
+        load(tmp_path / "a.yaml")

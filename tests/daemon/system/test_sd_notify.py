@@ -1,0 +1,40 @@
+"""The service manager's protocol over a real datagram socket."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from daemon.system.sd_notify import notify
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_words_arrive_as_one_datagram(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool) -> None:
+    name = f"@lumiloop-test-{os.getpid()}" if abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(name.replace("@", "\0", 1))
+        manager.settimeout(5.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        notify("READY=1", "STATUS=running")
+        assert manager.recv(100) == b"READY=1\nSTATUS=running"
+
+
+@pytest.mark.parametrize("address", [None, "", "nonsense", "/nowhere/at/all"])
+def test_without_a_manager_nothing_happens(monkeypatch: pytest.MonkeyPatch, address: str | None) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    if address is not None:
+        monkeypatch.setenv("NOTIFY_SOCKET", address)
+    notify("WATCHDOG=1")
+
+
+def test_without_a_free_file_descriptor_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(*kind: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setenv("NOTIFY_SOCKET", "/run/notify")
+    monkeypatch.setattr(socket, "socket", none_left)
+    notify("WATCHDOG=1")

@@ -1,0 +1,226 @@
+"""What the map knows better than light does of the pose that light holds, and what is not taken from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimator.fusion.map_odom_filter import Absolute, correct
+from estimator.mapping.graph_pose_prior import Said, said, surplus, take
+from estimator.mapping.loop_closure import take_answer
+from estimator.mapping.pose_graph import UPPER, Graph, optimise
+from estimator.mapping.relative_covariance import tied
+from estimator.measurements import Answer, Array
+from estimator.numerics import se2
+from estimator.relocalisation.hypothesis_tracking import Watch
+from estimator.state import State
+from tests.estimator.circuit import TOLD, circuit, driven, run_jobs
+
+VAGUE = np.diag((0.4**2, 0.4**2, 0.1**2))
+SURE = np.diag((0.04**2, 0.04**2, 0.02**2))
+HOW = (50, 1e-4, 10.0)
+
+
+def lit(tie: Array, told: Array = SURE) -> tuple[State, Array]:
+    """After a drive, light has said of each submap but the newest where it lies; the tie is as sure as said."""
+    state, truth = driven(settings=None)
+    state.settings = replace(state.settings, loops=TOLD)
+    state.absolute = Absolute(placed=True, P=tie.copy())
+    for submap in state.atlas.submaps.values():
+        submap.light = truth[submap.first - 1], told
+    return state, truth[-1]
+
+
+def solve(state: State) -> None:
+    state.atlas.stale = True
+    take_answer(state, Answer(0.0, -1, None))
+    run_jobs(state)
+
+
+def off(state: State, truth: Array) -> float:
+    x, y, _ = se2.between(truth, se2.compose(state.T_map_odom, state.fused.T_odom_base)).tolist()
+    return float(np.hypot(x, y))
+
+
+def test_a_robot_that_light_hardly_holds_is_moved_by_what_the_map_knows() -> None:
+    state, truth = lit(VAGUE)
+    before = off(state, truth)
+    solve(state)
+    assert state.absolute is not None
+    assert before > 0.25
+    assert off(state, truth) < 0.12
+    assert np.all(np.diag(state.absolute.P) < 0.25 * np.diag(VAGUE))
+
+
+@pytest.mark.parametrize("since", [0, 61])
+def test_hearing_the_map_does_not_move_the_map(since: int) -> None:
+    """The solution has put it where it belongs; moved with the robot once more, it tore where ``since`` lies."""
+    state, truth = lit(VAGUE)
+    assert state.absolute is not None
+    state.absolute.since = since
+    solve(state)
+    *older, newest = state.atlas.submaps.values()
+    places = circuit()
+    away = [np.hypot(*se2.between(places[piece.first - 1], piece.T_map_submap)[:2]) for piece in older]
+    assert max(away) < 0.08
+    T = se2.compose(newest.T_map_submap, se2.between(newest.T_odom_submap, state.fused.T_odom_base))
+    assert np.hypot(*se2.between(T, se2.compose(state.T_map_odom, state.fused.T_odom_base))[:2]) < 1e-9
+    assert off(state, truth) < 0.12
+
+
+def test_what_the_map_says_is_of_the_survey_even_if_light_moves_it_meanwhile() -> None:
+    """Light moves map and robot by 0.15 m while the graph is being solved; its anchors, and so its word, stay."""
+    ends = []
+    for moved in (0.0, 0.15):
+        state, truth = lit(VAGUE)
+        state.atlas.stale = True
+        take_answer(state, Answer(0.0, -1, None))
+        answers = [Answer(0.0, job.job_id, job.run()) for job in state.atlas.take_jobs()]
+        T_map_base = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+        correct(state, T_map_base + np.array((moved, 0.0, 0.0)), state.fused.T_odom_base)
+        for answer in answers:
+            take_answer(state, answer)
+        run_jobs(state)
+        ends.append(off(state, truth))
+    assert max(ends) < 0.15
+
+
+def test_a_map_that_was_wrong_is_given_up_for_light_that_comes_back() -> None:
+    """A pose that the map has moved far is held by nothing that light could not take back at once."""
+    state, _ = lit(VAGUE)
+    tie, newest = state.absolute, state.atlas.newest
+    assert tie is not None
+    assert newest is not None
+    tie.proved = True
+    take(state, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
+    assert not tie.broken
+    tie.P = VAGUE.copy()
+    take(state, Said(newest.T_map_submap + np.array((0.8, 0.0, 0.0)), SURE))
+    assert tie.broken
+
+
+@pytest.mark.parametrize("how", ["light disagrees", "adrift", "watched"])
+def test_a_map_that_may_be_wrong_is_not_heard(how: str) -> None:
+    state, _ = lit(VAGUE)
+    tie, newest = state.absolute, state.atlas.newest
+    assert tie is not None
+    assert newest is not None
+    if how == "light disagrees":
+        tie.odd_since = 1.0
+    elif how == "adrift":
+        state.atlas.adrift = 1
+    else:
+        state.atlas.watch = Watch(newest.key, 1.0, None)
+    take(state, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
+    np.testing.assert_array_equal(tie.P, VAGUE)
+
+
+def test_the_same_map_heard_again_tells_nothing_new() -> None:
+    state, _ = lit(VAGUE)
+    solve(state)
+    assert state.absolute is not None
+    P, T = state.absolute.P, state.T_map_odom
+    for _ in range(3):
+        solve(state)
+    assert np.trace(state.absolute.P[:2, :2]) > 0.8 * np.trace(P[:2, :2])
+    np.testing.assert_allclose(state.T_map_odom, T, atol=0.02)
+
+
+def test_what_is_mended_is_taken_off_what_the_tie_shares_with_the_pose() -> None:
+    state, _ = lit(VAGUE)
+    assert state.absolute is not None
+    state.absolute.X = 0.5 * VAGUE
+    solve(state)
+    assert np.all(np.diag(state.absolute.X) < 0.25 * np.diag(0.5 * VAGUE))
+    assert len(state.absolute.mended) >= 1
+
+
+@pytest.mark.parametrize("tie", [np.diag((0.02**2, 0.02**2, 0.005**2)), 1e-4 * VAGUE])
+def test_a_robot_that_light_holds_better_stays_where_it_is(tie: Array) -> None:
+    state, _ = lit(tie, told=VAGUE)
+    solve(state)
+    assert state.absolute is not None
+    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
+    np.testing.assert_array_equal(state.absolute.P, tie)
+
+
+def test_a_map_that_contradicts_what_light_is_sure_of_is_not_followed() -> None:
+    """Sure along x and y to a few cm, with the map elsewhere by far more than both allow, but a better heading."""
+    tie = np.diag((0.03**2, 0.03**2, 0.3**2))
+    state, _ = lit(tie, told=np.diag((0.01**2, 0.01**2, 0.002**2)))
+    for submap in state.atlas.submaps.values():
+        T, P = submap.light  # type: ignore[misc]  # all are lit
+        submap.light = T + np.array((2.0, -1.0, 0.0)), P
+    solve(state)
+    assert state.absolute is not None
+    np.testing.assert_array_equal(state.absolute.P, tie)
+    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
+
+
+def chain(anchored: tuple[int, ...], edges: tuple[tuple[int, int], ...]) -> Graph:
+    poses = np.array([(float(k), 0.0, 0.0) for k in range(4)])
+    H = np.array([[np.diag((1e4, 1e4, 1e5))[i, j] for i, j in UPPER]])
+    between = np.array([se2.between(poses[i], poses[j]) for i, j in edges])
+    doubtful = np.zeros(len(edges), np.bool_)
+    at, certainty = poses[list(anchored)], np.repeat(H, len(anchored), axis=0)
+    ways = np.repeat(H, len(edges), axis=0)
+    return Graph(poses, np.array(edges), between, ways, doubtful, np.array(anchored), at, certainty)
+
+
+@pytest.mark.parametrize(
+    ("anchored", "edges", "speaks"),
+    [
+        ((0, 3), ((0, 1), (1, 2), (2, 3)), True),
+        ((3,), ((0, 1), (1, 2), (2, 3)), False),
+        ((0, 3), ((0, 1), (2, 3)), False),
+    ],
+    ids=["one other anchor", "no other anchor", "none that the way joins with it"],
+)
+def test_the_map_says_nothing_of_a_place_that_nothing_but_the_tie_anchors(
+    anchored: tuple[int, ...], edges: tuple[tuple[int, int], ...], speaks: bool
+) -> None:
+    graph = chain(anchored, edges)
+    solution = optimise(graph, *HOW, covariance_of=3)
+    word = said(graph, solution, tied(graph, solution.poses, solution.trust, 3), HOW)
+    assert (word is not None) is speaks
+    if word is not None:  # its anchor's covariance and three steps, the heading's with the lever
+        x, y, yaw = np.diag(word.P).tolist()
+        assert x == pytest.approx(4e-4, rel=1e-3)
+        assert yaw == pytest.approx(4e-5, rel=1e-3)
+        assert y == pytest.approx(4e-4 + 1e-5 * (9.0 + 4.0 + 1.0), rel=1e-3)
+        np.testing.assert_allclose(word.T_map_newest, (3.0, 0.0, 0.0), atol=1e-9)
+
+
+sizes = st.floats(0.1, 10.0)
+angles = st.floats(-3.0, 3.0)
+
+
+@given(st.tuples(sizes, sizes, sizes), st.tuples(sizes, sizes, sizes), angles, angles, st.floats(1e-2, 1e2))
+def test_surplus_is_what_exceeds_in_each_direction_in_whatever_units(
+    one: tuple[float, ...], other: tuple[float, ...], turn: float, lean: float, unit: float
+) -> None:
+    A = np.zeros((3, 3))
+    A[:2, :2] = ((np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn)))
+    A[2, 2], A[2, 0] = 1.0, np.sin(lean)
+    L, than = A @ np.diag(one) @ A.T, np.diag(other)
+    G = surplus(L, than)
+    assert np.linalg.eigvalsh(G).min() > -1e-9
+    sum_ = than + G
+    assert np.linalg.eigvalsh(sum_ - L).min() > -1e-9 * np.trace(sum_), "no direction is told less than by either"
+    np.testing.assert_allclose(surplus(L, sum_), 0.0, atol=1e-8 * np.trace(sum_))
+    scale = np.diag((1.0, 1.0, unit))
+    np.testing.assert_allclose(
+        surplus(scale @ L @ scale, scale @ than @ scale), scale @ G @ scale, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_surplus_over_an_information_that_rounding_has_made_indefinite_is_finite() -> None:
+    than = np.diag((1e10, 1e3, -1e-7))
+    G = surplus(np.diag((1.0, 1.0, 1e6)), than)
+    assert np.isfinite(G).all()
+    assert G[2, 2] == pytest.approx(1e6, rel=0.1)
+    assert abs(G[0, 0]) < 1.0

@@ -1,0 +1,110 @@
+"""Sockets get half of the loop's time, and everything that waited is served afterwards."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+from hal.net.fair_share import PART, SLICE_S, Reader, Share
+
+
+class Watch:
+    """A stopwatch that is told the time."""
+
+    def __init__(self) -> None:
+        self.t = 100.0
+
+    def __call__(self) -> float:
+        return self.t
+
+
+def test_a_slice_is_used_up_and_comes_again() -> None:
+    watch = Watch()
+    share = Share(watch)
+    used = 0
+    while share.begin():
+        watch.t += 0.001
+        share.end()
+        used += 1
+    assert used == round(PART * SLICE_S / 0.001)
+    assert abs(share.left_s() - (1.0 - PART) * SLICE_S) < 1e-9
+    assert (share.begin(), share.held) == (False, 2)
+    watch.t += share.left_s() + 1e-6
+    assert share.begin()
+    assert share.left_s() > 0.9 * SLICE_S
+
+
+def test_one_long_call_does_not_borrow_from_the_slices_to_come() -> None:
+    watch = Watch()
+    share = Share(watch)
+    assert share.begin()
+    watch.t += 7.3 * SLICE_S
+    share.end()
+    assert share.left_s() == 0.0
+    assert share.begin()
+
+
+def test_a_clock_that_steps_back_holds_nobody_for_ever() -> None:
+    watch = Watch()
+    share = Share(watch)
+    assert share.begin()
+    watch.t += SLICE_S * PART
+    share.end()
+    watch.t -= 50.0
+    assert share.begin()
+
+
+def test_a_flood_waits_for_the_next_slice_and_is_served_then() -> None:
+    served = 0
+
+    async def run() -> tuple[int, int]:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        ours.setblocking(False)
+        watch = Watch()
+        share = Share(watch)
+
+        def serve() -> None:
+            nonlocal served
+            served += len(ours.recv(1))
+            watch.t += 0.6 * PART * SLICE_S
+
+        reader = Reader(ours.fileno(), serve, share)
+        for _ in range(6):
+            theirs.send(b"x")
+        await asyncio.sleep(0.005)
+        first = served
+        for _ in range(200):
+            watch.t += 0.1 * SLICE_S
+            await asyncio.sleep(0.001)
+        reader.close()
+        reader.close()
+        theirs.send(b"y")
+        await asyncio.sleep(0.02)
+        ours.close()
+        theirs.close()
+        return first, served
+
+    assert asyncio.run(run()) == (2, 6)
+
+
+def test_closing_while_waiting_ends_it() -> None:
+    async def run() -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        watch = Watch()
+        share = Share(watch)
+
+        def serve() -> None:
+            watch.t += SLICE_S * PART
+            ours.recv(1)
+
+        reader = Reader(ours.fileno(), serve, share)
+        for _ in range(3):
+            theirs.send(b"x")
+        await asyncio.sleep(0.002)
+        assert share.held >= 1
+        reader.close()
+        await asyncio.sleep(2 * SLICE_S)
+        ours.close()
+        theirs.close()
+
+    asyncio.run(run())

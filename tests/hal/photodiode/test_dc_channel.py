@@ -1,0 +1,189 @@
+"""The DC channel: dark, dazzled and dead told apart; whatever happens to it, sampling goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import numpy as np
+import pytest
+
+from hal.photodiode.dc_channel import LevelInput
+from hal.photodiode.driver import Sampling
+from tests.hal.photodiode.bench import Bench, on_fake
+
+DC = Sampling(level=LevelInput(full_scale_v=3.0, rest_v=0.0))
+
+
+def with_level(bench: Bench, volts: float = 1.2, chip: str = "ADS1115") -> None:
+    bench.device.add_level(lambda t: np.full_like(t, volts / 3.3), chip=chip)
+
+
+@pytest.mark.parametrize("chip", ["ADS1115", "ADS1015"])
+def test_level_is_read_between_blocks(chip: str) -> None:
+    async def body(bench: Bench) -> None:
+        with_level(bench, chip=chip)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            blocks = await bench.more(60, 10.0, driver)
+        assert driver.status.extra["dc_level"] == "40.0 %"
+        assert not any(block.blemish for block in blocks)
+
+    on_fake(body)
+
+
+def test_level_counts_from_rest() -> None:
+    """0.1 V is no light: the amplifier's bias."""
+
+    async def body(bench: Bench) -> None:
+        with_level(bench, 1.7)
+        driver = bench.driver(Sampling(level=LevelInput()))
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+        assert driver.status.extra["dc_level"] == "50.0 %"
+
+    on_fake(body)
+
+
+def test_light_without_lamps_is_neither_dark_nor_dead() -> None:
+    """Daylight only: nothing flickers, the converter's own noise goes on."""
+
+    async def body(bench: Bench) -> None:
+        noise = np.random.default_rng(4)
+        bench.device._source = lambda t: 0.5 + 1.1e-4 * noise.standard_normal(t.size)
+        with_level(bench)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(60, 10.0, driver)
+            assert "there is light, but no lamp in it" in str(driver.status.error)
+            assert driver.status.recoveries == 0
+
+    on_fake(body)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("dark", "dark: no light reaches the photodiode .*cover"),
+        ("saturated", "dazzled: the amplifier is saturated .*shade"),
+        ("stuck", "though there is light: the converter or its input is dead .*wire"),
+    ],
+)
+def test_causes_are_told_apart(fault: str, says: str, late: float) -> None:
+    async def body(bench: Bench) -> None:
+        with_level(bench)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            await asyncio.sleep(late)
+            bench.order(f"what = '{fault}'")
+            told: set[str] = set()
+            for _ in range(300):
+                await asyncio.sleep(0.01)
+                told |= {str(driver.status.error)} if driver.status.error else set()
+            assert len(told) == 1, told  # and never another cause first
+            with pytest.raises(AssertionError, match=says):
+                raise AssertionError(str(driver.status.error))
+            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+            await asyncio.sleep(2.0)
+            assert driver.status.error is None
+
+    on_fake(body)
+
+
+def test_a_converter_that_is_dark_for_a_known_reason_is_left_alone() -> None:
+    async def body(bench: Bench) -> None:
+        with_level(bench)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            bench.order("what = 'dark'")
+            await asyncio.sleep(100.0)
+            assert driver.status.recoveries == 0
+            assert driver.status.blocks > 1900
+
+    on_fake(body)
+
+
+def test_a_dead_converter_is_started_afresh_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            bench.order("what = 'stuck'")
+            await asyncio.sleep(100.0)
+            assert 3 <= driver.status.recoveries <= 4
+            assert "dead converter" in str(driver.status.error)
+
+    with caplog.at_level(logging.INFO, "hal"):
+        on_fake(body)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 1, told
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [("what = 'dc_off'", "has no registers"), ("what = 'error'; name = 'EIO'; on = 'all'", None)],
+)
+def test_sampling_goes_on_without_it(fault: str, says: str | None) -> None:
+    async def body(bench: Bench) -> None:
+        with_level(bench)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            bench.order(fault)
+            await asyncio.sleep(6.0)
+            if says:
+                assert says in driver.status.extra["dc_level"]
+                assert driver.status.blocks > 140
+            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+            await asyncio.sleep(10.0)
+            assert driver.status.extra["dc_level"] == "40.0 %"
+
+    on_fake(body)
+
+
+def test_a_brownout_of_the_dc_channel_is_no_darkness() -> None:
+    """After a reset it converts nothing and reads 0: its configuration is looked at before every reading."""
+
+    async def body(bench: Bench) -> None:
+        with_level(bench)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            for _ in range(5):
+                bench.order("what = 'brownout'")
+                await asyncio.sleep(1.3)
+                assert driver.status.extra["dc_level"] == "40.0 %"
+
+    on_fake(body)
+
+
+@pytest.mark.parametrize("wrong", ["LM75", "24C02"])
+def test_another_chip_in_its_place(wrong: str) -> None:
+    async def body(bench: Bench) -> None:
+        bench.device.add_level(lambda t: np.full_like(t, 0.5), chip=wrong)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+        assert "thresholds" in driver.status.extra["dc_level"]
+
+    on_fake(body)
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"chip": "MCP3221"}, "expected ADS1015 or ADS1115"),
+        ({"address": 0x4D}, "0x48 to 0x4b"),
+        ({"channel": 4}, "expected 0 to 3"),
+        ({"full_scale_v": 0.0}, "expected up to"),
+        ({"full_scale_v": 7.0}, "expected up to"),
+        ({"rest_v": 3.3}, "at rest at 3.3 V"),
+        ({"rest_v": -0.1}, "at rest"),
+    ],
+)
+def test_an_input_that_cannot_be(fields: dict[str, object], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        LevelInput(**fields)  # type: ignore[arg-type]  # keyword names vary

@@ -1,0 +1,67 @@
+"""What other programs would take wrongly: maps that are gone, beams without an echo."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
+from rosbags.typesys import Stores, get_typestore
+
+from daemon.config.schema import Mount
+from daemon.publish.stream_server import SIDE, scan_message
+from daemon.snapshot import State
+from taps.ros.messages import AGAIN_S, Translator
+from taps.stream.messages import MapTiles, Pose, Scan
+from tests.daemon.publish.test_stream_server import GEOMETRY, raw_scan
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def pose(t: float) -> Pose:
+    return Pose(seq=1, t_mono=t, t_sent=t, t_utc=1.7e9 + t, state=3, state_name="TRACKING", reason=0)
+
+
+def tile(fill: int) -> MapTiles:
+    cells = zlib.compress(np.full((SIDE, SIDE), fill, np.int8).tobytes())
+    return MapTiles(map_id=1, resolution=0.05, side=SIDE, unit=0.1, version=1, more=False, tiles=((2, 3, cells),))
+
+
+def told(translator: Translator, topic: str, *frames: Any) -> list[Any]:
+    out = [one for frame in frames for one in translator.take(frame) if one.topic == topic]
+    kind = {
+        "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/map": "nav_msgs/msg/OccupancyGrid",
+        "/scan": "sensor_msgs/msg/LaserScan",
+    }[topic]
+    return [STORE.deserialize_cdr(one.data, kind) for one in out]
+
+
+def test_a_map_that_was_reset_does_not_stay_latched() -> None:
+    """The last message on a latched topic is what everybody gets who comes later: it was the map that had gone."""
+    translator = Translator(Mount())
+    (before,) = told(translator, "/map", tile(20), pose(1.0))
+    assert set(before.data) == {100}
+    (after,) = told(translator, "/map", tile(0), pose(2.0), pose(2.0 + AGAIN_S))
+    assert (after.info.width, after.info.height, list(after.data)) == (1, 1, [-1])
+    assert not told(translator, "/map", pose(3.0 + 2.0 * AGAIN_S))
+
+
+def test_beams_without_an_echo_are_infinite_and_those_that_say_nothing_are_no_number() -> None:
+    """REP-117."""
+    raw = replace(raw_scan(), code=np.array([GEOMETRY.dmax + 1, 0, 8], np.int32), ranges=np.zeros(3, np.int32))
+    (scan,) = told(Translator(Mount()), "/scan", pose(1.0), msgspec.convert(scan_message(raw), Scan))
+    np.testing.assert_array_equal(scan.ranges, np.array([np.inf, np.nan, np.nan], np.float32))
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_a_guess_is_no_pose(state: State) -> None:
+    """Who reads /pose alone takes it for where the robot is, as evo does; trajectories leave guesses out, too."""
+    known = msgspec.structs.replace(pose(1.0), pose=(1.0, 2.0, 0.5), covariance=(1.0, 0.0, 1.0, 0.0, 0.0, 1.0))
+    found = told(Translator(Mount()), "/pose", msgspec.structs.replace(known, state=int(state)))
+    assert len(found) == (state not in (State.LOST, State.RELOCATING, State.AMBIGUOUS))

@@ -1,0 +1,1 @@
+"""Benchmarks of the whole daemon as a process."""

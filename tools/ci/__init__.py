@@ -1,0 +1,1 @@
+"""Checks of the repository: coverage floors, contracts, figures as data."""

@@ -1,0 +1,1 @@
+"""`make demo`: the daemon on a simulated robot under coded lamps."""

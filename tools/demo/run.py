@@ -1,0 +1,375 @@
+"""``make demo``: the real daemon and a simulated robot under coded lamps; live pose against truth, a map picture.
+
+The simulator is one process (a lidar on a pty, a photodiode's converter on an I2C bus behind a socket, odometry and
+truth as datagrams), the daemon another (``lumiloop run``), its web page a third (``lumiloop view``). This process reads
+the pose and the links over Modbus, as any PLC would, and compares the pose with the truth of the same instant. On the
+way the photodiode and then the lidar are switched off and on again, or, with --kidnap, the robot is carried away; keys
+do the same at any time. At the end the map is taken from the daemon's own recording. Loopback only; nothing is left
+running.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import json
+import math
+import os
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from daemon.cli.status import NoAnswer, Reader, Reading
+from daemon.snapshot import State
+from tools.demo.acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
+from tools.demo.score import READY, Score, Track, cause, pose_of, summary, verdict
+
+ROOT: Final = Path(__file__).parents[2]
+OUT: Final = Path("out/demo")
+READ_PERIOD_S: Final = 0.05
+LINE_PERIOD_S: Final = 1.0
+COLD_START_S: Final = 300.0
+"""Longest wait for the first start ever, which compiles. After `TELL_S` the viewer is told."""
+TELL_S: Final = 4.0
+STOP_S: Final = 10.0
+INTERRUPTED: Final = 130
+CONFIG: Final = "demo.toml"
+PAGE_LOG: Final = "page.log"
+RECORDING: Final = "recording"
+BUS: Final = "i2c"
+SURVEY: Final = "lamps.toml"
+CONTROL: Final = "control"
+OLD_S: Final = 1.0
+"""Links that have not been told anew for so long are not shown."""
+SHOWN: Final = 4
+"""Links in a line, the strongest."""
+PAGE_PORT: Final = 8090
+"""Where the web page is, if nobody else is there. After `PAGE_S` the robot drives off without it."""
+PAGE_S: Final = 5.0
+LIDAR_X: Final = 0.15
+"""Where the simulated robot carries its lidar (:class:`tools.sim.robot.Body`), told to the daemon as `lidar.mount`."""
+
+
+class DemoError(Exception):
+    """The demo cannot go on; the text says why and where to look."""
+
+
+# processes
+
+
+@contextlib.contextmanager
+def running(command: list[str], log: Path, **kw: Any) -> Iterator[subprocess.Popen[str]]:
+    """A child process in a session of its own (a Ctrl-C here must not reach it first); stopped on the way out."""
+    with log.open("w") as errors:
+        child = subprocess.Popen(command, cwd=ROOT, stderr=errors, text=True, start_new_session=True, **kw)
+        try:
+            yield child
+        finally:
+            stop(child)
+
+
+def stop(child: subprocess.Popen[str]) -> None:
+    """Ask it to end, then make it."""
+    try:
+        if child.poll() is None:
+            child.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(STOP_S)
+    finally:
+        if child.poll() is None:  # it does not listen, or a second Ctrl-C came while we waited
+            child.kill()
+            child.wait()
+        if child.stdout is not None:
+            child.stdout.close()
+
+
+def free_port() -> int:
+    """A port that is free on loopback for both TCP and UDP just now."""
+    for _ in range(50):
+        with socket.socket() as tcp, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            tcp.bind(("127.0.0.1", 0))
+            port = int(tcp.getsockname()[1])
+            with contextlib.suppress(OSError):
+                udp.bind(("127.0.0.1", port))
+                return port
+    raise DemoError("no port is free on 127.0.0.1 for both TCP and UDP; close some programs")
+
+
+def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) -> Path:
+    """The daemon's configuration for this run; its stream is found by the name, which no other run has."""
+    path = folder / CONFIG
+    text = (
+        f'name = "demo-{os.getpid()}"\nbind = "127.0.0.1"\n\n'
+        f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
+        f'[map]\nfolder = "none"\n\n[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\nwrite = true\n'
+    )
+    if lights:
+        text += f'\n[photodiode]\nbus = "unix:{folder / BUS}"\n\n[lights]\nsurvey = "{SURVEY}"\n'
+    path.write_text(text)
+    return path
+
+
+class Patience:
+    """Waits for a child and says once, after a few seconds, that the first start takes long."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._begin, self._told = out, time.monotonic(), False
+
+    def wait(self, child: subprocess.Popen[str], log: str) -> None:
+        """A moment.
+
+        Raises:
+            DemoError: the child has ended, or the wait is over.
+        """
+        waited = time.monotonic() - self._begin
+        if child.poll() is not None:
+            raise DemoError(f"it ended with code {child.returncode} before it was ready; read {self._out / log}")
+        if waited > COLD_START_S:
+            raise DemoError(f"it is not ready after {COLD_START_S:.0f} s; read {self._out / log}")
+        if waited > TELL_S and not self._told:
+            self._told = True
+            print(
+                "not ready yet: a first start compiles the numerical kernels, a minute or two; later ones take seconds",
+                flush=True,
+            )
+        time.sleep(0.05)
+
+
+def wait_for_simulator(simulator: subprocess.Popen[str], patience: Patience) -> None:
+    """Until its devices are there, which it says on its first line."""
+    assert simulator.stdout is not None
+    while not select.select([simulator.stdout], [], [], 0.0)[0]:
+        patience.wait(simulator, "simulator.log")
+
+
+def wait_for_pose(daemon: subprocess.Popen[str], reader: Reader, patience: Patience) -> None:
+    """Until the daemon says that it follows a sensor."""
+    while True:
+        with contextlib.suppress(NoAnswer):
+            if int(reader.read()["state"] or 0) in READY:
+                return
+        patience.wait(daemon, "daemon.log")
+
+
+@contextlib.contextmanager
+def web_page(config: Path, log: Path) -> Iterator[subprocess.Popen[str] | None]:
+    """Serves the web page of the daemon, and says in its log where; None where the library is missing that it needs."""
+    if importlib.util.find_spec("aiohttp") is None:
+        yield None
+        return
+    with socket.socket() as probe:
+        port = 0 if probe.connect_ex(("127.0.0.1", PAGE_PORT)) == 0 else PAGE_PORT
+    words = [sys.executable, "-m", "daemon", "view", "--config", str(config), "--port", str(port), "--write"]
+    with running(words, log, stdout=subprocess.DEVNULL) as server:
+        yield server
+
+
+def page_address(server: subprocess.Popen[str] | None, log: Path) -> str:
+    """Where the page is, as its server says; empty: there is none."""
+    end = time.monotonic() + PAGE_S
+    while server is not None and server.poll() is None and time.monotonic() < end:
+        address = log.read_text().partition("http://")[2]
+        if address.endswith("\n"):
+            return f"http://{address.split()[0]}"
+        time.sleep(0.05)
+    return ""
+
+
+# the show
+
+
+@dataclass(frozen=True, slots=True)
+class Show:
+    """What the demo watches and moves."""
+
+    reader: Reader
+    track: Track
+    stage: Stage
+    children: list[subprocess.Popen[str]]
+
+
+def watch(show: Show, score: Score, seconds: float) -> None:
+    """Read the pose twenty times a second and print a line every second; 0 seconds: for ever."""
+    reader, track, children = show.reader, show.track, show.children
+    print("    t |      x       y     yaw |  error          | state       scans  cycle  reads | lamp:strength, uA")
+    print("    s |      m       m     deg |     cm     deg  |                Hz     ms  per s |")
+    begin = time.monotonic()
+    line_at, read_at = begin + LINE_PERIOD_S, begin
+    reads = 0
+    while not seconds or time.monotonic() - begin < seconds:
+        for child in children:
+            if child.poll() is not None:
+                raise DemoError(f"a process ended with code {child.returncode}: {' '.join(child.args[1:4])}")  # type: ignore[index, arg-type]  # a list
+        asked = time.monotonic()
+        try:
+            reading = reader.read()
+        except NoAnswer:
+            score.unanswered += 1
+            continue
+        now = time.monotonic()
+        score.watched_s = now - begin
+        score.trip_s.append(now - asked)
+        track.collect()
+        score.take(reading, None if reading["t_mono"] is None else track.at(float(reading["t_mono"])))
+        show.stage.press(pressed(), now - begin)
+        off_m, jumps = (score.error_m[-1] if score.error_m else None), int(reading["jumps"] or 0)
+        for told in [*show.stage.play(now - begin, int(reading["state"] or 0), off_m, jumps), *score.news()]:
+            print(f"----- {told}", flush=True)
+        if now >= line_at:
+            print(line(now - begin, score, (score.reads - reads) / (now - line_at + LINE_PERIOD_S)), flush=True)
+            line_at, reads = now + LINE_PERIOD_S, score.reads
+        read_at = max(read_at + READ_PERIOD_S, now)
+        time.sleep(read_at - now)
+
+
+def line(t: float, score: Score, rate: float) -> str:
+    """One line about the latest reading."""
+    reading = score.last
+    pose = pose_of(reading)
+    where = "        no pose yet    " if pose is None else f"{pose[0]:7.3f} {pose[1]:7.3f} {math.degrees(pose[2]):7.1f}"
+    off = "               "
+    if score.error_m:
+        off = f"{100 * score.error_m[-1]:6.1f}  {math.degrees(score.error_rad[-1]):+7.2f}"
+    state = State(int(reading["state"] or 0)).name
+    scans, cycle = reading["scan_rate"] or 0.0, 1e3 * float(reading["cycle"] or 0.0)
+    return f"{t:5.1f} |{where} |{off}  | {state:<11}{scans:6.1f} {cycle:6.2f} {rate:6.1f} | {links(reading)}"
+
+
+def links(reading: Reading) -> str:
+    """How many lamps the position rests on, and the strongest with their IDs and strengths in microamperes."""
+    if reading.get("light_fix") is None:
+        return "no photodiode" if reading.get("links") is None else f"{reading['links']} links"
+    if not reading["links"] or float(reading["light_age"] or 0.0) > OLD_S:
+        return "no light"
+    shown = []
+    for row in range(1, SHOWN + 1):
+        lamp, strength = reading[f"link_{row}_lamp"], reading[f"link_{row}_strength"]
+        if lamp is not None and strength is not None:
+            shown.append(f"{int(lamp)}:{1e6 * float(strength):.3f}")
+    return f"{int(reading['light_used'] or 0):2d} of {int(reading['links']):2d} used  {'  '.join(shown)}"
+
+
+def export_map(folder: Path, out: Path) -> str:
+    """The map with the trajectory, from the daemon's own recording; returns what went wrong, if anything."""
+    words = [sys.executable, "-m", "daemon", "map", "export", str(folder / RECORDING), "--out", str(out / "map")]
+    words += ["--config", str(folder / CONFIG)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        return f"the map could not be exported: {done.stderr.strip()}"
+    shutil.copyfile(out / "map" / "map.png", out / "map.png")
+    print(f"map with trajectory: {out / 'map.png'}")
+    return ""
+
+
+def simulator_words(options: argparse.Namespace, folder: Path, odometry: int, truth: int) -> list[str]:
+    """The simulator's command line."""
+    words = [sys.executable, "-m", "tools.sim", "--building", options.building, "--seed", str(options.seed), "--hold"]
+    words += ["--pty", str(folder / "lidar"), "--odometry", f"udp://127.0.0.1:{odometry}"]
+    words += ["--truth", f"udp://127.0.0.1:{truth}", "--control", str(folder / CONTROL)]
+    if not options.dark:
+        words += ["--light", f"unix:{folder / BUS}", "--survey", str(folder / SURVEY)]
+    return words
+
+
+def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> None:
+    """Run simulator and daemon, and watch; everything is stopped when this returns or raises."""
+    modbus, odometry = free_port(), free_port()
+    config = write_config(folder, modbus, odometry, lights=not options.dark)
+    daemon_words = [sys.executable, "-m", "daemon", "run", "--config", str(config), "--record", str(folder / RECORDING)]
+    acts = programme(options.seconds, options.kidnap) if options.kidnap or not options.dark else []
+    stage = Stage(folder / CONTROL, acts)
+    score.acts, score.surveyed = stage.acts, not options.dark
+    with contextlib.ExitStack() as stack:
+        truth = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        truth.bind(("127.0.0.1", 0))
+        truth.setblocking(False)
+        words = simulator_words(options, folder, odometry, truth.getsockname()[1])
+        patience = Patience(out)
+        simulator = stack.enter_context(running(words, out / "simulator.log", stdout=subprocess.PIPE))
+        wait_for_simulator(simulator, patience)
+        daemon = stack.enter_context(running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL))
+        page = stack.enter_context(web_page(config, out / PAGE_LOG))
+        reader = stack.enter_context(Reader("127.0.0.1", modbus))
+        wait_for_pose(daemon, reader, patience)
+        print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
+        if address := page_address(page, out / PAGE_LOG):
+            print(f"watch it in a browser: {address}")
+        if sys.stdin.isatty() and not options.dark:
+            print("keys: p switches the photodiode off or on, l the lidar, c carries the robot away")
+        simulator.send_signal(signal.SIGUSR1)
+        stack.enter_context(keyboard())
+        watch(Show(reader, Track(truth), stage, [daemon, simulator]), score, options.seconds)
+
+
+def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
+    """The demo itself; returns the exit code."""
+    score, wrong, interrupted = Score(), "", False
+    try:
+        play(options, folder, out, score)
+    except KeyboardInterrupt:
+        interrupted = True
+        if not score.reads:
+            return INTERRUPTED
+    except (DemoError, OrderRefused) as error:
+        wrong = str(error)
+    figures = summary(score)
+    early = interrupted and not score.error_m  # nothing is wrong with a run that had no time to show anything
+    wrong = wrong or ("" if early else verdict(figures)) or complaint(score.acts)
+    if score.error_m or early:
+        wrong = export_map(folder, out) or wrong
+    if score.error_m:
+        off, turned = figures["error_m"], figures["error_deg"]
+        print(
+            f"{figures['driven_m']:.1f} m driven; error median {100 * off['median']:.1f} cm, "
+            f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg; "
+            f"largest while TRACKING {100 * score.tracking_m:.1f} cm"
+        )
+    for act in score.acts:
+        print(act.words)
+        if act.device == ROBOT:
+            print(f"map jumps counted: {act.jumps[0]} before, {act.jumps[1]} at the end")
+    (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
+    print(f"figures: {out / 'summary.json'}")
+    if wrong:
+        print(f"FAILED: {wrong}{cause(figures)} (logs: {out})", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the demo; 0 if the pose was good, 1 if not, 130 if interrupted before there was anything to show."""
+    parser = argparse.ArgumentParser(prog="python -m tools.demo.run", description=__doc__.splitlines()[0])
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--seconds", type=float, default=75.0, help="how long to watch (default %(default)s)")
+    length.add_argument(
+        "--forever", action="store_const", const=0.0, dest="seconds", help="until Ctrl-C; records 0.3 GB an hour"
+    )
+    parser.add_argument("--dark", action="store_true", help="without lamps: lidar and odometry alone")
+    parser.add_argument("--kidnap", action="store_true", help="carry the robot away instead of switching sensors off")
+    parser.add_argument("--building", default="paper_room", help="see `python -m tools.sim --help`")
+    parser.add_argument("--seed", type=int, default=0, help="of noise, slip and people")
+    parser.add_argument("--out", type=Path, default=OUT, help="where results go (default %(default)s)")
+    options = parser.parse_args(arguments)
+    out = options.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.default_int_handler)
+    os.environ.setdefault("PYTHONUNBUFFERED", "1")
+    try:
+        with tempfile.TemporaryDirectory(prefix="lumiloop-demo-") as folder:
+            return show(options, Path(folder), out)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,168 @@
+"""How good the published pose was: the truth of the same instant, errors, states, and a verdict."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import socket
+import statistics
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from daemon.cli.status import Reading
+from daemon.health.reasons import REASONS, Reason
+from daemon.snapshot import State
+from tools.demo.acts import Act
+
+ABSURD_M: Final = 0.5
+"""Median position error beyond which the demo has failed."""
+SLOW_SHARE: Final = 0.1
+"""Of the readings, from which on a slow computer is named beside what went wrong."""
+GOOD: Final = (State.MAPPING, State.TRACKING)
+READY: Final = (*GOOD, State.DEGRADED, State.RELOCATING)
+"""States in which the daemon follows a sensor."""
+
+Pose = tuple[float, float, float]
+
+
+@dataclass(slots=True)
+class Track:
+    """True poses of the last seconds, from the simulator's datagrams."""
+
+    sock: socket.socket
+    poses: deque[tuple[float, Pose]] = field(default_factory=lambda: deque(maxlen=400))
+
+    def collect(self) -> None:
+        """Take what has arrived."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                told = json.loads(self.sock.recv(512))
+                self.poses.append((told["t_mono"], (told["x"], told["y"], told["yaw"])))
+
+    def at(self, t_mono: float) -> Pose | None:
+        """The true pose at an instant, interpolated; None where it is not covered."""
+        after = next((k for k, (t, _) in enumerate(self.poses) if t >= t_mono), 0)
+        if after == 0:
+            return None
+        (t0, a), (t1, b) = self.poses[after - 1], self.poses[after]
+        part = (t_mono - t0) / (t1 - t0)
+        turn = math.remainder(b[2] - a[2], math.tau)
+        return a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn
+
+
+@dataclass(slots=True)
+class Score:
+    """What has been read and how good it was; errors in m and rad."""
+
+    origin: tuple[Pose, Pose] | None = None  # the first pose and the truth of its instant
+    surveyed: bool = False  # the map frame is the survey's, hence the truth's, from the first TRACKING on
+    acts: list[Act] = field(default_factory=list)
+    error_m: list[float] = field(default_factory=list)
+    error_rad: list[float] = field(default_factory=list)
+    tracking_m: float = 0.0  # the largest error while the state was TRACKING
+    states: dict[str, int] = field(default_factory=dict)
+    reads: int = 0
+    slow: int = 0  # readings that say that the computer is too slow
+    unanswered: int = 0
+    cycle_s: list[float] = field(default_factory=list)
+    trip_s: list[float] = field(default_factory=list)
+    last: Reading = field(default_factory=dict)
+    driven_m: float = 0.0
+    watched_s: float = 0.0
+    _was: Pose | None = None
+    _told: tuple[int, int] | None = None
+
+    def take(self, reading: Reading, truth: Pose | None) -> None:
+        """One reading of the published block, and where the robot truly was then."""
+        self.reads += 1
+        self.last = reading
+        state = State(int(reading["state"] or 0)).name
+        self.states[state] = self.states.get(state, 0) + 1
+        self.slow += reading.get("reason") == Reason.OVERLOADED
+        if reading["cycle"] is not None:
+            self.cycle_s.append(float(reading["cycle"]))
+        pose = pose_of(reading)
+        if pose is None or truth is None:
+            return
+        if self.origin is None and self.surveyed:
+            if state != State.TRACKING.name:
+                return
+            self.origin = truth, truth
+        if self.origin is None:
+            self.origin = pose, truth
+        want = in_map(truth, self.origin)
+        self.error_m.append(math.hypot(pose[0] - want[0], pose[1] - want[1]))
+        self.error_rad.append(math.remainder(pose[2] - want[2], math.tau))
+        if state == State.TRACKING.name:
+            self.tracking_m = max(self.tracking_m, self.error_m[-1])
+        if self._was is not None:
+            self.driven_m += math.hypot(truth[0] - self._was[0], truth[1] - self._was[1])
+        self._was = truth
+
+    def news(self) -> list[str]:
+        """State and reason in words, once for each change."""
+        said = int(self.last["state"] or 0), int(self.last["reason"] or 0)
+        if said == self._told:
+            return []
+        self._told = said
+        return [f"{State(said[0]).name}: {REASONS[Reason(said[1])][0]}"]
+
+
+def pose_of(reading: Reading) -> Pose | None:
+    """The published map pose, if there is one."""
+    x, y, yaw = (reading[f"map_{axis}"] for axis in ("x", "y", "yaw"))
+    return None if x is None or y is None or yaw is None else (float(x), float(y), float(yaw))
+
+
+def in_map(truth: Pose, origin: tuple[Pose, Pose]) -> Pose:
+    """A true pose as seen from the map, which is fixed by one published pose and the truth of its instant."""
+    (x, y, yaw), (x0, y0, yaw0) = origin
+    turn = yaw - yaw0
+    c, s = math.cos(turn), math.sin(turn)
+    dx, dy = truth[0] - x0, truth[1] - y0
+    return x + c * dx - s * dy, y + s * dx + c * dy, truth[2] + turn
+
+
+def summary(score: Score) -> dict[str, Any]:
+    """The run in figures."""
+    errors, angles = score.error_m, [abs(math.degrees(angle)) for angle in score.error_rad]
+    known, seconds = bool(errors), score.watched_s
+    return {
+        "seconds": round(seconds, 2),
+        "driven_m": round(score.driven_m, 2),
+        "poses_compared": len(errors),
+        "error_m": {"median": statistics.median(errors), "max": max(errors), "last": errors[-1]} if known else None,
+        "error_while_tracking_m": score.tracking_m if known else None,
+        "error_deg": {"median": statistics.median(angles), "max": max(angles), "last": angles[-1]} if known else None,
+        "states": score.states,
+        "too_slow": score.slow / max(score.reads, 1),
+        "acts": [act.figures for act in score.acts],
+        "scan_rate_hz": score.last.get("scan_rate"),
+        "scans_missed": score.last.get("missed"),
+        "cycle_ms": 1e3 * statistics.median(score.cycle_s) if score.cycle_s else None,
+        "cycles_over_budget": score.last.get("overruns"),
+        "modbus_reads_per_s": score.reads / max(seconds, 1e-9),
+        "modbus_round_trip_ms": 1e3 * statistics.median(score.trip_s) if score.trip_s else None,
+        "modbus_unanswered": score.unanswered,
+    }
+
+
+def cause(figures: dict[str, Any]) -> str:
+    """What a person can do about a run that went wrong, as a half sentence; empty where nothing is known of it."""
+    share = figures["too_slow"]
+    return (
+        f"; the computer was too slow for {100.0 * share:.0f} % of it: end other programs" if share > SLOW_SHARE else ""
+    )
+
+
+def verdict(figures: dict[str, Any]) -> str:
+    """What is wrong with the run; empty when nothing is."""
+    if not any(figures["states"].get(state.name) for state in GOOD):
+        return f"the pose was never MAPPING or TRACKING, but: {figures['states'] or 'nothing was read'}"
+    if figures["error_m"] is None:
+        return f"no pose could be compared with the truth, the states were {figures['states']}"
+    if figures["error_m"]["median"] > ABSURD_M:
+        return f"the median position error is {figures['error_m']['median']:.2f} m"
+    return ""

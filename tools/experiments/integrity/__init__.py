@@ -1,0 +1,1 @@
+"""The integrity campaign: random drives of the whole daemon against the truth."""

@@ -1,0 +1,54 @@
+"""Pictures of Fig. 5: maps as scans put at the estimated poses, the estimated way, the true walls and the true way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from tools.experiments.trajectory import Array, Track
+from tools.sim.building.buildings import building
+from tools.sim.building.world import CIRCLE
+
+VIEWS: Final = {"room": (-6.3, 6.3, -6.3, 6.3), "tour": (-14.0, 58.0, -8.0, 9.5)}
+"""What is shown: left, right, bottom, top of the picture in m; the tour lies on its side (y to the right)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One map. points: (n, 2) in the map's frame."""
+
+    title: str
+    track: Track
+    points: Array
+
+
+def draw_maps(panels: list[Panel], where: str, canvas: Any) -> None:
+    """Draw panels side by side (room) or one below the other (tour, turned by 90 degrees)."""
+    lying = where == "tour"
+    across = 1 if lying else (len(panels) + 1) // 2
+    places = canvas.subplots(-(-len(panels) // across), across, squeeze=False).ravel()
+    for axes, panel in zip(places, panels, strict=False):
+        walls(axes, lying)
+        for points, how in (
+            (panel.points, {"ls": "", "marker": ",", "color": "black", "alpha": 0.5}),
+            (panel.track.truth, {"ls": "--", "lw": 0.6, "color": "tab:gray"}),
+            (panel.track.pose, {"ls": "-", "lw": 0.8, "color": "tab:red"}),
+        ):
+            x, y = (points[:, 1], -points[:, 0]) if lying else (points[:, 0], points[:, 1])
+            axes.plot(x, y, **how)
+        left, right, bottom, top = VIEWS[where]
+        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        axes.tick_params(labelsize=7)
+        axes.set_title(panel.title.replace("\n", ": ") if lying else panel.title, fontsize=8)
+    for axes in places[len(panels) :]:
+        axes.set_axis_off()
+
+
+def walls(axes: Any, lying: bool) -> None:
+    """The true building, in light blue."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 25)
+    for kind, a, b, c, d, _ in building("paper_room").world.shapes:
+        x, y = (a + c * np.cos(turn), b + c * np.sin(turn)) if kind == CIRCLE else (np.array((a, c)), np.array((b, d)))
+        axes.plot(*((y, -x) if lying else (x, y)), color="lightskyblue", lw=2.0, zorder=0)

@@ -1,0 +1,1 @@
+"""Robots switched on or carried away in a mapped building."""

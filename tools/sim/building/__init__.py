@@ -1,0 +1,1 @@
+"""Buildings, their materials, people, and ray casting of a lidar in them."""

@@ -1,0 +1,1 @@
+"""Coded light at waveform level, and devices and drives under it."""
