@@ -48,7 +48,7 @@ class Kernel:
         fake_os = SimpleNamespace(open=self.open, close=self.close, O_RDWR=os.O_RDWR)
         monkeypatch.setattr("smbus2.smbus2.os", fake_os)
         monkeypatch.setattr("smbus2.smbus2.ioctl", self.ioctl)
-        monkeypatch.setattr(hal.i2c_linux, "ioctl", self.ioctl)
+        monkeypatch.setattr(hal.bus.i2c_linux, "ioctl", self.ioctl)
 
     def open(self, path: str, _flags: int) -> int:
         self.paths.append(path)

@@ -60,8 +60,8 @@ def taught() -> Drive:
 @pytest.fixture
 def played(taught: Drive, monkeypatch: pytest.MonkeyPatch) -> Drive:
     """Both commands get that drive, whatever recording is named."""
-    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: taught)
-    monkeypatch.setattr(daemon.survey, "read_drive", lambda *_: taught)
+    monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: taught)
+    monkeypatch.setattr(daemon.cli.survey, "read_drive", lambda *_: taught)
     return taught
 
 
@@ -114,7 +114,7 @@ def driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Drive:
     drive = Drive(Path("teach"), Trajectory(t, poses), nominal(2))
     drive.readings = np.column_stack((t, wheels))
     drive.config = Config(name="r7", lidar=LidarConfig(device="/dev/ttyACM3", mount=configured))
-    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: drive)
+    monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: drive)
     monkeypatch.chdir(tmp_path)
     return drive
 
@@ -183,10 +183,10 @@ def test_what_is_missing_is_said(
     ):
         fields = {name: getattr(played, name) for name in ("path", "poses", "survey", "epochs", "readings")}
         other = Drive(**{**fields, **change})
-        monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_, other=other: other)
+        monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_, other=other: other)
         assert parser.main(["calibrate", "teach", *out]) == parser.FAILED
         assert words in capsys.readouterr().err
-    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
+    monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
     assert parser.main(["calibrate", "teach", "--odometry"]) == parser.FAILED
     assert "no odometry in it" in capsys.readouterr().err
 
@@ -195,7 +195,7 @@ def test_a_survey_for_another_air_interface_is_refused(
     played: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = Drive(played.path, played.poses, played.survey, played.epochs, profile=PROFILE_B)
-    monkeypatch.setattr(daemon.calibrate, "read_drive", lambda *_: other)
+    monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: other)
     path = tmp_path / "lights.toml"
     path.write_text("lamp = [ { lamp_id = 7, code = 65, x = 0.0, y = 0.0, z = 2.6 } ]")
     assert (

@@ -60,7 +60,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 import daemon.recording.recorder, daemon.cli.run
-from daemon import warmup
+from daemon.runtime import warmup
 from daemon.runtime.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey

@@ -109,7 +109,7 @@ def test_no_room_for_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(daemon.disk, "write_whole", full)
+    monkeypatch.setattr(daemon.recording.disk_writer, "write_whole", full)
     recorder = Recorder(tmp_path, Config(), SystemClock(), Lights(SURVEY, PROFILE_A, None, b"a map"))
     assert "No space left on device" in recorder.error, "what cannot be replayed without it is not recorded"
     recorder.close()

@@ -34,7 +34,7 @@ def test_without_the_units_limits_nothing_is_taken() -> None:
 def test_the_loops_thread_takes_its_priority_and_later_threads_do_not(most: int, priority: int) -> None:
     code = f"""
 import os, threading
-from daemon import realtime
+from daemon.system import realtime
 text = realtime._schedule({most})
 seen = []
 thread = threading.Thread(target=lambda: seen.append(os.sched_getscheduler(0)))
@@ -50,7 +50,7 @@ def test_locked_memory_holds_what_is_touched_and_no_more() -> None:
     code = f"""
 import mmap
 from pathlib import Path
-from daemon import realtime
+from daemon.system import realtime
 text = realtime._lock({resource.RLIM_INFINITY})
 held = mmap.mmap(-1, 256 << 20)
 held[:1 << 20] = bytes(1 << 20)
@@ -84,7 +84,7 @@ def test_threads_that_cannot_be_listed_are_lined_up_later(monkeypatch: pytest.Mo
 def test_other_threads_come_right_behind_the_loop_once_it_is_ahead_and_later_ones_too() -> None:
     code = f"""
 import os, threading
-from daemon import realtime
+from daemon.system import realtime
 
 def made():
     asked, told, found = threading.Event(), threading.Event(), []
@@ -109,7 +109,7 @@ print(nothing, first >= 1, second, third, one(), other(), os.sched_getparam(0).s
 
 HELD = """
 import ctypes, sys
-from daemon import realtime
+from daemon.system import realtime
 libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
 
@@ -138,7 +138,7 @@ def test_what_a_large_job_has_needed_is_given_back() -> None:
 
 GROWN = """
 import ctypes, threading
-from daemon import realtime
+from daemon.system import realtime
 libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 

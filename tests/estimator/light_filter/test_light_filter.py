@@ -321,7 +321,7 @@ def test_without_odometry_a_robot_that_turns_back_is_seen_to_reverse() -> None:
         u = min(max(t - 15.0, 0.0), 2.0)  # from forward to backward within two seconds
         pose = circle(min(t, 15.0) + u - 0.5 * u * u - max(t - 17.0, 0.0))
         result = lf.update(filter_, Room(seed=k).epoch(t, pose))
-    assert filter_.tracks[0].x[lf.ekf.SPEED] < -0.3
+    assert filter_.tracks[0].x[lf.state_vector.SPEED] < -0.3
     assert off(result, pose)[1] < math.radians(15.0)
 
 
@@ -357,7 +357,7 @@ def test_a_gyro_gives_the_turn_and_its_bias_is_found() -> None:
         result = lf.update(filter_, epoch)
     assert off(result, circle(60.0))[0] < 0.05
     assert off(result, circle(60.0))[1] < math.radians(2.0)
-    assert filter_.tracks[0].x[lf.ekf.GYRO] == pytest.approx(bias, abs=0.004)
+    assert filter_.tracks[0].x[lf.state_vector.GYRO] == pytest.approx(bias, abs=0.004)
 
 
 def test_place_sets_the_pose() -> None:

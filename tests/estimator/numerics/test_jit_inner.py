@@ -33,9 +33,13 @@ def outside_kernels(node: ast.AST) -> Iterator[ast.AST]:
             yield from outside_kernels(child)
 
 
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
 def used(path: Path, tree: ast.Module) -> Iterator[str]:
     """What Python code of a file names, as ``module.name``."""
-    here = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    here = dotted(path)
     nodes = list(outside_kernels(tree))
     known = {
         alias.asname or alias.name: f"{node.module}.{alias.name}"
@@ -59,7 +63,7 @@ def test_those_that_only_kernels_call_say_so_and_no_others_do() -> None:
             if (call := decorator(node)) is not None:
                 words = {keyword.arg for keyword in call.keywords if ast.literal_eval(keyword.value)}
                 assert isinstance(node, ast.FunctionDef)
-                (inner if words & {"inner", "inline"} else outer).add(f"estimator.{path.stem}.{node.name}")
+                (inner if words & {"inner", "inline"} else outer).add(f"{dotted(path)}.{node.name}")
     assert len(outer) > 50
     assert sorted(inner & of_python) == []
     assert sorted(outer - of_python) == []

@@ -31,8 +31,8 @@ def host(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         (tmp_path / "sys" / node).mkdir(parents=True)
         (tmp_path / "sys" / node / "name").write_text(name + "\n")
         (tmp_path / "dev" / node).touch()
-    monkeypatch.setattr(hal.i2c_linux, "SYSFS", tmp_path / "sys")
-    monkeypatch.setattr(hal.i2c_linux, "DEV", tmp_path / "dev")
+    monkeypatch.setattr(hal.bus.i2c_linux, "SYSFS", tmp_path / "sys")
+    monkeypatch.setattr(hal.bus.i2c_linux, "DEV", tmp_path / "dev")
     return tmp_path
 
 
@@ -182,7 +182,7 @@ def test_what_an_open_says(
 
 
 def test_without_any_bus_the_remedy_is_to_enable_i2c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(hal.i2c_linux, "DEV", tmp_path)
+    monkeypatch.setattr(hal.bus.i2c_linux, "DEV", tmp_path)
     with pytest.raises(DeviceMissing, match=r"dtparam=i2c_arm=on.*i2c-dev"):
         open_linux("/dev/i2c-99")
 
@@ -190,7 +190,7 @@ def test_without_any_bus_the_remedy_is_to_enable_i2c(monkeypatch: pytest.MonkeyP
 def test_the_group_is_that_of_the_device_node(monkeypatch: pytest.MonkeyPatch, host: Path) -> None:
     kernel(monkeypatch).open_error = errno.EACCES
     groups = SimpleNamespace(getgrgid=lambda gid: SimpleNamespace(gr_name=f"group-{gid}"))
-    monkeypatch.setattr(hal.i2c_linux, "grp", groups)
+    monkeypatch.setattr(hal.bus.i2c_linux, "grp", groups)
     node = host / "dev" / "i2c-1"
     with pytest.raises(DeviceRefused, match=f"add the user to group group-{node.stat().st_gid}"):
         open_linux(str(node))
@@ -248,6 +248,6 @@ def test_names_that_do_not_choose_one(host: Path, name: str, kind: type[Exceptio
 
 
 def test_without_adapters_the_name_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(hal.i2c_linux, "SYSFS", tmp_path / "none")
+    monkeypatch.setattr(hal.bus.i2c_linux, "SYSFS", tmp_path / "none")
     with pytest.raises(DeviceMissing, match="enable I2C"):
         open_linux("adapter:bcm2835")

@@ -98,12 +98,12 @@ def test_an_empty_bus() -> None:
 
 
 def test_buses_of_this_computer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert "i2c-dev" in hal.i2c_linux.ENABLE
-    monkeypatch.setattr(hal.i2c_linux, "DEV", tmp_path)
-    assert hal.i2c_linux.buses() == []
+    assert "i2c-dev" in hal.bus.i2c_linux.ENABLE
+    monkeypatch.setattr(hal.bus.i2c_linux, "DEV", tmp_path)
+    assert hal.bus.i2c_linux.buses() == []
     for name in ("i2c-10", "i2c-1", "i2c-2", "i2c-stub", "ttyS0"):
         (tmp_path / name).touch()
-    assert [Path(bus).name for bus in hal.i2c_linux.buses()] == ["i2c-1", "i2c-2", "i2c-10"]
+    assert [Path(bus).name for bus in hal.bus.i2c_linux.buses()] == ["i2c-1", "i2c-2", "i2c-10"]
 
 
 def test_through_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,6 +90,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch, **runs: Any) -> None:
         modules[name] = ModuleType(name, "What it is about.")
         modules[name].run = run  # type: ignore[attr-defined]  # a module is made up
     monkeypatch.setattr(program, "EXPERIMENTS", dict.fromkeys(runs, "Fig. 9"))
+    monkeypatch.setattr(program, "MODULES", {name: f"tools.experiments.{name}" for name in runs})
     imported = program.importlib.import_module
 
     def known(path: str, package: str | None = None) -> ModuleType:
