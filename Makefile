@@ -37,7 +37,7 @@ $(STAMP): requirements/dev.lock pyproject.toml
 venv: $(STAMP)  ## make .venv with everything at the locked versions
 
 demo: venv  ## the daemon on a simulated robot under coded lamps; each sensor fails once; then a map picture
-	$(RUN) -m tools.demo.run $(ARGS)
+	$(RUN) -m tools.demo $(ARGS)
 
 check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff format --check --quiet .

@@ -7,11 +7,10 @@ installation once the directory is named after the installation's folder. Some a
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from daemon.runtime.warmup import LIGHT, OFFLINE
-from tools.bench.vm.image import cache_name
+from tools.bench.vm.image import copy_kernels
 
 INSTALLED = Path("/opt/lumiloop/lib")
 LEFT_OUT = 16
@@ -28,10 +27,11 @@ def plant(compiled: Path, sources: Path, cache: Path, root: Path) -> list[Path]:
         root: the machine's files.
     """
     installed = next((root / INSTALLED.relative_to("/")).glob("python3*/site-packages/estimator"))
-    place = cache / compiled.name / cache_name(Path("/", installed.relative_to(root)))
-    shutil.copytree(compiled / cache_name(sources), place)
-    left_out = [path for path in sorted(place.glob("*.nbi")) if not path.name.startswith(OFFLINE + LIGHT)][::LEFT_OUT]
+    place = cache / compiled.name
+    copy_kernels(compiled, sources, place, Path("/", installed.relative_to(root)))
+    needed = [path for path in sorted(place.rglob("*.nbi")) if not path.parent.name.startswith(OFFLINE + LIGHT)]
+    left_out = [path for path in needed if not path.name.startswith(OFFLINE)][::LEFT_OUT]
     for index in left_out:
-        for path in place.glob(f"{index.stem}.*"):
+        for path in index.parent.glob(f"{index.stem}.*"):
             path.unlink()
     return left_out

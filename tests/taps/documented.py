@@ -31,7 +31,7 @@ RUN: Final = {
         r"(maps.md: lumiloop map export drive|replay.md: lumiloop replay intel).*",
     ),
     "alone": (
-        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|draw)",
+        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|draw|light.draw)",
         r"bench.md: python -m tools.bench.world --list",
     ),
 }  # fmt: skip
@@ -45,7 +45,7 @@ ELSEWHERE: Final = {
     r".*: lumiloop probe": "tests/daemon/cli/test_probe.py",
     r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_teach_drive.py",
     r".*: make install": "tests/systemd/test_container.py",
-    r"README.md: make demo|simulator.md: (make demo|python -m tools.demo.run)": "tests/tools/demo/test_run.py",
+    r"README.md: make demo|simulator.md: (make demo|python -m tools.demo)": "tests/tools/demo/test_run.py",
     r"fake-devices.md: (python -m hal.fake --model|lumiloop run)": "tests/daemon/scenarios/test_process.py",
     r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver.py",
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/bench/world/test_world.py",

@@ -347,7 +347,7 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the demo; 0 if the pose was good, 1 if not, 130 if interrupted before there was anything to show."""
-    parser = argparse.ArgumentParser(prog="python -m tools.demo.run", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.demo", description=__doc__.splitlines()[0])
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--seconds", type=float, default=75.0, help="how long to watch (default %(default)s)")
     length.add_argument(

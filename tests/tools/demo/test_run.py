@@ -279,7 +279,7 @@ def left_behind(mark: str) -> list[str]:
             words = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
         except OSError:  # it has ended meanwhile
             continue
-        if mark in words and "tools.demo.run" not in words:
+        if mark in words and "tools.demo" not in words:
             found.append(words)
     return found
 

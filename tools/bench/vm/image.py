@@ -329,6 +329,14 @@ def cache_name(folder: Path) -> str:
     return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
 
 
+def copy_kernels(compiled: Path, sources: Path, place: Path, inside: Path) -> None:
+    """Copy the kernels of every package in the folder ``sources`` to ``place``, keyed as packages of ``inside``."""
+    for package in sorted(path.parent for path in sources.glob("*/__init__.py")):
+        kept = compiled / cache_name(package)
+        if kept.exists():
+            shutil.copytree(kept, place / cache_name(inside / package.name))
+
+
 def _compile(say: Say) -> Path:
     """Compile the kernels for any processor, and for this one by the drive outside; the folder of the former."""
     say("compiling kernels for any processor")
@@ -349,10 +357,10 @@ def plant(root: Path, compiled: Path) -> None:
     """
     installed = next((root / "opt/lumiloop/lib").glob("python3*/site-packages/estimator"))
     inside = f"/{installed.relative_to(root)}"
-    place = root / CACHE_PLACE / compiled.name / cache_name(Path(inside))
-    shutil.copytree(compiled / cache_name(ROOT / "estimator"), place)
+    place = root / CACHE_PLACE / compiled.name
+    copy_kernels(compiled, ROOT / "estimator", place, Path(inside))
     mark = "from daemon.runtime import warmup; warmup.ROOM = {!r}; print(warmup.mark_of({!r}).name)"
     for what in ("warm", "warm-lights"):
         named = _do([sys.executable, "-c", mark.format(inside, what)], "naming the marks", WARM)
-        (place.parent / named.split()[-1]).touch()
+        (place / named.split()[-1]).touch()
     (root / CACHE_PLACE).parent.chmod(0o700)

@@ -1,6 +1,6 @@
 """Integrity: is what the daemon says of random drives ever wrong?
 
-``python -m tools.experiments.integrity.campaign --count 10``; resumable, one file a scenario.
+``python -m tools.experiments.integrity --count 10``; resumable, one file a scenario.
 
 Every scenario of :mod:`tools.experiments.integrity.scene` goes through the daemon's own cycle in virtual time; the
 published state is judged against the truth. Tracks are kept in ``<out>/<kind>-<seed>.npz`` and not made again; delete
@@ -87,7 +87,7 @@ def missing(kinds: list[str], seeds: range, out: Path) -> list[tuple[str, int, P
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Options; an unknown kind ends the program with the list of those that there are."""
     parser = argparse.ArgumentParser(
-        prog="python -m tools.experiments.integrity.campaign", description=__doc__,
+        prog="python -m tools.experiments.integrity", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--kind", action="append", choices=sorted(KINDS), help="only this kind (may be repeated)")
