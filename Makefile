@@ -114,10 +114,12 @@ uninstall:  ## remove that; configuration and maps stay unless PURGE=1
 deb:  ## the same as a Debian package, in out/
 	systemd/package.sh
 
+EXTRAS  := --extra plot --extra mcap --extra foxglove --extra view --extra zenoh
+COMPILE := uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade
 lock:  ## renew the lock files (needs uv)
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade pyproject.toml -o requirements/core.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra zenoh pyproject.toml -o requirements/dev.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade --allow-unsafe --extra test --extra plot --extra mcap --extra foxglove --extra view --extra zenoh --extra bench pyproject.toml -o requirements/bench.lock
+	$(COMPILE) pyproject.toml -o requirements/core.lock
+	$(COMPILE) --allow-unsafe $(EXTRAS) --group dev pyproject.toml -o requirements/dev.lock
+	$(COMPILE) --allow-unsafe $(EXTRAS) --group dev --group bench pyproject.toml -o requirements/bench.lock
 
 clean:  ## remove what the targets above made
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
