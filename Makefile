@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Suites share the processors, and what is judged against the wall clock wants them alone: no two at once, -j or not.
 .NOTPARALLEL:
 
-.PHONY: help venv demo test cover test-system test-all check bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
+.PHONY: help venv demo check quick test cover test-system test-all bless hooks bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -45,10 +45,13 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/mypy
 
 QUICK := not slow and not system
+quick: venv  ## the tests of what has changed since main, most specific first (<= 60 s; ARGS=--list only names them)
+	$(RUN) -m tools.ci.quick --marks "$(QUICK)" $(ARGS)
+
 test: venv  ## everything quick (no root, <= 12 minutes)
 	@$(BIN)/python -c "from daemon.runtime.warmup import load; load()" & warm=$$!; trap "kill $$warm" INT TERM; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked  # each keeps one processor busy
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "$(QUICK)" $(ARGS)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -p tools.ci.durations -m "$(QUICK)" $(ARGS)
 
 # Compiled kernels are invisible to coverage, so the estimator is also run without the compiler, beside the compiling;
 # that row is silent unless it fails. Of the rest only what is traced (tests/conftest.py) is run once more.
@@ -78,6 +81,13 @@ LONG = $(BIN)/python -m pytest -q --durations=15
 test-all: test cover test-system  ## all of it, the long ones included (root, about three quarters of an hour)
 	$(LONG) -n auto --dist load -m "slow and not realtime" $(ARGS) $(NONE)
 	$(LONG) -m "slow and realtime" $(ARGS) $(NONE)
+
+bless: venv  ## make today's trajectories the golden ones: REASON="why they have changed", ARGS="NAME ..." for some logs
+	@test -n "$$REASON" || { echo 'say why the trajectories have changed: make bless REASON="..."'; exit 1; }
+	$(RUN) -m tests.logs.bless --reason "$$REASON" $(ARGS)
+
+hooks: venv  ## run the checks of `make check` before each commit (git hook of pre-commit)
+	$(BIN)/pre-commit install
 
 $(PEERS): $(STAMP) requirements/bench.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock

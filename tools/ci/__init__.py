@@ -1,1 +1,1 @@
-"""Checks of the repository: coverage floors, contracts, figures as data."""
+"""Checks of the repository: coverage floors, contracts, figures as data, the tests of a change."""
