@@ -36,9 +36,11 @@ def test_the_installer_takes_every_room() -> None:
 
 
 def test_locks_have_everything_that_is_named() -> None:
-    """Each lock file against the extras that it is made of (`make lock`)."""
-    extras = PROJECT["project"]["optional-dependencies"]
-    dev = ["test", "plot", "mcap", "foxglove", "view", "zenoh"]
+    """Each lock file against the extras and groups that it is made of (`make lock`)."""
+    groups = PROJECT["dependency-groups"]
+    tools = {name: [one for one in group if isinstance(one, str)] for name, group in groups.items()}
+    extras = PROJECT["project"]["optional-dependencies"] | tools
+    dev = ["test", "dev", "plot", "mcap", "foxglove", "view", "zenoh"]
     for lock, named in {"core": [], "dev": dev, "bench": [*dev, "bench"]}.items():
         kept = {name_of(row) for row in (ROOT / f"requirements/{lock}.lock").read_text().splitlines()}
         wanted = [*PROJECT["project"]["dependencies"], *(one for extra in named for one in extras[extra])]
