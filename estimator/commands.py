@@ -6,8 +6,9 @@ import numpy as np
 
 from estimator.mapping.keyframe_selection import NOTHING
 from estimator.mapping.map_frame import move_map, shift_map
-from estimator.measurements import Array, Command, Order
+from estimator.measurements import Command, Order
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.relocalisation import relocalisation
 from estimator.relocalisation.hypothesis_tracking import Suspicion
 from estimator.state import State

@@ -16,8 +16,10 @@ import numpy.typing as npt
 
 from estimator.cdma.epoch import LightEpoch as LightEpoch  # records too, so they are offered from here
 from estimator.cdma.epoch import SampleBlock as SampleBlock
+from estimator.numerics.arrays import Array as Array
 
-Array = npt.NDArray[np.float64]
+Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
+"""Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
 
 
 class Beam(IntEnum):

@@ -12,13 +12,12 @@ from estimator.fusion import map_odom_filter, motion_model, out_of_sequence, pro
 from estimator.fusion.laser_odometry import guide
 from estimator.fusion.pose_update import alike_of, covariance, fuse, learn_alike, noise_of
 from estimator.mapping import live_grid, loop_closure
-from estimator.mapping.keyframe import hanging, unturned
+from estimator.mapping.keyframe import hanging
 from estimator.mapping.keyframe_selection import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import (
     UNLIMITED,
     Answer,
-    Array,
     Command,
     Imu,
     Lap,
@@ -32,11 +31,12 @@ from estimator.measurements import (
     no_lap,
 )
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation import kidnap_detection, relocalisation, unaligned_map
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scan_matching import matcher_choice, scan_matcher
-from estimator.scan_matching.deskew import ScanPoints, oriented, points_of
+from estimator.scan_matching.deskew import ScanPoints, oriented, points_of, unturned
 from estimator.scan_matching.matcher_choice import First, Matcher, first_of
 from estimator.scan_matching.scan_matcher import Asked, Prior, View
 from estimator.scan_matching.scan_validation import in_time, nothing_of, refused

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from estimator.cdma.epoch import BlockFlag
-from estimator.measurements import Array, Job
+from estimator.measurements import Job
+from estimator.numerics.arrays import Array
 
 SURPRISE: Final = 16.3
 """Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) beyond which the pose and the lights' do not agree."""
@@ -218,6 +219,19 @@ class LightsResult:
     clock_ppm: float | None = None
     t_pose: float = -math.inf
     bent: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Virtual:
+    """The paper's virtual consistent state components: what light alone said of the place, free of laser and drift.
+
+    Attributes:
+        T_map_base, covariance: of the `lights` filter, for the keyframe's instant. accepted: IDs of the lamps used (S).
+    """
+
+    T_map_base: Array
+    covariance: Array
+    accepted: frozenset[int]
 
 
 @dataclass(frozen=True, slots=True)

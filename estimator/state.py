@@ -16,8 +16,9 @@ from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.live_grid import LiveMap
 from estimator.mapping.loop_verification import LoopSettings
 from estimator.mapping.submap_graph import Atlas
-from estimator.measurements import Array, Scan
+from estimator.measurements import Scan
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.relocalisation.hypothesis_tracking import Suspicion
 from estimator.result import MatchResult
 from estimator.scan_matching.deskew import ScanPoints

@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.mapping.keyframe import Beams
-from estimator.measurements import Array, Beam
+from estimator.measurements import Array, Beam, Beams
 from estimator.numerics import se2
 
 HEAD: Final = (

@@ -36,8 +36,7 @@ from daemon.recording.restore import (
 )
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Survey
-from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.submap import Settled
+from estimator.mapping.keyframe import Keyframe, Settled, Submap
 from estimator.mapping.submap_graph import Aside, Atlas
 from estimator.state import State
 

@@ -27,8 +27,7 @@ import numpy as np
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Survey
 from estimator.mapping.grid_patches import Patch
-from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.submap import Settled
+from estimator.mapping.keyframe import Keyframe, Settled, Submap
 from estimator.state import State
 
 WHOLE: Final = (Survey, ResidualMap, np.ndarray)

@@ -18,11 +18,12 @@ import numpy as np
 from daemon.replay import match_plot
 from daemon.replay.results import OutputRefused
 from daemon.system.extras import how_to_install
+from estimator.match_entry import Entry, LightSaid, entry_of
 from estimator.measurements import Array, Scan
 from estimator.result import MatchResult, Reason
 from estimator.scan_matching import icp, match_trace, scan_matcher
 from estimator.scan_matching.deskew import ScanPoints
-from estimator.scan_matching.match_trace import Entry, LightSaid, Pairs, Told
+from estimator.scan_matching.match_trace import Pairs, Told
 from estimator.scan_matching.scan_matcher import Asked
 from estimator.state import State
 
@@ -127,7 +128,7 @@ class MatchJournal:
 
         def told(scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> None:
             if self.wants(scan.t_end, result):
-                entry = match_trace.entry_of(state, scan, points, asked, result)
+                entry = entry_of(state, scan, points, asked, result)
                 self.kept[self.matches] = (scan.t_end - self._t_first, entry)
 
         state.journal = told
@@ -171,7 +172,7 @@ class MatchJournal:
         """``match-N.json`` and, with matplotlib, ``match-N.png`` of each, one at a time; ``stamps`` as for `named`."""
         for name in self.named(stamps):
             number, entry = name.match, self.kept[name.match][1]
-            told = match_trace.tell(entry)
+            told = match_trace.tell(entry.asked)
             yield f"match-{number}.json", (json.dumps(document(name, entry, told)) + "\n").encode()
             picture = match_plot.draw(str(name), entry, told)
             if picture is not None:

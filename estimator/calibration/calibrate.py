@@ -17,7 +17,7 @@ from estimator.calibration.observations import Rows, joined, thinned
 from estimator.calibration.parameters import COMMONS, OWNS, Common, Own, Priors, Problem, linear, problem, survey_at
 from estimator.calibration.robust_solver import Solution, solve
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 TOLD: Final = 0.7
 """A parameter is told by the drive if its sigma fell below this part of its prior's."""

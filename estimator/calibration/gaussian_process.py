@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 FREEDOM: Final = 4.0
 REWEIGHTS: Final = 5

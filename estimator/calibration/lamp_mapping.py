@@ -18,7 +18,7 @@ from estimator.calibration.observations import Index, Rows, thinned
 from estimator.calibration.parameters import COMMONS, OWNS, Own, Priors, problem
 from estimator.calibration.robust_solver import solve
 from estimator.light_filter.survey import Lamp, Receiver, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 REACH_M: Final = 2.2
 """A lamp is received up to this many of its heights away (the rim of the field of view is at 1.7)."""

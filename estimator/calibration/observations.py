@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.light_filter.lambertian import COLUMNS, expect
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 Index = npt.NDArray[np.int64]

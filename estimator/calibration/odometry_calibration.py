@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 STEP_M: Final = 0.4
 STEP_RAD: Final = 0.35

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from estimator.calibration.observations import Rows, model
 from estimator.light_filter.lambertian import Wrt, pack_lamps, pack_receiver
 from estimator.light_filter.survey import Lamp, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 
 class Common(IntEnum):

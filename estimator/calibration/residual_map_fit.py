@@ -12,7 +12,7 @@ from estimator.calibration.parameters import RIM_RAD
 from estimator.light_filter.lambertian import pack_lamps, pack_receiver
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 CELL_M: Final = 0.25
 MARGIN_M: Final = 1.0

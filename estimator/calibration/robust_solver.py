@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from estimator.calibration.observations import Rows, patches
 from estimator.calibration.parameters import COMMONS, OWNS, Linear, Problem, bounded, linear
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 Mask = npt.NDArray[np.bool_]
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from estimator.light_filter.survey import Lamp, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 FITS_M: Final = 0.5
 """A located lamp fits a surveyed one this near; both are good to decimetres."""

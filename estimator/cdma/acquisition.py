@@ -24,8 +24,8 @@ from estimator.cdma.correlation_kernels import align, columns, detect
 from estimator.cdma.data_bits import without
 from estimator.cdma.gold_codes import gold_codes
 from estimator.cdma.sample_block import Prior, Sampled, rows_of
+from estimator.numerics.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Spectrum = npt.NDArray[np.complex64]
 Lamps = tuple[Index, Array, Array]

@@ -21,7 +21,6 @@ from estimator.cdma.joint_fit import joint_fit
 from estimator.cdma.mains_rejection import Mains
 from estimator.cdma.sample_block import Fit, Prior, Sampled
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 LEADERS: Final = 3

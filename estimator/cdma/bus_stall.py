@@ -18,8 +18,7 @@ from estimator.cdma.correlation_kernels import columns
 from estimator.cdma.joint_fit import joint_fit
 from estimator.cdma.mains_rejection import Mains
 from estimator.cdma.sample_block import Fit, Prior, Sampled
-
-Array = npt.NDArray[np.float64]
+from estimator.numerics.arrays import Array
 
 PARTS: Final = 12
 """Parts of a block whose phases are compared."""

@@ -10,13 +10,11 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.cdma.air_interface import Profile
 from estimator.cdma.correlation_kernels import columns, mixed
 from estimator.cdma.sample_block import Fit, Prior, Sampled
-
-Array = npt.NDArray[np.float64]
+from estimator.numerics.arrays import Array
 
 STEPS: Final = 512
 """Table points per chip; expansion around the nearest is good to 5e-5 of the pulse, to 4e-4 where it bends."""

@@ -17,8 +17,8 @@ from estimator.cdma.data_frame import LampFrame
 from estimator.cdma.frame_accumulator import BitRings
 from estimator.cdma.gold_codes import gold_codes
 from estimator.cdma.sample_block import Fit, Prior
+from estimator.numerics.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 CAPACITY: Final = 64

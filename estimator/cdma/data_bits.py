@@ -16,8 +16,8 @@ from estimator.cdma.code_period_kernels import TAIL_CHIPS, compare_shifts, cut, 
 from estimator.cdma.correlation_kernels import columns, mixed
 from estimator.cdma.joint_fit_kernels import REACH
 from estimator.cdma.sample_block import Fit, Prior, Sampled, rows_of
+from estimator.numerics.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 LEADER: Final = 0.4

@@ -15,15 +15,13 @@ from collections.abc import Collection
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.cdma.acquisition import BIN, Found, Job
 from estimator.cdma.air_interface import Profile
 from estimator.cdma.block_update import SPURIOUS, Decoder, follow
 from estimator.cdma.epoch import UNUSABLE, BlockFlag, LightEpoch, LinkFlag, SampleBlock
 from estimator.cdma.sample_block import Sampled
-
-Array = npt.NDArray[np.float64]
+from estimator.numerics.arrays import Array
 
 LONGEST: Final = 10
 """Code periods: no block may be longer."""

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma.data_frame import LampFrame
+from estimator.numerics.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from estimator.cdma.correlation_kernels import fold
 from estimator.cdma.data_frame import FRAME_BITS, LampFrame, decode_ring
+from estimator.numerics.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 KNOWN: Final = 3.0

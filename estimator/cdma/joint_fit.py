@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.cdma.data_bits import Signs, data_signs, stacked
 from estimator.cdma.joint_fit_kernels import (
@@ -33,8 +32,7 @@ from estimator.cdma.joint_fit_kernels import (
     solve_once,
 )
 from estimator.cdma.sample_block import Fit, Prior, Sampled
-
-Array = npt.NDArray[np.float64]
+from estimator.numerics.arrays import Array
 
 MAX_STEPS: Final = 6
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.cdma.correlation_kernels import gram, inner
-
-Array = npt.NDArray[np.float64]
+from estimator.numerics.arrays import Array
 
 FUNDAMENTALS_HZ: Final = (100.0, 120.0)
 PULL: Final = 0.03

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.cdma.correlation_kernels import inner, mixed
-
-Array = npt.NDArray[np.float64]
+from estimator.numerics.arrays import Array
 
 
 def rows_of(*rows: Array) -> Array:

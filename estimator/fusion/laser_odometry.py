@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from typing import Final
 
+from estimator.fusion.motion_model import too_far
 from estimator.fusion.pose_update import BLIND, loose_direction
 from estimator.light_filter.motion_update import CARRY_S
 from estimator.measurements import Odometry
 from estimator.numerics import se2
-from estimator.relocalisation.kidnap_detection import too_far
 from estimator.result import MatchResult
 from estimator.state import State
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3, symmetric
 from estimator.result import LightsResult
 

@@ -30,13 +30,14 @@ from estimator.fusion.light_inflation import (
 )
 from estimator.fusion.motion_history import KEPT_S
 from estimator.light_filter.collinear_lamps import Lately, doubt, straighten, sure_part
-from estimator.mapping.keyframe import Virtual
+from estimator.light_filter.light_channel import SILENT_S, too_strong_at
 from estimator.mapping.map_frame import move_map, rehang, shift_map
-from estimator.measurements import Array, Command, Order
+from estimator.measurements import Command, Order
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import grow_tie, hang, mend_tie
 from estimator.numerics.symmetric3 import det3, invert3, largest_of, positive_part, symmetric
-from estimator.result import SURPRISE, Fix, LightsResult
+from estimator.result import SURPRISE, Fix, LightsResult, Virtual
 from estimator.state import State
 
 FRESH_M, FRESH_S = 0.7, 60.0
@@ -71,9 +72,8 @@ KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
 """Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey's frame counts as known."""
 MEMORY_S = 1.0
 """How late a light epoch may come."""
-SILENT_S, SILENT_PERIODS = 0.5, 2.5
-"""Light of which nothing could be used for so long, or so many epochs that come slowly, says nothing of where the robot
-is now. One epoch may be lost."""
+SILENT_PERIODS = 2.5
+"""Nor does light that has been silent for so many epochs, where these come slowly; see `SILENT_S`."""
 
 
 @dataclass(slots=True, eq=False)
@@ -436,13 +436,11 @@ def _elsewhere(state: State) -> bool:
     Else it is its heading that wheels have led away, or that a row of lamps has left open: the laser holds its own, and
     nothing that is received speaks against the place.
     """
-    from estimator.relocalisation.light_evidence import out_of_place
-
     assert state.absolute is not None
     assert state.light is not None
     if state.light.filter.way_start > state.absolute.way_start:
         return True
-    return out_of_place(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
+    return any(too_strong_at(state.light, se2.compose(state.T_map_odom, state.fused.T_odom_base)))
 
 
 def _surer(tie: Absolute, lights: LightsResult) -> bool:

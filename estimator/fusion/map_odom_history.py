@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 FROZEN_M: Final = 10.0
 """Way between two ties that are kept: the older one in use is between one and two times as old."""

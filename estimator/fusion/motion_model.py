@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimator.fusion.motion_history import Trail
-from estimator.measurements import Array, Imu, Odometry
+from estimator.measurements import Imu, Odometry
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import carry_on, feel_axes
 from estimator.numerics.symmetric3 import invert3
 
@@ -329,3 +330,17 @@ def learn(motion: Motion, correction: Array, H: Array, known: bool) -> Array:
         seen = motion.doubt * min(square / max(expected, LEAST_EXPECTED), SURPRISE_CAP)
         motion.doubt = min(max(DOUBT_LEAST, motion.doubt + DOUBT_LEARNING * (seen - motion.doubt)), DOUBT_CAP)
     return max(0.0, 1.0 / 9.0 - 1.0 / max(square, 9.0)) * np.outer(correction, correction)
+
+
+FASTEST = (1.0, 2.0)
+"""m/s, rad/s. No robot indoors drives so much faster than its wheels, or its velocity, state; but wheels slip in turns,
+and stamps come late."""
+MARGIN_M, MARGIN_RAD = 0.4, 0.2
+"""A pose may move by so much more than a robot drives: matches of one place differ by less."""
+
+
+def too_far(moved: Array, dt: float) -> bool:
+    """Whether a pose has moved (x, y, yaw) farther than a robot can drive in ``dt`` seconds."""
+    x, y, yaw = moved.tolist()
+    v, w = FASTEST
+    return math.hypot(x, y) > MARGIN_M + v * dt or abs(yaw) > MARGIN_RAD + w * dt

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.fusion.motion_history import ANOTHER_CLOCK_S, LATE_S, Ahead, made, positive, turned
-from estimator.mapping.submap_graph import swing as lever
-from estimator.measurements import Array, Scan
+from estimator.measurements import Scan
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import swing
 from estimator.state import State
 
@@ -93,7 +93,7 @@ def shared(state: State, t_mono: float, Q: Array) -> Array:
         delta, Q_later = made(way)
         there = se2.compose(moving.T_odom_base, se2.inverse(delta))
         later, away = turned(Q_later, there[2]), moving.T_odom_base - there
-        both, rest = lever(away) @ keep @ lever(-away) @ (both + rest - later), later
+        both, rest = se2.lever_matrix(away) @ keep @ se2.lever_matrix(-away) @ (both + rest - later), later
     return both + rest
 
 

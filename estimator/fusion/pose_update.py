@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from estimator.fusion import map_odom_filter, motion_model
-from estimator.measurements import Array, Scan
+from estimator.measurements import Scan
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import hang, informed, turn
 from estimator.result import MatchResult, Reason
 from estimator.scan_matching.residual_correlation import agreement, beams_each

@@ -25,8 +25,8 @@ import numpy as np
 
 from estimator.fusion.light_inflation import BESIDE_M, doubted_covariance
 from estimator.fusion.map_odom_filter import pose_at
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.result import Fix, Protection
 from estimator.state import State
 

@@ -19,7 +19,8 @@ from typing import Final
 
 import numpy as np
 
-from estimator.measurements import Array, Odometry, Scan
+from estimator.measurements import Odometry, Scan
+from estimator.numerics.arrays import Array
 from estimator.result import Lag, MatchResult, Reason
 
 STEP_S: Final = 0.05

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimator.light_filter.lamp_catalogue import Catalogue
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import add_turned
 
 ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2

@@ -16,8 +16,8 @@ from estimator.light_filter.lamp_catalogue import Catalogue
 from estimator.light_filter.model_consistency import Bent
 from estimator.light_filter.state_vector import FIRST, OWN, SIZE, SLOTS
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.result import LightsResult
 
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from estimator.light_filter import state_vector
 from estimator.light_filter.filter_state import Lights, Track
-from estimator.light_filter.link_gating import Sight, settled
+from estimator.light_filter.link_association import Sight
+from estimator.light_filter.link_gating import settled
 from estimator.light_filter.motion_update import wheel_scales
 from estimator.light_filter.survey import Lamp
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 Learned = Mapping[int, tuple[Array, Array]]
 """By lamp ID: means and variances of (ln gain, lean x, lean y)."""

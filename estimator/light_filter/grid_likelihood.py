@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from estimator.light_filter.lambertian import COLUMNS, expect
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 COMMON_VARIANCE: Final = 0.25**2

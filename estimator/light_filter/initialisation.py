@@ -12,11 +12,12 @@ from estimator.light_filter import grid_likelihood, state_vector
 from estimator.light_filter.collinear_lamps import Under
 from estimator.light_filter.filter_state import Lights, Track
 from estimator.light_filter.lambertian import pack_lamps, pack_receiver
-from estimator.light_filter.link_gating import ACCEPTED, DIFFUSE, Sight, remembered, sights
+from estimator.light_filter.link_association import Sight, sights
+from estimator.light_filter.link_gating import ACCEPTED, DIFFUSE, remembered
 from estimator.light_filter.model_consistency import Bent
 from estimator.light_filter.survey import Lamp
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 
 LEAST = 3
 """Links without which there is no start: two leave two places, and their gains are not known."""

@@ -22,8 +22,8 @@ import numpy as np
 from estimator.cdma.correlation_kernels import invert
 from estimator.light_filter.measurement_update import OUT_COLUMNS, RESIDUAL, SLOT, WHITE, absorb, linearise
 from estimator.light_filter.state_vector import COMMON, FIRST, OWN, YAW
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 
 NEAR_M, NEAR_RAD = 0.03, 0.03
 """A step of less needs no other."""

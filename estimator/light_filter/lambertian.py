@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from estimator.light_filter.survey import Lamp, Receiver, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 

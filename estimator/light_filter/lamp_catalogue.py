@@ -10,7 +10,7 @@ import numpy as np
 from estimator.cdma.data_frame import LampFrame
 from estimator.light_filter.lambertian import pack_lamps
 from estimator.light_filter.survey import Lamp, Receiver, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 CONTRADICTION_M = 0.3
 """A lamp whose own word differs from the survey by more is another one, or was moved, or one of the two is wrong."""

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from estimator.cdma import decoder
 from estimator.cdma.air_interface import PROFILE_A, Profile
-from estimator.cdma.epoch import LightEpoch, SampleBlock
+from estimator.cdma.epoch import UNUSABLE, LightEpoch, SampleBlock
 from estimator.light_filter import light_filter
 from estimator.light_filter.initialisation import Place
+from estimator.light_filter.link_association import strong_at
+from estimator.light_filter.residual_lookup import ResidualCorrections
 from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.residual_setting import Learned
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array, Imu, Odometry, Record
+from estimator.measurements import Imu, Odometry, Record
+from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.result import LightsResult
 
 
@@ -59,7 +64,7 @@ class Light:
         self.setup = setup
         hung = {lamp.code for lamp in setup.survey.lamps}
         self.decoder = decoder.new_decoder(setup.profile, setup.clock_ppm, hung)
-        learned = None if setup.residuals is None else Learned(setup.residuals, setup.survey.receiver)
+        learned = None if setup.residuals is None else ResidualCorrections(setup.residuals, setup.survey.receiver)
         self.filter = light_filter.new_lights(setup.survey, corrections=learned)
         self.result = light_filter.result(self.filter)
         self.epoch: LightEpoch | None = None
@@ -120,3 +125,28 @@ class Light:
     def reset(self) -> None:
         """Forget the place and what was learned of the lamps."""
         light_filter.reset(self.filter)
+
+
+SILENT_S = 0.5
+"""Light of which nothing could be used for so long says nothing of where the robot is now. One epoch may be lost."""
+
+
+def silent(light: Light) -> bool:
+    """Whether there is no usable epoch of now."""
+    epoch = light.epoch
+    return epoch is None or light.filter.course.t_mono - epoch.t_end > SILENT_S or bool(epoch.block & UNUSABLE)
+
+
+def too_strong_at(light: Light | None, T_map_base: Array) -> list[bool]:
+    """Of each lamp that is received now, whether it is stronger than it can be near a pose (x, y, yaw; map frame).
+
+    Reads the latest epoch alone, neither the filter, which wheels can lead astray, nor the heading, of which strengths
+    know nothing. Of lamps of one code the nearest counts. Empty without a usable epoch.
+    """
+    if light is None or silent(light):
+        return []
+    lights, epoch = light.filter, light.epoch
+    assert epoch is not None
+    rx = lights.survey.receiver
+    (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
+    return strong_at(lights, epoch, x, y)

@@ -20,12 +20,13 @@ from estimator.light_filter.filter_state import Corrections, Lights, LightsSetti
 from estimator.light_filter.gain_memory import bend, fresh_gains
 from estimator.light_filter.initialisation import Place, begin, decide, headings, mixture, new_track, places, rule_out
 from estimator.light_filter.lamp_catalogue import catalogue_of
-from estimator.light_filter.link_gating import Learned, Sight, distrust, forget, judge, relearn, sights, table, view_of
-from estimator.light_filter.missing_lamps import absent
+from estimator.light_filter.link_association import Learned, Sight, absent, sights
+from estimator.light_filter.link_gating import distrust, forget, judge, relearn, table, view_of
 from estimator.light_filter.model_consistency import Bent
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array, Imu, Odometry
+from estimator.measurements import Imu, Odometry
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3, positive_part
 from estimator.result import Fix, LightsResult, Link, LinkState, speaks_against, waits
 

@@ -1,35 +1,22 @@
-"""From an epoch to links: which lamp each one is, what it differs by, and whether it is used or paused."""
+"""Gating of links: how much each differs from its lamp, and whether it is used or paused."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.cdma.epoch import LightEpoch, LinkFlag
 from estimator.light_filter import measurement_update, state_vector
 from estimator.light_filter.filter_state import Lights, Pause, Track, Watch
 from estimator.light_filter.lambertian import pack_receiver
+from estimator.light_filter.link_association import Sight
 from estimator.light_filter.survey import Lamp
-from estimator.measurements import Array
-from estimator.result import STRONG, WEAK, Link, LinkState
+from estimator.numerics.arrays import Array
+from estimator.result import STRONG, WEAK, LinkState
 
-ACCEPTED, OCCLUDED, REJECTED, RIM, FAINT, TWIN, UNSURVEYED = (
-    LinkState.ACCEPTED,
-    LinkState.OCCLUDED,
-    LinkState.REJECTED,
-    LinkState.RIM,
-    LinkState.FAINT,
-    LinkState.TWIN,
-    LinkState.UNSURVEYED,
-)
-FAINT_FLAG, TWIN_FLAG = int(LinkFlag.FAINT), int(LinkFlag.TWIN)  # an enum's lookups would be half of an update
+ACCEPTED, OCCLUDED = LinkState.ACCEPTED, LinkState.OCCLUDED
+REJECTED, RIM = LinkState.REJECTED, LinkState.RIM
 
-TWIN_SHARE = 0.1
-"""A second lamp of the same code adds to a link when it would be received at this share of the first or more."""
-NO_LIGHT_A = 1e-15
-"""A strength below that is rounding: one electron in a block is more."""
 DIFFUSE = 0.6
 """A strength below this share of what the lamp gives at the edge of view has not come straight."""
 RELEARN_S, RELEARN_M = 15.0, 3.0
@@ -55,103 +42,6 @@ STRIDE_M = 0.2
 """Way between two epochs that counts at most: what was driven out of a lamp's sight says nothing of it."""
 FORGET_S, DESCRIBED = 3600.0, 1024
 """A lamp known by its own word only is forgotten when unheard for so long, or as the longest unheard of so many."""
-
-
-@dataclass(slots=True, eq=False)
-class Sight:
-    """One link of an epoch as a hypothesis sees it; the fields are those of `result.Link`."""
-
-    code: int
-    amplitude: float
-    variance: float
-    state: LinkState = UNSURVEYED
-    lamp: Lamp | None = None
-    contradicted: bool = False
-    slot: int = -1
-    residual: float | None = None
-    sigma: float | None = None
-
-    def link(self, learned: Learned) -> Link:
-        """As others are told."""
-        known = self.lamp is not None and self.state is not TWIN
-        link_id = self.lamp.lamp_id if self.lamp is not None and known else None
-        gain, spread = learned.gain(self.slot)
-        sigma = math.sqrt(max(spread, 0.0))
-        residual, of_it = self.residual, self.sigma
-        return Link(self.code, link_id, self.state, self.amplitude, residual, of_it, gain, sigma, self.contradicted)
-
-
-class Learned:
-    """What a hypothesis has learned of the lamps in its slots; None: there is no hypothesis."""
-
-    def __init__(self, track: Track | None) -> None:
-        """Take it out of the arrays at once: one number at a time costs as much as all of them."""
-        self._x: list[float] = []
-        if track is not None:  # with slots that are not in use: it may be younger than the sights
-            self._x = track.x.tolist()
-            self._variance, self._common = track.P.diagonal().tolist(), track.P[state_vector.COMMON].tolist()
-
-    def gain(self, slot: int) -> tuple[float, float]:
-        """Of the lamp in a slot (-1: none), common part included: ln gain and its variance."""
-        if slot < 0 or not self._x:
-            return 0.0, 0.0
-        at = state_vector.FIRST + state_vector.OWN * slot
-        spread = self._variance[at] + self._variance[state_vector.COMMON] + 2.0 * self._common[at]
-        return self._x[at] + self._x[state_vector.COMMON], spread
-
-
-def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
-    """The links of an epoch with the lamps they come from if the receiver is near a place, strongest first."""
-    rows = zip(
-        epoch.ids.tolist(),
-        epoch.amplitude.tolist(),
-        epoch.variance.tolist(),
-        epoch.flags.tolist(),
-        epoch.lamps,
-        strict=True,
-    )
-    found = []
-    for code, amplitude, variance, flags, frame in rows:
-        if not (NO_LIGHT_A < amplitude < math.inf and variance >= 0.0):
-            found.append(Sight(code, 0.0, math.inf, FAINT))
-            continue
-        sight = Sight(code, amplitude, variance)
-        found.append(sight)
-        if frame is not None:
-            sight.lamp, sight.contradicted = lights.catalogue.learn(frame, code, lights.course.t_mono)
-            alone = True
-        else:
-            sight.lamp, alone = nearest(lights, code, x, y)
-            alone = alone and not flags & TWIN_FLAG
-            if sight.lamp is not None:
-                lights.catalogue.touch(sight.lamp.lamp_id, lights.course.t_mono)
-        if sight.lamp is None:
-            continue
-        if flags & FAINT_FLAG or amplitude <= lights.settings.faint * math.sqrt(variance):
-            sight.state = FAINT
-        else:
-            sight.state = ACCEPTED if alone else TWIN
-    found.sort(key=lambda sight: -sight.amplitude)
-    return found
-
-
-def nearest(lights: Lights, code: int, x: float, y: float) -> tuple[Lamp | None, bool]:
-    """The lamp of a code nearest to a place, and whether it alone can be what is received there."""
-    lamps = lights.catalogue.candidates(code)
-    if len(lamps) < 2:
-        return (lamps[0], True) if lamps else (None, True)
-    ranked = sorted(lamps, key=lambda lamp: -below(lights, lamp, x, y))
-    first, second = (below(lights, lamp, x, y) for lamp in ranked[:2])
-    return ranked[0], second < TWIN_SHARE * first
-
-
-def below(lights: Lights, lamp: Lamp, x: float, y: float) -> float:
-    """Roughly how strong a lamp is at a place, level and without field of view: enough to rank lamps by."""
-    receiver = lights.survey.receiver
-    h2 = max(lamp.z - receiver.z, 0.1) ** 2
-    d2 = h2 + (lamp.x - x) ** 2 + (lamp.y - y) ** 2
-    fall = math.pow(h2 / d2, 0.5 * (lamp.order + receiver.order))
-    return lamp.power_w * fall / d2
 
 
 def slot_of(lights: Lights, track: Track, lamp: Lamp, busy: set[int]) -> int | None:

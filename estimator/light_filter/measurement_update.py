@@ -25,7 +25,7 @@ from estimator.light_filter.state_vector import (
     X,
     Y,
 )
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 WIDTH: Final = 12

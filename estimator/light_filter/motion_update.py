@@ -14,8 +14,9 @@ import numpy as np
 
 from estimator.light_filter import state_vector
 from estimator.light_filter.filter_state import Lights, Track
-from estimator.measurements import Array, Imu, Odometry
+from estimator.measurements import Imu, Odometry
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 
 CARRY_S: Final = 0.5
 """Odometry older than that is not missed for a moment; it has ended, and constant velocity takes over."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 X, Y, YAW, SPEED, SIDE, TURN = range(6)

@@ -16,12 +16,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.mapping.keyframe import Keyframe, Submap
+from estimator.mapping.constraints import Constraints
+from estimator.mapping.keyframe import Keyframe, Settled, Submap
 from estimator.mapping.map_snapshot import Identity, MapImage, Piece
-from estimator.mapping.submap import Settled
-from estimator.mapping.submap_graph import Constraints
-from estimator.measurements import Array, Beam
+from estimator.measurements import Beam
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 from estimator.scan_matching.local_map import NX, NY, SEEN, SLOPE, UNPROVED, WEIGHT, WIDTH, X, Y
 

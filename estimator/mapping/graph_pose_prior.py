@@ -18,8 +18,8 @@ from estimator.fusion.motion_history import positive
 from estimator.mapping.map_frame import move_map, shift_map
 from estimator.mapping.pose_graph import Graph, Solution, optimise
 from estimator.mapping.relative_covariance import UNTIED
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import hang
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE

@@ -7,19 +7,14 @@ and every solution of the graph its time.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from estimator.mapping.spanning_tree_step import Bools, spanning
-from estimator.measurements import Array
+from estimator.mapping.constraints import Constraints
+from estimator.mapping.spanning_tree_step import spanning
+from estimator.numerics.arrays import Array, Bools, Ints
 from estimator.numerics.elimination_ordering import NONE
-
-if TYPE_CHECKING:
-    from estimator.mapping.submap_graph import Constraints
-
-Ints = npt.NDArray[np.int64]
 
 WAYS, LOOPS = 2, 4
 """Constraints of each kind that a submap keeps for itself; it may have more that the other end keeps."""

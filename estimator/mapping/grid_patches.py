@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.mapping import occupancy_grid
-from estimator.mapping.keyframe import Beams, Keyframe
-from estimator.measurements import Array, Beam
+from estimator.mapping.keyframe import Keyframe
+from estimator.measurements import Beam, Beams
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 Tile = tuple[int, int]

@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import TYPE_CHECKING
 from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.measurements import Array, Scan
+from estimator.measurements import Beams, Scan
 from estimator.numerics import se2
-
-if TYPE_CHECKING:
-    from estimator.mapping.submap import Settled
+from estimator.numerics.arrays import Array
+from estimator.result import Virtual
+from estimator.scan_matching import local_map
+from estimator.scan_matching.deskew import unturned
+from estimator.scan_matching.local_map import LocalMap
 
 Square = tuple[int, int, int]
-Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
-"""Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
+Elements = npt.NDArray[np.float32]
+"""Line elements (n, localmap.WIDTH) in the submap's frame; float32 resolves a micrometre over 10 m."""
 
 ANYWHERE = np.diag((1e3, 1e3, 10.0))
 """Covariance (m, m, rad) of a place that no way joins with the others."""
@@ -30,19 +30,6 @@ NEAR_M, NEAR_RAD = 0.4, 0.25 * math.pi
 
 LONGEST_M = 1e6
 """Ranges beyond are kept as this: they say the same, and fit into single precision."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Virtual:
-    """The paper's virtual consistent state components: what light alone said of the place, free of laser and drift.
-
-    Attributes:
-        T_map_base, covariance: of the `lights` filter, for the keyframe's instant. accepted: IDs of the lamps used (S).
-    """
-
-    T_map_base: Array
-    covariance: Array
-    accepted: frozenset[int]
 
 
 @dataclass(slots=True, eq=False, weakref_slot=True)
@@ -127,6 +114,24 @@ class Keyframe:
         return unturned(self.bearing_rad, self.turned_rad), self.range_m.astype(np.float64), self.beam
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Settled:
+    """What a finished submap consists of.
+
+    Attributes:
+        elements: of all its keyframes, merged. witness: its middle keyframe, placed in the submap's frame, for what it
+            says of free space. sigma: range noise they were laid with.
+    """
+
+    elements: Elements
+    witness: Keyframe
+    sigma: float
+
+    def local(self) -> LocalMap:
+        """The submap as something to match against, in its own frame."""
+        return local_map.index(self.elements.astype(np.float64), np.zeros(2), 1, self.witness)
+
+
 def near(one: Array, other: Array) -> bool:
     """Whether two keyframes look at the same from the same place; who drives along an axis is well within an eighth."""
     x, y, yaw = (one - other).tolist()
@@ -143,20 +148,6 @@ def squares_about(T_map_keyframe: Array) -> list[Square]:
     """The squares in which all are listed that are `near`."""
     i, j, k = square_of(T_map_keyframe)
     return [(i + a, j + b, (k + c) % 8) for a in (0, -1, 1) for b in (0, -1, 1) for c in (0, -1, 1)]
-
-
-def unturned(bearing_rad: Array, turned_rad: float) -> Array:
-    """Bearings as they would be had the lidar not turned during the scan, seen from its end."""
-    n = len(bearing_rad)
-    if turned_rad == 0.0 or n < 2:
-        return bearing_rad
-    return np.asarray(bearing_rad - turned_rad * _to_come(n))
-
-
-@lru_cache(maxsize=4)
-def _to_come(n: int) -> Array:
-    """Share of a scan that is still to come at each of its ``n`` beams."""
-    return np.asarray(1.0 - np.arange(n) / (n - 1))
 
 
 def hanging(frames: Iterable[Keyframe]) -> list[tuple[Submap, list[Keyframe]]]:

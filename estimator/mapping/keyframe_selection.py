@@ -15,8 +15,9 @@ from estimator.mapping.keyframe import Keyframe, Submap, near, square_of, square
 from estimator.mapping.loop_closure import keyframe_laid
 from estimator.mapping.submap import SIZE
 from estimator.mapping.submap_graph import OWN
-from estimator.measurements import Array, Scan
+from estimator.measurements import Scan
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.relocalisation import relocalisation, relocalisation_check, unaligned_map
 from estimator.result import MatchResult
 from estimator.scan_matching import local_map

@@ -17,8 +17,8 @@ import numpy as np
 from estimator.mapping.grid_patches import SIDE, UNIT, Cells, Patch, Seen, Tile, compose, render
 from estimator.mapping.keyframe import Keyframe, Submap, hanging
 from estimator.mapping.occupancy_grid import Grid, blank
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 
 if TYPE_CHECKING:
     from estimator.state import State

@@ -21,9 +21,10 @@ from estimator.mapping.map_alignment_covariance import APART
 from estimator.mapping.map_frame import move_map
 from estimator.mapping.pose_graph import UPPER, Graph, Solution, optimise
 from estimator.mapping.relative_covariance import tied
-from estimator.mapping.submap_graph import LOOK, SOLVE, Atlas, Ints, Waiting
-from estimator.measurements import Answer, Array
+from estimator.mapping.submap_graph import LOOK, SOLVE, Atlas, Waiting
+from estimator.measurements import Answer
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Loop, LoopReason
 from estimator.state import State

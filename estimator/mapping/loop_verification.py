@@ -17,10 +17,10 @@ from typing import Final
 
 import numpy as np
 
-from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.submap import Settled, points_of_frame
-from estimator.measurements import Array
+from estimator.mapping.keyframe import Keyframe, Settled, Submap
+from estimator.mapping.submap import points_of_frame
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import LoopReason, MatchResult
 from estimator.scan_matching.branch_and_bound import Around, SearchSettings, field_of, search

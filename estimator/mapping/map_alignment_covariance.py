@@ -14,8 +14,8 @@ import numpy as np
 from estimator.mapping.keyframe import Submap
 from estimator.mapping.relative_covariance import inverse3
 from estimator.mapping.submap_graph import Atlas
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3, swing
 
 APART: Final = 4.0

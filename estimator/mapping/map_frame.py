@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from estimator.mapping.keyframe import square_of
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.state import State
 
 JUMP_M, JUMP_RAD = 0.05, math.radians(1.0)

@@ -17,11 +17,11 @@ import numpy as np
 from estimator.fusion.pose_update import covariance
 from estimator.light_filter.survey import Lamp
 from estimator.mapping import live_grid
-from estimator.mapping.keyframe import Keyframe, Submap, square_of
-from estimator.mapping.submap import Settled, settle
-from estimator.mapping.submap_graph import Constraints
-from estimator.measurements import Array
+from estimator.mapping.constraints import Constraints
+from estimator.mapping.keyframe import Keyframe, Settled, Submap, square_of
+from estimator.mapping.submap import settle
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.state import Settings, State, new_state
 
 if TYPE_CHECKING:  # costs nothing where there is no photodiode

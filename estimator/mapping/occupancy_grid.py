@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from estimator.mapping.keyframe import Beams
-from estimator.measurements import Array, Beam
+from estimator.measurements import Beam, Beams
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 Placed = tuple[Array, Beams]

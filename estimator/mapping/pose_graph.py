@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimator.mapping.spanning_tree_step import Bools, carry_on, spanning
-from estimator.measurements import Array
+from estimator.mapping.spanning_tree_step import carry_on, spanning
+from estimator.numerics.arrays import Array, Bools, Ints
 from estimator.numerics.block_ldl import factor, solve
-from estimator.numerics.elimination_ordering import NONE, Ints, adjacency, columns, minimum_degree
+from estimator.numerics.elimination_ordering import NONE, adjacency, columns, minimum_degree
 from estimator.numerics.jit import kernel
 
 NARROWER = 0.5

@@ -11,13 +11,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from estimator.mapping.pose_graph import Graph
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-
-Ints = npt.NDArray[np.int64]
 
 BELIEVED: Final = 0.25
 """A loop that the graph believes less than this joins nothing."""

@@ -10,13 +10,10 @@ Grisetti et al., RSS 2007, who optimise in such coordinates altogether).
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from estimator.measurements import Array
-from estimator.numerics.elimination_ordering import NONE, Ints, adjacency
+from estimator.numerics.arrays import Array, Bools, Ints
+from estimator.numerics.elimination_ordering import NONE, adjacency
 from estimator.numerics.jit import kernel
-
-Bools = npt.NDArray[np.bool_]
 
 
 @kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1], b1[::1], b1[::1])", aside=True)

@@ -3,42 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from estimator.mapping.keyframe import Keyframe
-from estimator.measurements import Array, Beam
+from estimator.mapping.keyframe import Keyframe, Settled
+from estimator.measurements import Beam
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.scan_matching import local_map
 from estimator.scan_matching.deskew import ScanPoints
 from estimator.scan_matching.line_features import lines_of
-from estimator.scan_matching.local_map import LocalMap, MapSettings
-
-Elements = npt.NDArray[np.float32]
-"""Line elements (n, localmap.WIDTH) in the submap's frame; float32 resolves a micrometre over 10 m."""
+from estimator.scan_matching.local_map import MapSettings
 
 SIZE = 12
 """Keyframes in a submap: some three metres of way."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Settled:
-    """What a finished submap consists of.
-
-    Attributes:
-        elements: of all its keyframes, merged. witness: its middle keyframe, placed in the submap's frame, for what it
-            says of free space. sigma: range noise they were laid with.
-    """
-
-    elements: Elements
-    witness: Keyframe
-    sigma: float
-
-    def local(self) -> LocalMap:
-        """The submap as something to match against, in its own frame."""
-        return local_map.index(self.elements.astype(np.float64), np.zeros(2), 1, self.witness)
 
 
 def settle(frames: Sequence[Keyframe], T_odom_submap: Array, sigma: float) -> Settled:

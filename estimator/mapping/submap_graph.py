@@ -8,20 +8,17 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from estimator.mapping.constraints import Constraints
 from estimator.mapping.graph_sparsification import handed_on, thinned
-from estimator.mapping.keyframe import ANYWHERE, Keyframe, Submap
+from estimator.mapping.keyframe import ANYWHERE, Keyframe, Settled, Submap
 from estimator.mapping.loop_verification import Found
-from estimator.mapping.pose_graph import UPPER
-from estimator.mapping.submap import SIZE, Settled, settle
-from estimator.measurements import Answer, Array, Job
+from estimator.mapping.submap import SIZE, settle
+from estimator.measurements import Answer, Job
 from estimator.numerics import se2
-from estimator.numerics.symmetric3 import invert3
+from estimator.numerics.arrays import Array
 from estimator.relocalisation.hypothesis_tracking import Seek, Watch
 from estimator.result import Loop
-
-Ints = npt.NDArray[np.int64]
 
 FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
 """What a keyframe's place loses against the one before, beyond what the matches know of: 5 mm and 0.1 deg."""
@@ -33,9 +30,6 @@ would go on filling up for hours, because no lap begins its submaps where the la
 OWN: Final = 12
 """Submaps of this session kept on top of a restored map that is only used."""
 
-MANY: Final = 3
-"""Loops kept between the same two submaps."""
-
 LOST: Final = 100
 """Keyframes after which a job that has not answered never will: one that failed does not."""
 
@@ -43,90 +37,6 @@ LOOK, SOLVE, SETTLE = 3, 2, 1
 """Priorities of the jobs, lowest first."""
 
 Apply = Callable[[object], None]
-
-
-@dataclass(slots=True, eq=False)
-class Constraints:
-    """What joins the submaps; arrays with one row each.
-
-    Attributes:
-        between: (m, 2) keys of two submaps a, b. T: (m, 3) T_a_b. information: (m, 6), upper triangle, in b's axes.
-        loop: (m,) whether it is a loop, which may be false.
-    """
-
-    between: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    T: Array = field(default_factory=lambda: np.empty((0, 3)))
-    information: Array = field(default_factory=lambda: np.empty((0, 6)))
-    loop: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-
-    def add(self, a: int, b: int, T_a_b: Array, P: Array, is_loop: bool) -> None:
-        """Join two submaps; ``P`` is the covariance of T_a_b in b's axes.
-
-        Of many loops of a pair the latest stay, and of many ways the surest one: what is kept is bounded by the submaps
-        that are, however often others are taken out between them.
-        """
-        same = np.flatnonzero((self.loop == is_loop) & (np.sort(self.between, axis=1) == sorted((a, b))).all(axis=1))
-        if len(same) >= (MANY if is_loop else 1):
-            if not is_loop and np.trace(self.seen_from(a, int(same[0]))[2]) <= np.trace(P):
-                return
-            self.keep(np.arange(len(self.loop)) != same[0])
-        H = invert3(P)
-        self.between = np.vstack((self.between, (a, b)))
-        self.T = np.vstack((self.T, T_a_b))
-        self.information = np.vstack((self.information, [H[i, j] for i, j in UPPER]))
-        self.loop = np.append(self.loop, is_loop)
-
-    def keep(self, which: npt.NDArray[np.bool_]) -> None:
-        """Forget all others."""
-        self.between, self.T = self.between[which], self.T[which]
-        self.information, self.loop = self.information[which], self.loop[which]
-
-    def split(self, first: int) -> Constraints:
-        """Take out what joins submaps with keys below ``first``, and return it; what joins them with others goes."""
-        a, b = (self.between < first).T
-        which = a & b
-        out = Constraints(self.between[which], self.T[which], self.information[which], self.loop[which])
-        self.keep(~(a | b))
-        return out
-
-    def put(self, other: Constraints) -> None:
-        """Add all of the other ones."""
-        self.between, self.T = np.vstack((other.between, self.between)), np.vstack((other.T, self.T))
-        self.information = np.vstack((other.information, self.information))
-        self.loop = np.append(other.loop, self.loop)
-
-    def covariance(self, row: int) -> Array:
-        """Of a constraint's T, 3x3, in b's axes."""
-        H = np.empty((3, 3))
-        for k, (i, j) in enumerate(UPPER):
-            H[i, j] = H[j, i] = self.information[row, k]
-        return invert3(H)
-
-    def of(self, key: int) -> Ints:
-        """Rows that join this submap with others."""
-        return np.flatnonzero((self.between == key).any(axis=1))
-
-    def seen_from(self, key: int, row: int) -> tuple[int, Array, Array]:
-        """The other submap of a constraint: its key, T_key_other, and the covariance of that in the other's axes."""
-        a, b = self.between[row].tolist()
-        T, P = self.T[row], self.covariance(row)
-        if a == key:
-            return b, T, P
-        A = se2.adjoint(T)
-        return a, se2.inverse(T), A @ P @ A.T
-
-    def reroute(self, key: int, hub: int, T_hub_key: Array, P: Array, rows: Ints | None = None) -> None:
-        """Take a submap out: what else it is joined with is joined with ``hub`` by way of it; ``P`` in its axes.
-
-        ``rows``: constraints that are handed on so, all if None.
-        """
-        rows = self.of(key) if rows is None else rows
-        others = [(*self.seen_from(key, row), bool(self.loop[row])) for row in rows]
-        self.keep(~(self.between == key).any(axis=1))
-        for other, T, P_other, is_loop in others:
-            if other != hub:
-                A = se2.adjoint(se2.inverse(T))
-                self.add(hub, other, se2.compose(T_hub_key, T), A @ P @ A.T + P_other, is_loop)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,7 +231,7 @@ class Atlas:
         """
         newest, T = self.newest, frame.T_odom_keyframe
         x, y, _ = (T - self.T_odom_last).tolist()
-        F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+        F = se2.lever_matrix(T - self.T_odom_last)
         self.C = F @ self.C @ F.T
         self.loosen(P + FLOOR, T)
         self.way_m += math.hypot(x, y) if newest is not None else 0.0
@@ -369,14 +279,13 @@ class Atlas:
         """The same, with ``P_newest`` for that of the newest submap."""
         newest = self.newest
         assert newest is not None
-        x, y, _ = (T_odom - newest.T_odom_submap).tolist()
-        F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+        F = se2.lever_matrix(T_odom - newest.T_odom_submap)
         return np.asarray(F @ P_newest @ F.T + self.C)
 
     def loosen(self, P: Array, T_odom: Array) -> None:
         """Add to what the way has lost, at a place: covariance ``P`` in odom axes."""
         self.C += P
-        A = swing(-T_odom)
+        A = se2.lever_matrix(-T_odom)
         self.strayed = self.strayed + A @ P @ A.T
 
     def strayed_since(self, since: Submap, T_odom: Array) -> Array:
@@ -385,7 +294,7 @@ class Atlas:
         Each step of the way adds its own, swung out by the lever from there to here; summed up about one origin, the
         sums of two instants can be subtracted.
         """
-        A = swing(T_odom)
+        A = se2.lever_matrix(T_odom)
         return np.asarray(A @ (self.strayed - since.strayed) @ A.T)
 
     def apart(self, other: Submap, T_odom: Array) -> Array:
@@ -394,7 +303,7 @@ class Atlas:
         tie = self.ties.get(other.key)
         if tie is None or self.tied is None:
             return way
-        A = swing(T_odom - self.tied.T_odom_submap)
+        A = se2.lever_matrix(T_odom - self.tied.T_odom_submap)
         loop = np.asarray(A @ tie @ A.T + self.strayed_since(self.tied, T_odom))
         return loop if np.trace(loop) < np.trace(way) else way
 
@@ -435,11 +344,6 @@ class Atlas:
         submap.hang_on(hub, se2.between(hub.T_map_submap, submap.T_map_submap))
         submap.settled = None
         del self.submaps[submap.key]
-
-
-def swing(lever: Array) -> Array:
-    """What an error becomes a lever (x, y) further on: an error of heading moves the place there."""
-    return np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0]), (0.0, 0.0, 1.0)))
 
 
 def alike(one: Submap, other: Submap) -> bool:

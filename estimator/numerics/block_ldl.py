@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.measurements import Array
-from estimator.numerics.elimination_ordering import Ints
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 
 Pattern = tuple[Ints, Ints, Ints, Ints]

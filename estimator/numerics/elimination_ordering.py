@@ -9,11 +9,9 @@ is the pattern of its column in the factor, so that ordering and symbolic factor
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from estimator.numerics.arrays import Ints
 from estimator.numerics.jit import kernel
-
-Ints = npt.NDArray[np.int64]
 
 NONE = -1
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 
 def identity() -> Array:
@@ -94,3 +94,8 @@ def adjoint(T: Array) -> Array:
     A = rotation(float(T[2]))
     A[0, 2], A[1, 2] = T[1], -T[0]
     return A
+
+
+def lever_matrix(lever: Array) -> Array:
+    """Jacobian (3, 3) of a pose error carried along a lever (x, y): a heading error moves the far end."""
+    return np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0]), (0.0, 0.0, 1.0)))

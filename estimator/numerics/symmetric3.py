@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 TINY = 1e-9

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.paper.lateration_model import Links, Method, expected_error, spread
 from estimator.paper.lateration_solvers import DECIDED, SAME_M, Solution, Strengths, distinct, starts
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from estimator.mapping.keyframe import Beams
-from estimator.measurements import Array
+from estimator.measurements import Beams
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 ROOT_2PI = math.sqrt(2.0 * math.pi)

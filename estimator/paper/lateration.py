@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.paper.adaptive_link_selection import adapted
 from estimator.paper.lateration_model import (
     LINK_N,

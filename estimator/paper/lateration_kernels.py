@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator.cdma.correlation_kernels import invert
 from estimator.light_filter.lambertian import COLUMNS, expect
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 STEPS: Final = 80

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from estimator.light_filter.lambertian import LEAST_HEIGHT_M, pack_lamps, pack_receiver
 from estimator.light_filter.survey import Lamp, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 
 Index = npt.NDArray[np.int64]
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.paper.lateration_kernels import by_range, by_strength, strength_step
 from estimator.paper.lateration_model import Links, Method, Solver, in_line, spread
 

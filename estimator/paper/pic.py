@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 from estimator.numerics.symmetric3 import solve3
 from estimator.scan_matching import icp
-from estimator.scan_matching.distance_axis import Ints, ray_distance2, turn_of
+from estimator.scan_matching.distance_axis import ray_distance2, turn_of
 
 COMPATIBLE = 5.991
 """Squared Mahalanobis distance within which two points may be one: chi-squared, 2 degrees of freedom, 95 %."""

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 from estimator.numerics.symmetric3 import invert3, solve3
 from estimator.scan_matching import icp
-from estimator.scan_matching.distance_region import Ints
 
 REACH_M, FEW = 0.12, 2
 """A surface's direction comes from the neighbours within this, and from so many on either side at least."""

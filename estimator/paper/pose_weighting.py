@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 from estimator.numerics.symmetric3 import invert3
 

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 
 from estimator.mapping.keyframe import Keyframe
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.relocalisation.global_scan_match import Fit, Looked, Terrain, Verdict, same
 from estimator.relocalisation.scene_change import Leap
 from estimator.scan_matching.branch_and_bound import Around

@@ -26,12 +26,13 @@ import numpy as np
 
 from estimator.commands import forget
 from estimator.fusion import map_odom_filter
+from estimator.fusion.motion_model import too_far
 from estimator.fusion.pose_update import BLIND, noise_of
 from estimator.mapping import keyframe
-from estimator.mapping.keyframe import unturned
 from estimator.mapping.submap_graph import LOOK
-from estimator.measurements import Array, Odometry, Scan
+from estimator.measurements import Odometry, Scan
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation import global_scan_match, relocalisation
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, Verdict
@@ -39,14 +40,11 @@ from estimator.relocalisation.hypothesis_tracking import BEHIND, Question
 from estimator.relocalisation.scene_change import glance
 from estimator.result import MatchResult
 from estimator.scan_matching import local_map
-from estimator.scan_matching.deskew import ScanPoints
+from estimator.scan_matching.deskew import ScanPoints, unturned
 from estimator.state import State
 
 SURPRISE: Final = 25.0
 """Squared Mahalanobis distance of a correction that no driving explains; as that of `matching.demand_on`."""
-FASTEST: Final = (1.0, 2.0)
-"""m/s, rad/s. No robot indoors drives so much faster than wheels, or its velocity, say; but wheels slip in turns, and
-stamps come late."""
 ROW: Final = 3
 """Scans in a row that do not fit, and then do; so many more, before the place is looked for: the first that fits may be
 of two places, or blurred."""
@@ -215,13 +213,6 @@ def surprising(state: State, match: MatchResult) -> bool:
     """Whether a match has moved the pose farther than the prediction allows."""
     off = match.correction
     return float(off @ invert3(state.fused.P) @ off) > SURPRISE
-
-
-def too_far(moved: Array, dt: float) -> bool:
-    """Whether a pose has moved (x, y, yaw) farther than a robot can drive in ``dt`` seconds."""
-    x, y, yaw = moved.tolist()
-    v, w = FASTEST
-    return math.hypot(x, y) > global_scan_match.SAME_M + v * dt or abs(yaw) > global_scan_match.SAME_RAD + w * dt
 
 
 def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> None:

@@ -15,17 +15,15 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma.epoch import UNUSABLE, LightEpoch
-from estimator.fusion.map_odom_filter import SILENT_S
+from estimator.cdma.epoch import UNUSABLE
 from estimator.light_filter.collinear_lamps import ACROSS_M, ROW_M, spread
 from estimator.light_filter.filter_state import Lights, Track
 from estimator.light_filter.grid_likelihood import CAP
 from estimator.light_filter.initialisation import RIVAL, Place, direct, places, probabilities, straight
-from estimator.light_filter.light_channel import Asked, Light
-from estimator.light_filter.link_gating import sights
-from estimator.light_filter.survey import Lamp
-from estimator.measurements import Array
+from estimator.light_filter.light_channel import SILENT_S, Asked, Light, silent, too_strong_at
+from estimator.light_filter.link_association import NEARER_M, strong_at
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Fix, Link, LinkState
 from estimator.state import State
@@ -59,9 +57,6 @@ ASKED_M: Final = 0.1
 """Within that far of each other two poses receive the same lamps: a robot drives less from one epoch to the next."""
 MISPLACED: Final = 2
 """So many lamps at least have to be received that cannot be at a pose: a single one may be a lamp that was moved."""
-NEARER_M: Final = 1.0
-STRONGER: Final = 2.0
-"""A lamp that is received so many times stronger than it can be within the former of a place is not received there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +136,7 @@ def out_of_place(state: State, T_map_base: Array) -> bool:
     It asks the latest epoch alone, not the `lights` filter, which wheels that turn more than they say can lead astray;
     and not the heading, of which strengths know nothing. Of lamps of one code the nearest counts.
     """
-    return any(received(state, T_map_base))
+    return any(too_strong_at(state.light, T_map_base))
 
 
 def misplaced(state: State, T_map_base: Array) -> bool:
@@ -167,7 +162,7 @@ def _misplaced(state: State, T_map_base: Array, compared: bool) -> bool:
     heard = sum(link.state not in UNHEARD for link in result.links)
     if heard < MISPLACED or (compared and 2 * len(result.accepted) >= heard):
         return False  # what is used fits where the filter is, and where that is, is held against the pose: costs less
-    strong = received(state, T_map_base)
+    strong = too_strong_at(state.light, T_map_base)
     return sum(strong) >= MISPLACED and 2 * sum(strong) > len(strong)
 
 
@@ -177,7 +172,7 @@ def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:
     Wheels that turn more than they say lead the filter astray, and not one epoch; it says more than that the lamps of
     the place are received, which they are a few metres beside it too.
     """
-    if state.light is None or not received(state, T_map_base):
+    if state.light is None or not too_strong_at(state.light, T_map_base):
         return False
     rx, found = state.light.filter.survey.receiver, glimpsed(state.light)
     (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
@@ -186,48 +181,8 @@ def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:
 
 def in_place(state: State, T_map_base: Array) -> bool:
     """Whether lamps enough are received now, all of them as strong as they can be about a pose, and it may be there."""
-    strong = received(state, T_map_base)
+    strong = too_strong_at(state.light, T_map_base)
     return len(strong) >= LEAST and not any(strong) and not glimpsed_elsewhere(state, T_map_base)
-
-
-def received(state: State, T_map_base: Array) -> list[bool]:
-    """Of each lamp that is received, whether it is stronger than it can be about a pose."""
-    if state.light is None or silent(state.light):
-        return []
-    lights, epoch = state.light.filter, state.light.epoch
-    assert epoch is not None
-    rx = lights.survey.receiver
-    (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
-    return strong_at(lights, epoch, x, y)
-
-
-def silent(light: Light) -> bool:
-    """Whether there is no epoch of now that is of any use."""
-    epoch = light.epoch
-    return epoch is None or light.filter.course.t_mono - epoch.t_end > SILENT_S or bool(epoch.block & UNUSABLE)
-
-
-def strong_at(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[bool]:
-    """Of each lamp of an epoch, whether it is stronger than it can be about a place of the receiver."""
-    return [
-        too_strong(lights, sight.lamp, sight.amplitude, x, y)
-        for sight in sights(lights, epoch, x, y)
-        if sight.state is LinkState.ACCEPTED and sight.lamp is not None
-    ]
-
-
-def too_strong(lights: Lights, lamp: Lamp, amplitude: float, x: float, y: float) -> bool:
-    """Whether a lamp is received straight, and stronger than it can be near a place of the receiver.
-
-    However dim it was known last, it may shine as surveyed: something may have stood in its light while it was learned.
-    """
-    rx = lights.survey.receiver
-    h = max(lamp.z - rx.z, 0.1)
-    away = max(math.hypot(lamp.x - x, lamp.y - y) - NEARER_M, 0.0)
-    fall = h / math.hypot(h, away) / math.cos(min(rx.half_fov_rad, 1.5))
-    known = lights.gains.get(lamp.lamp_id)
-    rim = lights.catalogue.rims[lamp.lamp_id] * (1.0 if known is None else math.exp(max(float(known[0][0]), 0.0)))
-    return amplitude > rim * max(1.0, STRONGER * math.pow(fall, lamp.order + rx.order + 2.0))
 
 
 def about(lights: Lights, place: Place) -> Window:

@@ -23,8 +23,8 @@ from estimator.mapping.loop_verification import Found
 from estimator.mapping.map_alignment_covariance import askew_at
 from estimator.mapping.map_frame import move_map, rehang, shift_map, unlist
 from estimator.mapping.submap_graph import LOOK, Atlas
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, look
 from estimator.relocalisation.hypothesis_tracking import WATCH_M, Hypothesis, Seek, Watch

@@ -15,10 +15,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.mapping.keyframe import Beams
-from estimator.measurements import Array
+from estimator.measurements import Beams
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-from estimator.scan_matching.distance_region import Ints
 from estimator.scan_matching.local_map import HIT, MARGIN, WIDTH, X, Y, look_at
 
 Floats = npt.NDArray[np.float32]

@@ -15,12 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 
 Bytes = npt.NDArray[np.uint8]
 Nodes = npt.NDArray[np.int32]
-Ints = npt.NDArray[np.int64]
 
 Node = tuple[np.int32, np.int32, np.int32, np.int32]
 """Level, column, row, heading."""

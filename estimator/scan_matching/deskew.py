@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.measurements import Array, Beam, Scan
+from estimator.measurements import Beam, Scan
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 HIT: int = int(Beam.HIT)
@@ -146,3 +148,17 @@ def oriented(points: ScanPoints, most: int) -> Array:
     out = np.empty((-(-n // stride), 4))
     orient(points.xy, stride, out)
     return out
+
+
+def unturned(bearing_rad: Array, turned_rad: float) -> Array:
+    """Bearings as they would be had the lidar not turned during the scan, seen from its end."""
+    n = len(bearing_rad)
+    if turned_rad == 0.0 or n < 2:
+        return bearing_rad
+    return np.asarray(bearing_rad - turned_rad * _to_come(n))
+
+
+@lru_cache(maxsize=4)
+def _to_come(n: int) -> Array:
+    """Share of a scan that is still to come at each of its ``n`` beams."""
+    return np.asarray(1.0 - np.arange(n) / (n - 1))

@@ -14,12 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-
-Ints = npt.NDArray[np.int64]
 
 GROUP = 8
 """Sectors that share a ring."""

@@ -24,10 +24,10 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-from estimator.scan_matching.distance_axis import GROUP, Axis, Ints, build_axis, sector_of
+from estimator.scan_matching.distance_axis import GROUP, Axis, build_axis, sector_of
 
 __all__ = ["Axis", "Fused", "Ints", "Kind", "build_axis", "fuse", "glance", "nearest", "nearest_all", "pair_fused"]
 

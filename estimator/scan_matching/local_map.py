@@ -9,15 +9,17 @@ depends on what is in view, not on how long the robot has driven.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.mapping.keyframe import Beams, Keyframe
-from estimator.measurements import Array, Beam
+from estimator.measurements import Beam, Beams
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-from estimator.scan_matching.distance_region import Axis, Ints, build_axis, nearest
+from estimator.result import Virtual
+from estimator.scan_matching.distance_region import Axis, build_axis, nearest
 
 X, Y, NX, NY, SLOPE, WEIGHT, SEEN, STRIKES = range(8)
 """Columns of an element: place, normal towards the sensor, variance of the normal's direction (rad^2), scans averaged,
@@ -62,6 +64,33 @@ class MapSettings:
     strikes: float = 0.3
 
 
+class PlacedScan(Protocol):
+    """A kept scan with the pose it was taken from, as `estimator.mapping.keyframe.Keyframe` is one."""
+
+    @property
+    def T_odom_keyframe(self) -> Array:
+        """Base in the odom frame, (x, y, yaw)."""
+
+    @property
+    def T_base_lidar(self) -> Array:
+        """Mount of the lidar."""
+
+    @property
+    def T_odom_lidar(self) -> Array:
+        """Lidar in the odom frame."""
+
+    @property
+    def bearing_rad(self) -> Array:
+        """Bearings in the lidar frame as the device gives them."""
+
+    @property
+    def virtual(self) -> Virtual | None:
+        """What light alone said at that instant, None where it said nothing good."""
+
+    def beams(self) -> Beams:
+        """Beams as seen from the end of the scan."""
+
+
 @dataclass(slots=True, eq=False)
 class LocalMap:
     """Elements (n, WIDTH) in the odom frame, and their axis; ``lines`` (normal x, y, slope, weight) follow its rows."""
@@ -70,7 +99,7 @@ class LocalMap:
     axis: Axis
     lines: Array
     updates: int = 0
-    newest: Keyframe | None = None
+    newest: PlacedScan | None = None
 
 
 @kernel(
@@ -182,7 +211,7 @@ def empty(origin: Array) -> LocalMap:
     return LocalMap(np.empty((0, WIDTH)), build_axis(np.empty((0, 2)), origin), np.empty((0, 4)))
 
 
-def update(local: LocalMap, frame: Keyframe, lines: Array, settings: MapSettings, sigma: float) -> LocalMap:
+def update(local: LocalMap, frame: PlacedScan, lines: Array, settings: MapSettings, sigma: float) -> LocalMap:
     """The map after a keyframe with these lines (base frame): merged, aged, indexed around the place of its lidar."""
     number, count, margin = local.updates + 1, len(local.elements), MARGIN + 5.0 * sigma
     fresh = lines if local.newest is None else standing(frame, lines, local.newest, margin)
@@ -203,7 +232,7 @@ def update(local: LocalMap, frame: Keyframe, lines: Array, settings: MapSettings
     return index(elements[alive][-settings.capacity :], eye[:2], number, frame)
 
 
-def standing(frame: Keyframe, lines: Array, before: Keyframe, margin: float) -> Array:
+def standing(frame: PlacedScan, lines: Array, before: PlacedScan, margin: float) -> Array:
     """Lines of a keyframe that do not stand where the one before saw nothing: what has just moved in is left out."""
     points = np.zeros((len(lines), 4))
     points[:, :2] = se2.apply(frame.T_odom_keyframe, lines[:, :2])
@@ -221,7 +250,7 @@ def lines_along(elements: Array, label: Ints, lines: Array) -> None:
         lines[i, 3] = elements[j, WEIGHT] / (elements[j, WEIGHT] + 1.0)
 
 
-def index(elements: Array, origin: Array, number: int, newest: Keyframe | None) -> LocalMap:
+def index(elements: Array, origin: Array, number: int, newest: PlacedScan | None) -> LocalMap:
     """Order elements on the axis around ``origin``."""
     axis = build_axis(elements[:, :2], origin)
     lines = np.empty((len(elements), 4))

@@ -1,4 +1,4 @@
-"""One match told again, iteration by iteration: its pairs, their residuals and weights, and what light says beside it.
+"""One match re-run, iteration by iteration: its pairs, their residuals and weights.
 
 A match keeps a trace of a few numbers an iteration. Everything else follows from it and from what the matcher was asked
 with, because the kernels are deterministic; so a match costs nothing until somebody asks, and what is then told is what
@@ -12,17 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from estimator.fusion import map_odom_filter
-from estimator.measurements import Array, Scan
 from estimator.numerics import se2
-from estimator.result import Fix, MatchResult
+from estimator.numerics.arrays import Array, Ints
 from estimator.scan_matching import icp, scan_matcher
-from estimator.scan_matching.deskew import ScanPoints
 from estimator.scan_matching.local_map import LocalMap
 from estimator.scan_matching.scan_matcher import Asked, Attempt
-from estimator.state import State
-
-Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,61 +56,11 @@ class Told:
     iterations: tuple[Iteration, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LightPoint:
-    """One lamp as a point of the paper's Eq. 13: its place in body frames, which light alone has told.
-
-    Attributes:
-        reference: in the frame of the newest keyframe, ``X_ref^-1 L``; None if light said nothing good there.
-        present: in the present body frame, ``X_new^-1 L``.
-        residual: how far the matched motion since the keyframe carries ``present`` from ``reference`` (x, y in m, frame
-            of the keyframe); None without a reference or a match.
-        logarithm: of received over expected strength in the latest epoch, None if it was not received.
-    """
-
-    lamp_id: int
-    code: int
-    reference: Array | None
-    present: Array
-    residual: Array | None
-    logarithm: float | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LightSaid:
-    """What light said at a scan: how far its fix had come, the pose T_map_base if it was good, and the lamps in use.
-
-    ``keyframe`` is the ID of the newest one, laid at ``T_odom_keyframe``.
-    """
-
-    fix: Fix
-    T_map_base: Array | None
-    keyframe: int
-    T_odom_keyframe: Array
-    lamps: tuple[LightPoint, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Entry:
-    """One match as it was asked and answered, and what light said; a few references, nothing computed yet."""
-
-    scan: Scan
-    points: ScanPoints
-    asked: Asked | None
-    result: MatchResult
-    light: LightSaid | None
-
-
-def entry_of(state: State, scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> Entry:
-    """Keep a match, from within `State.journal`: after the match and before it is fused."""
-    return Entry(scan, points, asked, result, light_said(state, result))
-
-
-def tell(entry: Entry) -> tuple[Told, ...]:
+def tell(asked: Asked | None) -> tuple[Told, ...]:
     """Match again and tell every attempt; nothing where the matcher was not asked (no map, too few points)."""
-    if entry.asked is None:
+    if asked is None:
         return ()
-    view, local, prior, cap, settings = entry.asked
+    view, local, prior, cap, settings = asked
     tried: list[Attempt] = []
     scan_matcher.match(view, local, prior, cap, settings, tried)
     names = [name_of(k, attempt, view) for k, attempt in enumerate(tried)]
@@ -166,29 +110,3 @@ def pairs_at(body: Array, partners: tuple[LocalMap, Ints], trace: Array) -> Pair
     away = se2.apply(T, body[:2, queries].T) - local.axis.rows[row, :2]
     residual = (local.lines[row, :2] * away).sum(axis=1)
     return Pairs(queries, local.axis.label[row], residual, said[:, 1], said[:, 2], said[:, 3] > 0.0)
-
-
-def light_said(state: State, match: MatchResult) -> LightSaid | None:
-    """What light said at this scan; None where there is no photodiode."""
-    if state.light is None:
-        return None
-    light, virtual = state.light, map_odom_filter.virtual(state)
-    if virtual is None:
-        return LightSaid(light.result.fix, None, state.anchor, state.T_odom_anchor, ())
-    newest = state.keyframes.get(state.anchor)
-    before = None if newest is None else newest.virtual
-    moved = se2.between(state.T_odom_anchor, match.T_odom_base) if match.ok else None
-    strength = {link.lamp_id: link.residual for link in light.result.links}
-    lamps = []
-    for lamp_id in sorted(virtual.accepted | (frozenset() if before is None else before.accepted)):
-        lamp = light.filter.catalogue.by_id.get(lamp_id)
-        if lamp is None:
-            continue
-        at = np.array(((lamp.x, lamp.y),))
-        present = se2.apply(se2.inverse(virtual.T_map_base), at)[0]
-        reference = None if before is None else se2.apply(se2.inverse(before.T_map_base), at)[0]
-        residual = None
-        if reference is not None and moved is not None:
-            residual = se2.apply(moved, present[None])[0] - reference
-        lamps.append(LightPoint(lamp_id, lamp.code, reference, present, residual, strength.get(lamp_id)))
-    return LightSaid(light.result.fix, virtual.T_map_base, state.anchor, state.T_odom_anchor, tuple(lamps))

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.mapping.keyframe import Keyframe, Virtual
-from estimator.measurements import Array, Beam
+from estimator.measurements import Beam
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
-from estimator.result import LightsResult, LinkState, MatchResult, Reason
+from estimator.result import LightsResult, LinkState, MatchResult, Reason, Virtual
 from estimator.scan_matching import icp, scan_matcher
 from estimator.scan_matching.distance_region import build_axis
+from estimator.scan_matching.local_map import PlacedScan
 from estimator.scan_matching.scan_matcher import Asked, Attempt, Prior, View
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def load(settings: Settings) -> None:
         import estimator.paper.pic  # noqa: F401  # imported to be compiled
 
 
-def first_of(prior: Prior, newest: Keyframe | None, now: Virtual | None, lights: LightsResult | None) -> First:
+def first_of(prior: Prior, newest: PlacedScan | None, now: Virtual | None, lights: LightsResult | None) -> First:
     """T1 from light where both the keyframe and this instant have a good position from it, else the prediction.
 
     ``X_ref^-1 X_new`` of the `lights` filter, hung on the keyframe. How the two positions' errors hang together is not
@@ -106,7 +107,7 @@ def match(asked: Asked, first: First, settings: Settings) -> MatchResult:
     return scan_matcher.verdict(best, local, prior, settings.matching)
 
 
-def points_of(frame: Keyframe, far_m: float) -> Array:
+def points_of(frame: PlacedScan, far_m: float) -> Array:
     """A keyframe's points (n, 2) in its lidar's frame, in order of measurement, those farther than L left out."""
     bearing, distance, kind = frame.beams()
     hit = (kind == Beam.HIT) & (distance > 0.0) & (distance <= far_m)
@@ -114,7 +115,7 @@ def points_of(frame: Keyframe, far_m: float) -> Array:
     return np.column_stack((r * np.cos(angle), r * np.sin(angle)))
 
 
-def by_points(view: View, frame: Keyframe, xy: Array, first: First, cap: int, settings: Settings) -> Attempt:
+def by_points(view: View, frame: PlacedScan, xy: Array, first: First, cap: int, settings: Settings) -> Attempt:
     """The paper's matcher, see point_to_point.py."""
     from estimator.paper import point_to_point
 
@@ -129,7 +130,7 @@ def by_points(view: View, frame: Keyframe, xy: Array, first: First, cap: int, se
     return Attempt(T, turned_back(H, -eye[2]), course.sums, len(trace), len(view.points), trace, view, told)
 
 
-def by_pic(view: View, frame: Keyframe, xy: Array, prior: Prior, cap: int, settings: Settings) -> Attempt:
+def by_pic(view: View, frame: PlacedScan, xy: Array, prior: Prior, cap: int, settings: Settings) -> Attempt:
     """The paper's baseline, see pic.py."""
     from estimator.paper import pic
 

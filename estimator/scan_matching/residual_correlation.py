@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-from estimator.scan_matching.distance_region import Axis, Ints, nearest
+from estimator.scan_matching.distance_region import Axis, nearest
 
 BESIDE_M = 0.2
 """Farther apart, two points in a row lie on different surfaces."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimator.mapping.keyframe import Beams
-from estimator.measurements import Array
+from estimator.measurements import Beams
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import VAGUE, MatchResult, Reason
 from estimator.scan_matching import icp

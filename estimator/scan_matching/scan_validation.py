@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from estimator.measurements import Array, Scan
+from estimator.measurements import Scan
+from estimator.numerics.arrays import Array
 from estimator.result import Reason
 from estimator.scan_matching.deskew import ScanPoints
 from estimator.state import State

@@ -8,12 +8,12 @@ import numpy as np
 
 from daemon.maps.image import meta_of, packed
 from estimator.light_filter.survey import Lamp, Survey
-from estimator.mapping.keyframe import Keyframe, Submap, Virtual
+from estimator.mapping.constraints import Constraints
+from estimator.mapping.keyframe import Keyframe, Settled, Submap
 from estimator.mapping.map_snapshot import Identity, MapImage, Piece
-from estimator.mapping.submap import Settled
-from estimator.mapping.submap_graph import Constraints
 from estimator.measurements import Array
 from estimator.numerics import se2
+from estimator.result import Virtual
 
 LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(6))
 SURVEY = Survey(LAMPS)

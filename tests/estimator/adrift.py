@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimator.mapping.keyframe import Submap, keep
-from estimator.mapping.submap import SIZE, Settled, settle
+from estimator.mapping.keyframe import Settled, Submap, keep
+from estimator.mapping.submap import SIZE, settle
 from estimator.mapping.submap_graph import Atlas
 from estimator.measurements import UNLIMITED, Answer, Array, Beam, Command, Job, Odometry, Record
 from estimator.numerics import se2

@@ -12,7 +12,8 @@ import numpy as np
 from estimator.cdma.epoch import BlockFlag, LightEpoch
 from estimator.light_filter import light_filter, measurement_update
 from estimator.light_filter.lambertian import expected
-from estimator.light_filter.link_gating import sights, table, view_of
+from estimator.light_filter.link_association import sights
+from estimator.light_filter.link_gating import table, view_of
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.measurements import Array, Odometry
 from estimator.numerics import se2

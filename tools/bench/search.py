@@ -18,8 +18,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from estimator.measurements import Array
+from estimator.numerics.arrays import Ints
 from estimator.scan_matching import distance_region
-from estimator.scan_matching.distance_axis import FEWEST, Axis, Ints, build_axis, sector_count
+from estimator.scan_matching.distance_axis import FEWEST, Axis, build_axis, sector_count
 from tools.bench.match import FAR, STILL, pairs, points
 from tools.bench.support.scenes import Scene, corridor, office, paper_room, round_room
 from tools.ci.figures import Figure, bounded

@@ -20,7 +20,7 @@ from estimator.calibration.parameters import Priors
 from estimator.calibration.residual_map_fit import learn
 from estimator.light_filter import light_filter
 from estimator.light_filter.filter_state import LightsSettings
-from estimator.light_filter.residual_setting import Learned
+from estimator.light_filter.residual_lookup import ResidualCorrections
 from estimator.measurements import LightEpoch, Odometry
 from estimator.result import Fix
 from tools.ci.figures import Figure, bounded
@@ -113,7 +113,7 @@ def trace(run: LightRun, case: Case, settings: LightsSettings, seconds: float) -
     return np.array(rows)
 
 
-def taught(run: LightRun) -> tuple[Any, Learned]:
+def taught(run: LightRun) -> tuple[Any, ResidualCorrections]:
     """Calibration and residual map of the same ceiling from another drive, poses by laser."""
     drive = Drive(TEACH_ROUTE, ROOM_BODY, 2.0, 1)
     other = replace(run, drive=drive, seconds=drive.lap_s)
@@ -124,7 +124,7 @@ def taught(run: LightRun) -> tuple[Any, Learned]:
     rows = Rows(pose, lamp.astype(np.int64), amplitude, sigma, t)
     found = calibrate(run.survey, rows, Priors(lever=0.0))
     survey = replace(found.survey, lamps=tuple(replace(lamp, sigma_ln=0.03) for lamp in found.survey.lamps))
-    return survey, Learned(learn(found.survey, found.rows.chosen(found.used)), survey.receiver)
+    return survey, ResidualCorrections(learn(found.survey, found.rows.chosen(found.used)), survey.receiver)
 
 
 def rows_of(

@@ -245,8 +245,8 @@ def test_a_recording_with_lights_tells_what_light_said(tmp_path: Path) -> None:
 
 
 def test_a_document_of_lamps_is_complete() -> None:
+    from estimator.match_entry import LightPoint, LightSaid
     from estimator.result import Fix
-    from estimator.scan_matching.match_trace import LightPoint, LightSaid
 
     here, there = np.array((1.0, 2.0)), np.array((1.1, 2.0))
     lamps = (LightPoint(7, 70, there, here, here - there, 0.1), LightPoint(8, 80, None, here, None, None))

@@ -11,7 +11,8 @@ from estimator.cdma.epoch import BlockFlag
 from estimator.light_filter import iterated_update, state_vector
 from estimator.light_filter import light_filter as lf
 from estimator.light_filter.gain_memory import recall
-from estimator.light_filter.link_gating import Sight, gate
+from estimator.light_filter.link_association import Sight
+from estimator.light_filter.link_gating import gate
 from estimator.light_filter.survey import Survey
 from estimator.measurements import Array, Imu
 from estimator.numerics import se2

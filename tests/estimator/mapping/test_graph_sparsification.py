@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from estimator.mapping.constraints import Constraints
 from estimator.mapping.graph_sparsification import LOOPS, SLACK, WAYS, handed_on, surest, thinned, vagueness
-from estimator.mapping.submap_graph import Constraints
 from estimator.numerics import se2
 
 

@@ -9,16 +9,17 @@ import pytest
 
 from estimator.commands import forget
 from estimator.fusion.map_odom_filter import Absolute
-from estimator.mapping.keyframe import Submap, Virtual, keep
+from estimator.mapping.constraints import MANY, Constraints
+from estimator.mapping.keyframe import Submap, keep
 from estimator.mapping.loop_closure import candidates, found_again, surer, take_answer
 from estimator.mapping.loop_verification import Candidate, Found, look, look_in
 from estimator.mapping.pose_graph import UPPER, Graph, optimise
 from estimator.mapping.submap import SIZE, settle
-from estimator.mapping.submap_graph import KEPT, LOOK, LOST, MANY, SOLVE, Atlas, Constraints, alike
+from estimator.mapping.submap_graph import KEPT, LOOK, LOST, SOLVE, Atlas, alike
 from estimator.measurements import Answer, Array
 from estimator.numerics import se2
 from estimator.relocalisation.relocalisation import begin
-from estimator.result import Loop, LoopReason
+from estimator.result import Loop, LoopReason, Virtual
 from estimator.state import new_state
 from tests.estimator.circuit import BARE, HALF, SMALL, TOLD, drifted, driven, lay, run_jobs
 from tests.estimator.world import scan_in

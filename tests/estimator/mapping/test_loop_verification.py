@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.mapping.keyframe import Submap, Virtual, keep
+from estimator.mapping.keyframe import Submap, keep
 from estimator.mapping.loop_closure import candidates, found_again, keyframe_laid
 from estimator.mapping.loop_verification import BLURRED, Condition, Found, Told, look_in, passed, told_by_light
 from estimator.numerics import se2
-from estimator.result import LoopReason
+from estimator.result import LoopReason, Virtual
 from tests.estimator.circuit import HALF, SMALL, TOLD, driven
 from tests.estimator.mapping.test_loop_closure import frame_at
 from tests.estimator.world import scan_in

@@ -11,8 +11,7 @@ import pytest
 
 from estimator.light_filter.initialisation import rule_out
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.keyframe import Submap
-from estimator.mapping.submap import Settled
+from estimator.mapping.keyframe import Settled, Submap
 from estimator.measurements import UNLIMITED, Array, LightEpoch, Odometry
 from estimator.numerics import se2
 from estimator.pipeline import new_state, step

@@ -10,7 +10,8 @@ import pytest
 
 from estimator.fusion.map_odom_filter import Absolute, blind, on_lights
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.submap import SIZE, Settled
+from estimator.mapping.keyframe import Settled
+from estimator.mapping.submap import SIZE
 from estimator.mapping.submap_graph import OWN, SETTLE
 from estimator.measurements import UNLIMITED, Array, Command, Order
 from estimator.numerics import se2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.mapping.submap import Settled
+from estimator.mapping.keyframe import Settled
 from estimator.measurements import Array, Command, Order
 from estimator.numerics import se2
 from tests.estimator.adrift import Robot, furnished, mapped, rooms, stored, way

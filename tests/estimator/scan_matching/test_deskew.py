@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from estimator.mapping.keyframe import keep, unturned
+from estimator.mapping.keyframe import keep
 from estimator.measurements import Array, Beam, Scan
 from estimator.numerics import se2
-from estimator.scan_matching.deskew import points_of
+from estimator.scan_matching.deskew import points_of, unturned
 from tools.bench.support.scenes import bearings, paper_room
 
 STILL = np.zeros(3)

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimator.match_entry import Entry, entry_of
 from estimator.measurements import UNLIMITED, Limits, Scan
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, new_state, step
 from estimator.result import Fix, MatchResult, Reason
 from estimator.scan_matching import icp, match_trace
 from estimator.scan_matching.deskew import ScanPoints
-from estimator.scan_matching.match_trace import Entry, Told
+from estimator.scan_matching.match_trace import Told
 from estimator.scan_matching.scan_matcher import Asked, MatchSettings, match
 from tests.estimator.lit import lit_state, play, scans, together
 from tests.estimator.scan_matching.test_icp import pair_of
@@ -28,7 +29,7 @@ def listen(state: State) -> list[Entry]:
     heard: list[Entry] = []
 
     def told(scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> None:
-        heard.append(match_trace.entry_of(state, scan, points, asked, result))
+        heard.append(entry_of(state, scan, points, asked, result))
 
     state.journal = told
     return heard
@@ -58,7 +59,7 @@ def test_the_pairs_add_up_and_the_last_pose_is_the_result() -> None:
     local, view, T, T_new = pair_of(paper_room(), bearings(91, 180.0), 0.05, 2.0, rng)
     asked = (view, local, prior_at(T, 0.2, 0.1), 30, MatchSettings())
     result = match(*asked)
-    (told,) = match_trace.tell(entry_for(asked, result, scan_in(paper_room(), T_new, bearings(91, 180.0), rng)))
+    (told,) = match_trace.tell(entry_for(asked, result, scan_in(paper_room(), T_new, bearings(91, 180.0), rng)).asked)
     assert told.what == "first"
     holds(told)
     assert result.ok
@@ -81,7 +82,7 @@ def test_a_second_opinion_is_told_with_all_its_trials(beams: int) -> None:
         local, view, T, T_new = pair_of(office(), bearing, 0.1, 60.0, rng)
         asked = (view, local, prior_at(T, 0.2, 0.1), 50, MatchSettings())
         result = match(*asked)
-        told = match_trace.tell(entry_for(asked, result, scan_in(office(), T_new, bearing, rng)))
+        told = match_trace.tell(entry_for(asked, result, scan_in(office(), T_new, bearing, rng)).asked)
         names = [one.what for one in told]
         assert names[0] == "first"
         assert set(names[1:-1]) <= {"trial"}
@@ -104,9 +105,9 @@ def test_matches_under_caps_are_told_as_they_were() -> None:
     for k, T in enumerate(path(40)[:4]):
         step(state, [scan_at(T, 0.05 * k, k, noise)], Limits(2, 60, True))
     assert [entry.result.reason for entry in heard][:1] == [Reason.NO_MAP]
-    assert match_trace.tell(heard[0]) == ()
+    assert match_trace.tell(heard[0].asked) == ()
     for entry in heard[1:]:
-        (told, *_) = match_trace.tell(entry)
+        (told, *_) = match_trace.tell(entry.asked)
         assert len(told.iterations) <= 2
         assert told.attempt.points <= 60
         holds(told)
@@ -133,7 +134,7 @@ def test_what_was_not_matched_is_told_too() -> None:
     step(state, [bad("empty")], UNLIMITED)
     assert heard[-1].result.reason is Reason.TOO_FEW_POINTS
     assert heard[-1].asked is None
-    assert match_trace.tell(heard[-1]) == ()
+    assert match_trace.tell(heard[-1].asked) == ()
 
 
 @pytest.mark.jit

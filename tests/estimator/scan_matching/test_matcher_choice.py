@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.mapping.keyframe import Virtual, keep
+from estimator.mapping.keyframe import keep
 from estimator.measurements import UNLIMITED, Array, Odometry
 from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state, step
-from estimator.result import Fix, LightsResult, Link, LinkState
+from estimator.result import Fix, LightsResult, Link, LinkState, Virtual
 from estimator.scan_matching.matcher_choice import First, Matcher, Weight, first_of, match
 from estimator.scan_matching.scan_matcher import Prior
 from tests.estimator.world import map_of, moved, place_both, prior_at, scan_in, view_of

@@ -29,10 +29,9 @@ from daemon.runtime.cycle import Cycle, Parts
 from daemon.runtime.warmup import load
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.system.realtime import line_up
-from estimator.mapping.keyframe import Submap
+from estimator.mapping.keyframe import Settled, Submap
 from estimator.mapping.loop_closure import found_again
 from estimator.mapping.loop_verification import Found, LoopSettings
-from estimator.mapping.submap import Settled
 from estimator.mapping.submap_graph import LOOK
 from estimator.measurements import Array, Job
 from estimator.numerics import se2

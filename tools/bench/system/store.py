@@ -24,9 +24,9 @@ from daemon.maps.autosave import BREATH_S
 from daemon.maps.image import image_from, meta_of, packed
 from daemon.maps.schema import read
 from daemon.maps.store import Store
+from estimator.mapping.constraints import Constraints
 from estimator.mapping.keyframe import Submap
 from estimator.mapping.map_snapshot import Identity, MapImage, finished, image_of, restored
-from estimator.mapping.submap_graph import Constraints
 from estimator.measurements import UNLIMITED, Answer, Array, Beam, Odometry, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import State, new_state, step

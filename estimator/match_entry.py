@@ -1,0 +1,92 @@
+"""One match for the match journal: what the matcher was given, its result, and what light said beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.fusion import map_odom_filter
+from estimator.measurements import Scan
+from estimator.numerics import se2
+from estimator.numerics.arrays import Array
+from estimator.result import Fix, MatchResult
+from estimator.scan_matching.deskew import ScanPoints
+from estimator.scan_matching.scan_matcher import Asked
+from estimator.state import State
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightPoint:
+    """One lamp as a point of the paper's Eq. 13: its place in body frames, which light alone has told.
+
+    Attributes:
+        reference: in the frame of the newest keyframe, ``X_ref^-1 L``; None if light said nothing good there.
+        present: in the present body frame, ``X_new^-1 L``.
+        residual: how far the matched motion since the keyframe carries ``present`` from ``reference`` (x, y in m, frame
+            of the keyframe); None without a reference or a match.
+        logarithm: of received over expected strength in the latest epoch, None if it was not received.
+    """
+
+    lamp_id: int
+    code: int
+    reference: Array | None
+    present: Array
+    residual: Array | None
+    logarithm: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightSaid:
+    """What light said at a scan: how far its fix had come, the pose T_map_base if it was good, and the lamps in use.
+
+    ``keyframe`` is the ID of the newest one, laid at ``T_odom_keyframe``.
+    """
+
+    fix: Fix
+    T_map_base: Array | None
+    keyframe: int
+    T_odom_keyframe: Array
+    lamps: tuple[LightPoint, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entry:
+    """One match as it was asked and answered, and what light said; a few references, nothing computed yet."""
+
+    scan: Scan
+    points: ScanPoints
+    asked: Asked | None
+    result: MatchResult
+    light: LightSaid | None
+
+
+def entry_of(state: State, scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> Entry:
+    """Keep a match, from within `State.journal`: after the match and before it is fused."""
+    return Entry(scan, points, asked, result, light_said(state, result))
+
+
+def light_said(state: State, match: MatchResult) -> LightSaid | None:
+    """What light said at this scan; None where there is no photodiode."""
+    if state.light is None:
+        return None
+    light, virtual = state.light, map_odom_filter.virtual(state)
+    if virtual is None:
+        return LightSaid(light.result.fix, None, state.anchor, state.T_odom_anchor, ())
+    newest = state.keyframes.get(state.anchor)
+    before = None if newest is None else newest.virtual
+    moved = se2.between(state.T_odom_anchor, match.T_odom_base) if match.ok else None
+    strength = {link.lamp_id: link.residual for link in light.result.links}
+    lamps = []
+    for lamp_id in sorted(virtual.accepted | (frozenset() if before is None else before.accepted)):
+        lamp = light.filter.catalogue.by_id.get(lamp_id)
+        if lamp is None:
+            continue
+        at = np.array(((lamp.x, lamp.y),))
+        present = se2.apply(se2.inverse(virtual.T_map_base), at)[0]
+        reference = None if before is None else se2.apply(se2.inverse(before.T_map_base), at)[0]
+        residual = None
+        if reference is not None and moved is not None:
+            residual = se2.apply(moved, present[None])[0] - reference
+        lamps.append(LightPoint(lamp_id, lamp.code, reference, present, residual, strength.get(lamp_id)))
+    return LightSaid(light.result.fix, virtual.T_map_base, state.anchor, state.T_odom_anchor, tuple(lamps))
