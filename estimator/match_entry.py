@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.fusion import map_odom_filter
+from estimator.fusion.light_witness import virtual
 from estimator.measurements import Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
@@ -70,23 +70,24 @@ def light_said(state: State, match: MatchResult) -> LightSaid | None:
     """What light said at this scan; None where there is no photodiode."""
     if state.light is None:
         return None
-    light, virtual = state.light, map_odom_filter.virtual(state)
-    if virtual is None:
-        return LightSaid(light.result.fix, None, state.anchor, state.T_odom_anchor, ())
-    newest = state.keyframes.get(state.anchor)
+    light = state.light
+    now = virtual(state.pose, state.motion, light)
+    if now is None:
+        return LightSaid(light.result.fix, None, state.pose.anchor, state.pose.T_odom_anchor, ())
+    newest = state.map.keyframes.get(state.pose.anchor)
     before = None if newest is None else newest.virtual
-    moved = se2.between(state.T_odom_anchor, match.T_odom_base) if match.ok else None
+    moved = se2.between(state.pose.T_odom_anchor, match.T_odom_base) if match.ok else None
     strength = {link.lamp_id: link.residual for link in light.result.links}
     lamps = []
-    for lamp_id in sorted(virtual.accepted | (frozenset() if before is None else before.accepted)):
+    for lamp_id in sorted(now.accepted | (frozenset() if before is None else before.accepted)):
         lamp = light.filter.catalogue.by_id.get(lamp_id)
         if lamp is None:
             continue
         at = np.array(((lamp.x, lamp.y),))
-        present = se2.apply(se2.inverse(virtual.T_map_base), at)[0]
+        present = se2.apply(se2.inverse(now.T_map_base), at)[0]
         reference = None if before is None else se2.apply(se2.inverse(before.T_map_base), at)[0]
         residual = None
         if reference is not None and moved is not None:
             residual = se2.apply(moved, present[None])[0] - reference
         lamps.append(LightPoint(lamp_id, lamp.code, reference, present, residual, strength.get(lamp_id)))
-    return LightSaid(light.result.fix, virtual.T_map_base, state.anchor, state.T_odom_anchor, tuple(lamps))
+    return LightSaid(light.result.fix, now.T_map_base, state.pose.anchor, state.pose.T_odom_anchor, tuple(lamps))

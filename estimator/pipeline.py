@@ -10,10 +10,21 @@ import numpy as np
 from estimator.commands import obey
 from estimator.fusion import map_odom_filter, motion_model, out_of_sequence, protection_level, time_offset
 from estimator.fusion.laser_odometry import guide
-from estimator.fusion.pose_update import alike_of, covariance, fuse, learn_alike, noise_of
+from estimator.fusion.light_witness import KNOWN, virtual
+from estimator.fusion.pose_update import beams_per_sample, fuse, learn_correlation, noise_of
 from estimator.mapping import live_grid, loop_closure
 from estimator.mapping.keyframe import hanging
-from estimator.mapping.keyframe_selection import keyframe_due, lay_anchor, lay_keyframe, update_map, walk
+from estimator.mapping.keyframe_selection import (
+    count_steps,
+    hang_on,
+    keyframe_due,
+    lay_anchor,
+    lost,
+    make_keyframe,
+    retire,
+    update_local_map,
+)
+from estimator.mapping.map_frame import relist, shift_map
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import (
     UNLIMITED,
@@ -33,8 +44,14 @@ from estimator.measurements import (
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
-from estimator.relocalisation import kidnap_detection, relocalisation, unaligned_map
-from estimator.result import MatchResult, Reason, StepResult
+from estimator.relocalisation import (
+    kidnap_detection,
+    light_evidence,
+    relocalisation,
+    relocalisation_check,
+    unaligned_map,
+)
+from estimator.result import LightsResult, MatchResult, Reason, StepResult
 from estimator.scan_matching import matcher_choice, scan_matcher
 from estimator.scan_matching.deskew import ScanPoints, oriented, points_of, unturned
 from estimator.scan_matching.matcher_choice import First, Matcher, first_of
@@ -52,67 +69,104 @@ FLOOR = np.diag((0.005**2, 0.005**2, 0.003**2))
 def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
     """Take the records since the last step, in the order in which they were true (`in_turn`), and return the pose then.
 
-    Never raises for what a sensor delivers: a scan that cannot be matched leaves the prediction and says why.
+    Never raises for what a sensor delivers: a scan that cannot be matched leaves the prediction, and the result has
+    the reason.
     """
-    match: MatchResult | None = None
+    result: MatchResult | None = None
     keyframe = -1
     for record in in_turn(state, records):
-        why = refused(state, record) if isinstance(record, Scan) else None
-        if why is None:
+        refusal = refused(state.matching, record) if isinstance(record, Scan) else None
+        if refusal is None:
             predict(state, record)
-        if isinstance(record, SampleBlock | LightEpoch):
-            see_lights(state, record)
-            lay_anchor(state)
-            lap("lights")
-        if isinstance(record, Answer):
-            close_loops(state, record)
-            lap("map")
-        if isinstance(record, Scan):
-            why = why or passed_over(state, record, limits)
-            if why is not None or not out_of_sequence.late(state, record):
-                match, laid = see(state, record, limits, why, lap)
-            else:
-                ahead = out_of_sequence.go_back(state, record)
-                match, laid = see(state, record, limits, why, lap)
-                out_of_sequence.come_again(state, ahead)
-            keyframe = max(keyframe, laid)
+        match record:
+            case SampleBlock() | LightEpoch():
+                see_light(state, record)
+                lap("lights")
+            case Answer():
+                loop_closure.take_answer(state.map, state.pose, state.motion, record)
+                lap("map")
+            case Scan():
+                result, laid = see_scan(state, record, limits, refusal or passed_over(state, record, limits), lap)
+                keyframe = max(keyframe, laid)
     lap("step")
     look_for_lamps(state, limits)
     lap("search")
     relocalisation.step_done(state)
     unaligned_map.step_done(state)
-    return report(state, match, keyframe, limits)
+    return report(state, result, keyframe, limits)
 
 
-def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
-    """Match a scan at the pose, take in what it says, and keep it where one is due; the match, and the ID or -1."""
-    points = nothing_of(scan) if why else virtual_frame(state, scan)
-    walk(state)
-    match = match_scan(state, scan, points, limits, why)
-    carried = kidnap_detection.raised(state, scan, points, match)
-    fuse(state, match)
-    guide(state, match)
-    time_offset.on_match(state.lag, scan, match)
-    if carried:
+def see_scan(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
+    """Match a scan where the robot was when it was true, and carry the pose on again; the match, and an ID or -1."""
+    if refusal is not None or not out_of_sequence.late(state.motion, scan):
+        return see(state, scan, limits, refusal, lap)
+    ahead = out_of_sequence.go_back(state.pose, state.motion, scan)
+    seen = see(state, scan, limits, refusal, lap)
+    out_of_sequence.come_again(state.pose, state.motion, ahead)
+    return seen
+
+
+def see(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
+    """Match a scan at the pose, fuse it, and extend the map by it where a keyframe is due; the match, an ID or -1."""
+    points = nothing_of(scan) if refusal else virtual_frame(state, scan)
+    count_steps(state.settings, state.motion, state.matching)
+    match = match_scan(state, scan, points, limits, refusal)
+    suspected = kidnap_detection.raised(state, scan, points, match)
+    fuse_match(state, scan, match)
+    if suspected:
         kidnap_detection.look(state, scan, points, match)
     lap("match")
-    if match.ok and kidnap_detection.waits(state):
+    if not (limits.update_map and limits.rung < Rung.NO_MAP and extends_map(state, points, match)):
         return match, -1
-    if not (limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match)):
-        return match, -1
-    if match.ok:
-        learn_alike(state, oriented(points, limits.points))
-    keyframe = lay_keyframe(state, scan, points)
-    update_map(state, scan, points)
+    keyframe = extend_map(state, scan, points, limits, match)
     lap("map")
     return match, keyframe
+
+
+def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
+    """Eq. 14-15: take a match into the pose, and its motion into the light filter and the time offset."""
+    more = fuse(state.pose, state.motion, state.matching, match, state.settings.noise)
+    if more is not None:  # the way too, or no loop could bring submaps together again
+        state.map.graph.loosen(more, state.pose.T_odom_anchor)
+    guide(state.light, state.motion, match)
+    time_offset.on_match(state.time_offset, scan, match)
+
+
+def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:
+    """Whether a keyframe is due; never from next to nothing, nor where the robot may have been carried off."""
+    if (match.ok and kidnap_detection.waits(state)) or len(points.xy) < state.settings.matching.min_points:
+        return False
+    every_step = state.settings.matcher is Matcher.LINE
+    return keyframe_due(state.map, state.pose, state.motion, state.matching, match, every_step)
+
+
+def extend_map(state: State, scan: Scan, points: ScanPoints, limits: Limits, match: MatchResult) -> int:
+    """Sect. 4.3: keep a scan as a keyframe and merge it into the local map; returns its ID."""
+    map_, pose, motion, matching = state.map, state.pose, state.motion, state.matching
+    if match.ok:
+        learn_correlation(matching, oriented(points, limits.points), motion.T_odom_base)
+    frame = make_keyframe(map_, pose, motion, scan, points.turned_rad)
+    noise_m, anew = noise_of(matching, scan), lost(motion, matching)
+    frame.virtual = virtual(pose, motion, state.light)
+    if anew and matching.local_map is not None:
+        relocalisation.local_map_lost(state)
+    P = hang_on(map_, pose, motion, frame)
+    matching.scans_since_keyframe = 0
+    loop_closure.add_keyframe(map_, pose, frame, (P, noise_m, anew))
+    for searched in (relocalisation, relocalisation_check, unaligned_map):
+        searched.keyframe_laid(state, frame)
+    if anew and pose.alignment is not None:
+        pose.alignment.broken = True
+    update_local_map(matching, frame, points, state.settings.map, noise_m, anew)
+    retire(map_, frame)
+    return frame.key
 
 
 def passed_over(state: State, scan: Scan, limits: Limits) -> Reason | None:
     """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose, or it is too old."""
     if limits.rung >= Rung.CARRIED:
         return Reason.PASSED_OVER
-    return Reason.LATE if out_of_sequence.too_old(state, scan) else None
+    return Reason.LATE if out_of_sequence.too_old(state.motion, scan) else None
 
 
 def order(record: Record) -> tuple[float, bool]:
@@ -155,32 +209,45 @@ def predict(state: State, record: Record) -> None:
     if order(record)[0] == -math.inf:
         return  # at no time
     noise = state.settings.noise
-    before = state.fused.T_odom_base, state.fused.P, state.fused.t_mono
+    before = state.motion.T_odom_base, state.motion.P, state.motion.t_mono
     if state.light is not None:
         state.light.predict(record)
     match record:
         case Odometry():
-            motion_model.on_odometry(state.fused, record, noise)
-            time_offset.on_odometry(state.lag, record)
+            motion_model.on_odometry(state.motion, record, noise)
+            time_offset.on_odometry(state.time_offset, record)
             kidnap_detection.on_odometry(state, record)
         case Imu():
-            motion_model.on_imu(state.fused, record, noise)
+            motion_model.on_imu(state.motion, record, noise)
         case Scan() | SampleBlock() | LightEpoch():
-            motion_model.carry_to(state.fused, record.t_end, noise)
+            motion_model.carry_to(state.motion, record.t_end, noise)
         case Command():
             obey(state, record)
-            map_odom_filter.on_order(state, record)
+            map_odom_filter.on_order(state.pose, state.motion, state.light, record)
             return  # RESET sets the odometry's covariance back: that is no motion
-    map_odom_filter.on_motion(state, *before)
+    map_odom_filter.on_motion(state.pose, state.motion, *before)
 
 
-def see_lights(state: State, record: SampleBlock | LightEpoch) -> None:
-    """Eq. 1-7: decode the block, if it is one, take its links into the `lights` filter, and its news into the pose.
+def see_light(state: State, record: SampleBlock | LightEpoch) -> None:
+    """Eq. 1-7: decode the block, if it is one, take its links into the light filter, and its news into the pose.
 
     Without a photodiode in the setup the record is passed over.
     """
     if state.light is not None:
-        map_odom_filter.on_lights(state, state.light.take(record))
+        fuse_light(state, state.light.take(record))
+    lay_anchor(state.map, state.pose, state.motion)
+
+
+def fuse_light(state: State, lights: LightsResult) -> None:
+    """Correct T_map_odom by a result of the light filter; what was laid since the place was known comes along."""
+    assert state.light is not None
+    map_, pose = state.map, state.pose
+    shift = map_odom_filter.on_lights(pose, state.motion, state.light, lights, map_.next_key)
+    if shift is None:
+        return
+    shift_map(map_, shift.moved, max(shift.since, map_.parts.detached_since))
+    if shift.known and map_.parts.session_start:  # a stored map has come along for the last time
+        relist(map_, 0)
 
 
 def look_for_lamps(state: State, limits: Limits) -> None:
@@ -191,7 +258,7 @@ def look_for_lamps(state: State, limits: Limits) -> None:
 
 def virtual_frame(state: State, scan: Scan) -> ScanPoints:
     """Eq. 10-11: filter the beams (Q, L) and carry each from its own instant to the scan's end."""
-    moved = se2.exp(state.fused.velocity * max(0.0, scan.t_end - scan.t_begin))
+    moved = se2.exp(state.motion.velocity * max(0.0, scan.t_end - scan.t_begin))
     return points_of(scan, moved, state.settings.far_m, state.settings.quality)
 
 
@@ -199,20 +266,26 @@ def match_scan(
     state: State, scan: Scan, points: ScanPoints, limits: Limits, refusal: Reason | None = None
 ) -> MatchResult:
     """Eq. 12-14: nearest neighbours on the distance axis, point-to-line, the prediction weighted in."""
-    state.since_keyframe += 1
-    T_pred, count = state.fused.T_odom_base, len(points.xy)
+    state.matching.scans_since_keyframe += 1
+    T_pred, count = state.motion.T_odom_base, len(points.xy)
     asked: Asked | None = None
     if refusal is not None:
         result = scan_matcher.no_match(T_pred, count, refusal)
-    elif state.local is None:
+    elif state.matching.local_map is None:
         result = scan_matcher.no_match(T_pred, count, Reason.NO_MAP)
     elif count < state.settings.matching.min_points:
         result = scan_matcher.no_match(T_pred, count, Reason.TOO_FEW_POINTS)
     else:
         beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-        view = View(oriented(points, limits.points), scan.T_base_lidar, beams, noise_of(state, scan), alike_of(state))
-        prior = Prior(T_pred, invert3(state.fused.P))
-        asked = (view, state.local, prior, limits.icp_iterations, state.settings.matching)
+        view = View(
+            oriented(points, limits.points),
+            scan.T_base_lidar,
+            beams,
+            noise_of(state.matching, scan),
+            beams_per_sample(state.matching),
+        )
+        prior = Prior(T_pred, invert3(state.motion.P))
+        asked = (view, state.matching.local_map, prior, limits.icp_iterations, state.settings.matching)
         if state.settings.matcher is Matcher.LINE:
             result = scan_matcher.match(*asked)
         else:
@@ -222,56 +295,51 @@ def match_scan(
     return result
 
 
-def close_loops(state: State, answer: Answer) -> None:
-    """Sect. 4.3: take in what a job has found, a loop or a corrected map; `T_odom_base` never hears of it."""
-    loop_closure.take_answer(state, answer)
-
-
 def light_first(state: State, prior: Prior) -> First:
     """T1 of Eq. 14 for the paper's matcher: from light, or the prediction where light tells nothing good."""
-    assert state.local is not None
+    assert state.matching.local_map is not None
     lights = None if state.light is None else state.light.result
-    return first_of(prior, state.local.newest, map_odom_filter.virtual(state), lights)
+    return first_of(prior, state.matching.local_map.newest, virtual(state.pose, state.motion, state.light), lights)
 
 
 def report(state: State, match: MatchResult | None, keyframe: int, limits: Limits = UNLIMITED) -> StepResult:
     """The estimate after this step; jobs wait for one that has the time."""
-    moving, P = state.fused, covariance(state)
+    motion, pose, map_ = state.motion, state.pose, state.map
+    alignment, P = pose.alignment, pose.covariance(motion.T_odom_base, motion.P)
     return StepResult(
-        t_mono=moving.t_mono,
-        T_odom_base=moving.T_odom_base,
-        T_map_odom=state.T_map_odom,
+        t_mono=motion.t_mono,
+        T_odom_base=motion.T_odom_base,
+        T_map_odom=pose.T_map_odom,
         covariance=P + FLOOR,
-        velocity=moving.velocity.copy(),
+        velocity=motion.velocity.copy(),
         known_axes=known_axes(state, match, P),
         match=match,
         keyframe=keyframe,
-        loop=state.atlas.take_news(),
-        anchor=state.anchor,
-        T_anchor_base=se2.between(state.T_odom_anchor, moving.T_odom_base),
-        jumps=state.jumps,
+        loop=map_.graph.take_news(),
+        anchor=pose.anchor,
+        T_anchor_base=se2.between(pose.T_odom_anchor, motion.T_odom_base),
+        jumps=pose.jumps,
         lights=None if state.light is None else state.light.result,
-        placed=state.absolute is not None and state.absolute.placed,
-        gap=None if state.absolute is None else state.absolute.gap,
+        placed=alignment is not None and alignment.placed,
+        gap=None if alignment is None else alignment.gap,
         places=relocalisation.places(state),
-        apart=state.absolute is not None and state.absolute.apart,
+        apart=alignment is not None and alignment.apart,
         misplaced=misplaced(state),
-        aside=state.atlas.aside is not None,
-        let_go=state.let_go,
-        lag=state.lag.told,
-        jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
-        anew=state.anew,
-        protection=protection_level.bound(state, P),
+        aside=map_.parts.aside is not None,
+        let_go=state.relocalisation.maps_dropped,
+        lag=state.time_offset.told,
+        jobs=state.jobs.take() if limits.rung < Rung.NO_MAP else (),
+        anew=state.matching.restarts,
+        protection=protection_level.bound(pose, motion, state.light, state.matching, P),
     )
 
 
 def misplaced(state: State) -> bool:
     """Whether light receives what it cannot receive at the pose; see `light_evidence.misplaced`."""
-    if state.light is None or state.absolute is None or not state.absolute.placed:
+    alignment = state.pose.alignment
+    if alignment is None or not alignment.placed:
         return False
-    from estimator.relocalisation import light_evidence  # costs nothing where there is no photodiode
-
-    return light_evidence.misplaced(state, se2.compose(state.T_map_odom, state.fused.T_odom_base))
+    return light_evidence.misplaced(state.light, alignment, state.pose.here(state.motion.T_odom_base))
 
 
 def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
@@ -279,22 +347,22 @@ def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
 
     A corridor along x of the odom frame may run along y of the map.
     """
-    if state.absolute is not None and state.absolute.placed:
-        return np.asarray(P.diagonal() < map_odom_filter.KNOWN, dtype=np.float64)
+    if state.pose.alignment is not None and state.pose.alignment.placed:
+        return np.asarray(P.diagonal() < KNOWN, dtype=np.float64)
     if match is None or not match.ok:
         return np.ones(3) if match is None else match.known_axes
-    R = se2.rotation(state.T_map_odom[2])
+    R = se2.rotation(state.pose.T_map_odom[2])
     return scan_matcher.known_axes(R @ match.information @ R.T)
 
 
 def keyframe_poses(state: State) -> dict[int, Array]:
     """``T_map_keyframe`` by ID as corrected so far, 0 being the start; those let go only where history is kept."""
-    kept = {key: frame.T_map_keyframe for key, frame in state.keyframes.items()}
-    gone = {key: se2.compose(submap.place(), T) for key, (submap, T) in state.retired.items()}
-    lone = {key: submap.place() for key, submap in state.lone.items()}
-    return {0: state.T_map_start} | lone | gone | kept
+    kept = {key: frame.T_map_keyframe for key, frame in state.map.keyframes.items()}
+    gone = {key: se2.compose(submap.place(), T) for key, (submap, T) in state.map.retired.items()}
+    by_light = {key: submap.place() for key, submap in state.map.light_anchors.items()}
+    return {0: state.map.T_map_start} | by_light | gone | kept
 
 
 def render_map(state: State, resolution: float) -> Grid:
     """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (`livemap.at_once`)."""
-    return live_grid.at_once(hanging(state.keyframes.values()), resolution)
+    return live_grid.at_once(hanging(state.map.keyframes.values()), resolution)

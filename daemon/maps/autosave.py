@@ -158,7 +158,7 @@ class Keeper:
         state = self._state()
         if state is None or empty(state):
             return NO_MAP
-        return ADRIFT if state.atlas.unproved is not None and self._saved == self._revision(state) else DONE
+        return ADRIFT if state.map.parts.unproved is not None and self._saved == self._revision(state) else DONE
 
     async def run(self) -> None:
         """Save on the schedule until cancelled."""
@@ -266,13 +266,14 @@ class Keeper:
 
     def _revision(self, state: State) -> Revision:
         """Changes when there is something new to save."""
-        atlas = state.atlas
-        if (first := atlas.unproved) is not None:
+        atlas = state.map.graph
+        if (first := atlas.parts.unproved) is not None:
             return self._map_id(), first, -1
-        return self._map_id(), state.next_key, atlas.closures
+        return self._map_id(), state.map.next_key, atlas.closures
 
     def _image(self, state: State) -> MapImage:
-        from estimator.mapping.map_snapshot import Identity, image_of
+        from estimator.mapping.map_snapshot import Identity
+        from estimator.stored_map import image_of
 
         before = self._start.stored.meta if self._start is not None else None
         who = Identity(
@@ -330,4 +331,4 @@ class Keeper:
 def empty(state: State) -> bool:
     """Whether there is nothing of a map yet: no keyframe, and nothing learned of lamps."""
     learned = state.light is not None and bool(state.light.filter.gains)
-    return not (state.keyframes or state.atlas.submaps or learned)
+    return not (state.map.keyframes or state.map.graph.submaps or learned)

@@ -54,24 +54,25 @@ class Switch:
 
 
 def take_over(state: State, donor: State) -> None:
-    """The running state goes on in the donor's map, adrift in it; the donor is not to be used any more.
+    """The running state goes on in the donor's map, detached in it; the donor is not to be used any more.
 
     Answers to what was asked about the old map will mean nothing: job numbers go on counting.
     """
-    from estimator.commands import forget
     from estimator.numerics import se2
+    from estimator.relocalisation.map_reset import forget_map
 
-    forget(state)
-    atlas = donor.atlas
-    atlas.next_job, atlas.closures = state.atlas.next_job, state.atlas.closures
-    state.atlas, state.keyframes, state.places, state.live = atlas, donor.keyframes, donor.places, donor.live
-    state.light, state.absolute = donor.light, donor.absolute
-    state.next_key, state.noise_m = donor.next_key, donor.noise_m
-    state.frozen.forget()
-    state.guessed_s = 0.0
-    state.T_map_odom = se2.compose(donor.T_map_odom, se2.inverse(state.fused.T_odom_base))
-    state.T_map_start = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    state.jumps += 1
+    forget_map(state)
+    donor.map.graph.jobs, donor.map.graph.closures = state.jobs, state.map.graph.closures
+    for name in ("graph", "keyframes", "places", "live", "next_key"):
+        setattr(state.map, name, getattr(donor.map, name))
+    for name in ("search", "unaligned", "T_left", "P_left"):
+        setattr(state.relocalisation, name, getattr(donor.relocalisation, name))
+    state.light, state.pose.alignment = donor.light, donor.pose.alignment
+    state.matching.noise_m, state.matching.unheld_s = donor.matching.noise_m, 0.0
+    state.pose.history.forget()
+    state.pose.T_map_odom = se2.compose(donor.pose.T_map_odom, se2.inverse(state.motion.T_odom_base))
+    state.map.T_map_start = state.pose.here(state.motion.T_odom_base)
+    state.pose.jumps += 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -198,12 +198,12 @@ def _packed(cells: Cells) -> bytes:
 
 
 def _adrift(state: State) -> float:
-    return math.inf if state.atlas.adrift is None else float(state.atlas.adrift)
+    return math.inf if state.map.parts.detached is None else float(state.map.parts.detached)
 
 
 def _stands(state: State, submap: Submap) -> bool:
     """Whether a submap is a part of the map: in the graph, or in another one's place."""
-    while state.atlas.submaps.get(submap.key) is not submap:
+    while state.map.graph.submaps.get(submap.key) is not submap:
         if submap.into is None:
             return False
         submap = submap.into[0]
@@ -213,8 +213,8 @@ def _stands(state: State, submap: Submap) -> bool:
 def _newer(state: State, seen: int) -> list[Any]:
     """Keyframes laid since, oldest first."""
     newer = []
-    for key in reversed(state.keyframes):
+    for key in reversed(state.map.keyframes):
         if key <= seen:
             break
-        newer.append(state.keyframes[key])
+        newer.append(state.map.keyframes[key])
     return newer[::-1]

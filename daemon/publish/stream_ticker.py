@@ -67,7 +67,7 @@ def in_words(faults: tuple[Fault, ...]) -> list[tuple[int, str, str]]:
 def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:
     """Where a keyframe lies in the map as corrected so far (m, m, rad); None where it is not kept any more."""
     now = state()
-    frame = None if now is None else now.keyframes.get(keyframe)
+    frame = None if now is None else now.map.keyframes.get(keyframe)
     if frame is None:
         return None
     x, y, yaw = frame.T_map_keyframe.tolist()

@@ -37,7 +37,10 @@ from daemon.recording.restore import (
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Survey
 from estimator.mapping.keyframe import Keyframe, Settled, Submap
-from estimator.mapping.submap_graph import Aside, Atlas
+from estimator.mapping.map_state import MapState
+from estimator.mapping.submap_graph import SubmapGraph
+from estimator.relocalisation.hypothesis_tracking import SearchedAside
+from estimator.scan_matching.match_memory import MatchMemory
 from estimator.state import State
 
 PROTOCOL: Final = 5
@@ -152,8 +155,8 @@ def take(state: State, rest: dict[str, object]) -> Taken:
         CannotTake: something in them cannot be pickled.
     """
     taken = Taken()
-    taken.hold_all(set(map(_submap_of, state.keyframes.values())).union(state.atlas.submaps.values()))
-    if (aside := state.atlas.aside) is not None:
+    taken.hold_all(set(map(_submap_of, state.map.keyframes.values())).union(state.map.graph.submaps.values()))
+    if (aside := state.map.parts.aside) is not None:
         taken.hold_all(set(map(_submap_of, aside.frames.values())).union(aside.submaps.values()))
     try:
         taken.seal({"state": state, "rest": rest})
@@ -187,25 +190,35 @@ def _pickled(what: object, taken: Taken) -> bytes:
 
 def _keep_state(state: State, taken: Taken) -> Any:
     said = _fields_of(state)
-    said["keyframes"] = taken.hold(state.keyframes.copy())
-    said["places"] = taken.hold({place: tuple(keys) for place, keys in state.places.items()})
     said["journal"] = None
-    if state.bearing_rad is not None:
-        said["bearing_rad"] = taken.hold(state.bearing_rad)
     return blank, (State,), said, None, None, fill
 
 
-def _keep_atlas(atlas: Atlas, taken: Taken) -> Any:
-    said = _fields_of(atlas)
-    said["submaps"] = taken.hold(atlas.submaps.copy())
-    said["ties"] = taken.hold(atlas.ties.copy())
-    return blank, (Atlas,), said, None, None, fill
+def _keep_map(map_: MapState, taken: Taken) -> Any:
+    said = _fields_of(map_)
+    said["keyframes"] = taken.hold(map_.keyframes.copy())
+    said["places"] = taken.hold({place: tuple(keys) for place, keys in map_.places.items()})
+    return blank, (MapState,), said, None, None, fill
 
 
-def _keep_aside(aside: Aside, taken: Taken) -> Any:
+def _keep_matching(matching: MatchMemory, taken: Taken) -> Any:
+    said = _fields_of(matching)
+    if matching.bearing_rad is not None:
+        said["bearing_rad"] = taken.hold(matching.bearing_rad)
+    return blank, (MatchMemory,), said, None, None, fill
+
+
+def _keep_graph(graph: SubmapGraph, taken: Taken) -> Any:
+    said = _fields_of(graph)
+    said["submaps"] = taken.hold(graph.submaps.copy())
+    said["ties"] = taken.hold(graph.ties.copy())
+    return blank, (SubmapGraph,), said, None, None, fill
+
+
+def _keep_aside(aside: SearchedAside, taken: Taken) -> Any:
     said = _fields_of(aside)
     said["submaps"], said["frames"] = taken.hold(aside.submaps), taken.hold(aside.frames)  # neither is ever changed
-    return blank, (Aside,), said, None, None, fill
+    return blank, (SearchedAside,), said, None, None, fill
 
 
 def _keep_function(function: types.FunctionType, taken: Taken) -> Any:
@@ -223,8 +236,10 @@ def _keep_piece(piece: object, taken: Taken) -> Any:
 _KEPT: Final[dict[type, Callable[[Any, Taken], Any]]] = {
     **dict.fromkeys((Submap, Survey, ResidualMap, *FIXED), _keep_piece),
     State: _keep_state,
-    Atlas: _keep_atlas,
-    Aside: _keep_aside,
+    MapState: _keep_map,
+    MatchMemory: _keep_matching,
+    SubmapGraph: _keep_graph,
+    SearchedAside: _keep_aside,
     types.FunctionType: _keep_function,
     WeakSet: lambda held, taken: (weak_set, (tuple(held),)),
     _Ref: lambda ref, taken: (piece_of, (ref.number,)),

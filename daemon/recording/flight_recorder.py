@@ -227,7 +227,7 @@ class BlackBox:
 
     def _let_go(self, state: State) -> None:
         """Forget the jobs that nobody waits for any more, but the latest: they hold what they are about."""
-        unasked = [job_id for job_id in self._jobs if job_id not in state.atlas.asked]
+        unasked = [job_id for job_id in self._jobs if job_id not in state.jobs.pending]
         for job_id in unasked[:-UNASKED]:
             del self._jobs[job_id]
 

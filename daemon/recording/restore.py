@@ -330,8 +330,8 @@ def _restored(pieces: Iterator[Piece]) -> tuple[State, dict[str, Any]]:
     state, rest = everything["state"], everything["rest"]
     if type(state) is not State or type(rest) is not dict:
         raise pickle.UnpicklingError("it holds no state")
-    for place, keys in state.places.items():
-        state.places[place] = list(keys)
+    for place, keys in state.map.places.items():
+        state.map.places[place] = list(keys)
     return state, rest
 
 

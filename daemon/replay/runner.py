@@ -32,10 +32,11 @@ from daemon.runtime.light_setup import Lights, begun, new_state
 from daemon.runtime.vitals import vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
-from estimator.mapping.map_snapshot import Identity, MapImage, image_of
+from estimator.mapping.map_snapshot import Identity, MapImage
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import UNLIMITED, Array, Limits, Order, Record
 from estimator.result import StepResult
+from estimator.stored_map import image_of
 from hal.adc import AdcStatus, RawSamples
 from hal.imu import RawImu
 from hal.lidar import Link, RawScan
@@ -226,7 +227,7 @@ class Rerun:
 
     def lamps(self) -> Array | None:
         """(k, 2) surveyed places of the lamps in the map frame; None until light has told where the map lies."""
-        tie, light = self._state.absolute, self._state.light
+        tie, light = self._state.pose.alignment, self._state.light
         if tie is None or light is None or not tie.placed:
             return None
         return np.array([(lamp.x, lamp.y) for lamp in light.setup.survey.lamps]).reshape(-1, 2)

@@ -159,7 +159,7 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     if start is None:
         return pipeline.new_state(settings, setup)
     from daemon.maps.image import image_from
-    from estimator.mapping.map_snapshot import restored
+    from estimator.stored_map import restored
 
     settings = replace(settings or pipeline.Settings(), localise=start.localise)
     try:

@@ -11,24 +11,23 @@ from __future__ import annotations
 
 from typing import Final
 
-from estimator.fusion.motion_model import too_far
+from estimator.fusion.motion_model import Motion, too_far
 from estimator.fusion.pose_update import BLIND, loose_direction
+from estimator.light_filter.light_channel import Light
 from estimator.light_filter.motion_update import CARRY_S
 from estimator.measurements import Odometry
 from estimator.numerics import se2
 from estimator.result import MatchResult
-from estimator.state import State
 
 WHEELS_GONE_S: Final = 5.0
 """Wheels that have been silent for longer are not waited for: what lamps said of their scale is given up."""
 
 
-def guide(state: State, match: MatchResult) -> None:
-    """Tell `lights` how the robot has moved since the scan before, after ``match`` has been fused."""
-    light, moving = state.light, state.fused
+def guide(light: Light | None, motion: Motion, match: MatchResult) -> None:
+    """Move the light filter by the way since the scan before, after ``match`` has been fused."""
     if light is None:
         return
-    if moving.t_mono - moving.t_odometry < WHEELS_GONE_S:
+    if motion.t_mono - motion.t_odometry < WHEELS_GONE_S:
         light.guided = None
         return
     if match.reason in BLIND:  # the next one tells of the way since
@@ -37,11 +36,11 @@ def guide(state: State, match: MatchResult) -> None:
     if not (match.ok and match.known_axes.all() and loose_direction(match.information) is None):
         light.left_alone()
         return
-    light.guided = now, T = moving.t_mono, moving.T_odom_base
+    light.guided = now, T = motion.t_mono, motion.T_odom_base
     if before is None:
         return
     dt, made = now - before[0], se2.between(before[1], T)
     if dt >= CARRY_S or too_far(made, dt):  # then it was carried
         light.left_alone()
     else:
-        light.move(Odometry(before[0], now, made), moving.velocity)
+        light.move(Odometry(before[0], now, made), motion.velocity)

@@ -1,4 +1,4 @@
-"""The tie of the odom frame to the map as it was a while ago: what light, under test since, is held against."""
+"""T_map_odom as it was a while ago: what light, under test since, is compared with (solution separation)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Final
 
 from estimator.numerics.arrays import Array
 
-FROZEN_M: Final = 10.0
-"""Way between two ties that are kept: the older one in use is between one and two times as old."""
+SPACING_M: Final = 10.0
+"""Way between two snapshots: the older one in use is between one and two times as old."""
 
 
 @dataclass(slots=True)
-class Frozen:
-    """At most two ties, the older first.
+class MapOdomHistory:
+    """At most two snapshots, the older first.
 
     Attributes:
         kept: T_map_odom, covariance of the pose (3, 3; map axes) and metres driven, of then.
@@ -22,8 +22,8 @@ class Frozen:
     kept: list[tuple[Array, Array, float]] = field(default_factory=list)
 
     def take(self, T_map_odom: Array, P: Array, way: float) -> None:
-        """Keep a tie, if the newest is old enough."""
-        if not self.kept or way - self.kept[-1][2] >= FROZEN_M:
+        """Keep a snapshot, if the newest is old enough."""
+        if not self.kept or way - self.kept[-1][2] >= SPACING_M:
             self.kept.append((T_map_odom, P, way))
             del self.kept[:-2]
 

@@ -7,13 +7,15 @@ import math
 import numpy as np
 
 from estimator.fusion import map_odom_filter, motion_model
+from estimator.fusion.map_pose import MapPose
+from estimator.fusion.motion_model import Motion, MotionNoise
 from estimator.measurements import Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
-from estimator.numerics.covariance3 import hang, informed, turn
+from estimator.numerics.covariance3 import informed
 from estimator.result import MatchResult, Reason
+from estimator.scan_matching.match_memory import MatchMemory
 from estimator.scan_matching.residual_correlation import agreement, beams_each
-from estimator.state import State
 
 LEAST_NOISE_M = 0.004
 LEARNING = 0.02
@@ -25,32 +27,37 @@ CAUCHY = 0.807
 """What the robust weights of the matcher leave of a Gaussian's variance."""
 
 
-def fuse(state: State, match: MatchResult) -> None:
-    """Take the matched pose and add its information; without odometry it also tells the velocity.
+def fuse(pose: MapPose, motion: Motion, matching: MatchMemory, match: MatchResult, noise: MotionNoise) -> Array | None:
+    """Take the matched pose and add its information; without odometry it also gives the velocity.
 
     The match has weighed the prediction in already (Eq. 14), so its pose is the fused pose.
+
+    Returns:
+        Covariance (3, 3; odom axes) that the way to here has gained because nothing held the pose, None for none.
     """
-    moving = state.fused
+    more: Array | None = None
     if match.ok:
-        state.failures, state.t_match = 0, moving.t_mono
-        learn_noise(state, match)
-        T_pred, P_pred = moving.T_odom_base, moving.P
-        moving.T_odom_base = match.T_odom_base
-        lacked = motion_model.learn(moving, match.correction, match.information, bool(match.known_axes.all()))
-        moving.P = updated(P_pred + lacked, match.information, moving.odometry)
-        map_odom_filter.on_match(state, T_pred, P_pred, lacked)
-        if state.t_scan > -np.inf:
-            made = se2.between(state.T_odom_scan, moving.T_odom_base)
-            moving.gyro.learn(float(made[2]), moving.t_mono - state.t_scan)
-            motion_model.feel(
-                moving, made, (state.t_scan, moving.t_mono), 2.0 * moving.P.diagonal(), state.settings.noise
-            )
-            guess(state, match.information, moving.t_mono - state.t_scan)
+        matching.failures, matching.t_match = 0, motion.t_mono
+        learn_noise(matching, match)
+        T_pred, P_pred = motion.T_odom_base, motion.P
+        motion.T_odom_base = match.T_odom_base
+        lacked = motion_model.learn(motion, match.correction, match.information, bool(match.known_axes.all()))
+        motion.P = updated(P_pred + lacked, match.information, motion.odometry)
+        map_odom_filter.on_match(pose, motion, matching.t_scan, (T_pred, P_pred), lacked)
+        if matching.t_scan > -np.inf:
+            made, dt = se2.between(matching.T_odom_scan, motion.T_odom_base), motion.t_mono - matching.t_scan
+            motion.gyro.learn(float(made[2]), dt)
+            interval = (matching.t_scan, motion.t_mono)
+            motion_model.feel(motion, made, interval, 2.0 * motion.P.diagonal(), noise)
+            more = unheld(matching, motion, match.information, dt)
+            if more is not None:
+                pose.P_anchor += more
     elif match.reason is not Reason.NO_MAP:
-        state.failures += match.reason not in BLIND  # who sees nothing contradicts nothing
-        if not moving.odometry:
-            motion_model.slow_down(moving)
-    state.t_scan, state.T_odom_scan = moving.t_mono, moving.T_odom_base
+        matching.failures += match.reason not in BLIND  # a scan that shows nothing contradicts nothing
+        if not motion.odometry:
+            motion_model.slow_down(motion)
+    matching.t_scan, matching.T_odom_scan = motion.t_mono, motion.T_odom_base
+    return more
 
 
 def updated(P: Array, H: Array, odometry: bool) -> Array:
@@ -58,7 +65,7 @@ def updated(P: Array, H: Array, odometry: bool) -> Array:
 
     A direction that the match does not hold gets no surer by it. In a corridor what it does hold is not the same to a
     hair from scan to scan; a tenth of a degree between two of them, forty times a second, would add up to centimetres
-    along an axis of which none has seen anything. Without ``odometry`` there is nothing else either: see :func:`guess`.
+    along an axis of which none has seen anything. Without ``odometry`` there is nothing else: see :func:`unheld`.
     """
     after = np.empty((3, 3))
     informed(P, H, after)
@@ -81,60 +88,49 @@ def loose_direction(H: Array) -> Array | None:
     return np.array((x, y)) if x * x * xx + 2.0 * x * y * xy + y * y * yy < HELD else None
 
 
-def guess(state: State, H: Array, dt: float) -> None:
-    """Without wheels, along a direction that the match does not hold the pose is a guess, and the stated place says so.
+def unheld(matching: MatchMemory, motion: Motion, H: Array, dt: float) -> Array | None:
+    """Covariance (3, 3; odom axes) that the place in the map gains along a direction that no match holds; None: none.
 
-    The velocity carries the pose on, and no match contradicts it. What it may be wrong by adds up with the way: the map
-    that is laid meanwhile is out of place for good, so it is the covariance of the place in the map that grows: at
-    walking pace, from half a second on. A silence of the laser has grown the prediction's own covariance already.
+    Without wheels the pose is a guess along such a direction: the velocity carries it on, and no match contradicts it.
+    What it may be wrong by adds up with the way. The map that is laid meanwhile is out of place for good, so it is the
+    covariance of the place in the map that grows: at walking pace, from half a second on. A silence of the laser has
+    grown the prediction's own covariance already.
     """
     loose = loose_direction(H)
-    if state.fused.odometry or loose is None:
-        state.guessed_s = 0.0
-        return
-    before, state.guessed_s = state.guessed_s, state.guessed_s + min(max(dt, 0.0), motion_model.LONGEST_CARRY_S)
-    t0, t1 = max(0.0, before - motion_model.LONGEST_CARRY_S), max(0.0, state.guessed_s - motion_model.LONGEST_CARRY_S)
+    if motion.odometry or loose is None:
+        matching.unheld_s = 0.0
+        return None
+    longest, before = motion_model.LONGEST_CARRY_S, matching.unheld_s
+    matching.unheld_s += min(max(dt, 0.0), longest)
+    t0, t1 = max(0.0, before - longest), max(0.0, matching.unheld_s - longest)
     more = np.zeros((3, 3))
     more[:2, :2] = float(motion_model.UNSEEN[0]) ** 2 * (t1 * t1 - t0 * t0) * np.outer(loose, loose)
-    state.P_anchor += more
-    state.atlas.loosen(more, state.T_odom_anchor)  # the way too, or no loop could bring submaps together again
+    return more
 
 
-def noise_of(state: State, scan: Scan) -> float:
-    """Range noise to reckon with: what residuals have shown, within a factor of three of the device's own figure."""
+def noise_of(matching: MatchMemory, scan: Scan) -> float:
+    """Range noise to reckon with, m: as residuals show, within a factor of three of the device's own figure."""
     stated = max(scan.sigma_m, LEAST_NOISE_M)
-    return min(max(state.noise_m or stated, stated / 3.0, LEAST_NOISE_M), 3.0 * stated)
+    return min(max(matching.noise_m or stated, stated / 3.0, LEAST_NOISE_M), 3.0 * stated)
 
 
-def learn_noise(state: State, match: MatchResult) -> None:
+def learn_noise(matching: MatchMemory, match: MatchResult) -> None:
     """Follow the variance of the residuals."""
     square = match.residual_m**2 / CAUCHY
-    if state.noise_m > 0.0:
-        square = (1.0 - LEARNING) * state.noise_m**2 + LEARNING * square
-    state.noise_m = float(np.sqrt(square))
+    if matching.noise_m > 0.0:
+        square = (1.0 - LEARNING) * matching.noise_m**2 + LEARNING * square
+    matching.noise_m = float(np.sqrt(square))
 
 
-def alike_of(state: State) -> float:
-    """How many beams tell as much as one independent beam, by what residuals have shown."""
-    return beams_each(*state.kinship.tolist())
+def beams_per_sample(matching: MatchMemory) -> float:
+    """How many beams count as one independent measurement, by what residuals have shown."""
+    return beams_each(*matching.residual_sums.tolist())
 
 
-def learn_alike(state: State, points: Array) -> None:
+def learn_correlation(matching: MatchMemory, points: Array, T_odom_base: Array) -> None:
     """Follow how neighbouring residuals agree, from a scan that has just been matched: ``points`` (n, 4)."""
-    if state.local is not None:
-        gate = 3.0 * max(state.noise_m, LEAST_NOISE_M)
-        found = agreement(points, state.local.axis, state.local.lines, state.fused.T_odom_base, gate)
-        state.kinship = (1.0 - LEARNING) * state.kinship + LEARNING * found[:2]
-
-
-def covariance(state: State) -> Array:
-    """3x3 covariance of T_map_base: of the anchor, swung out to here, and of the pose relative to it.
-
-    Once light has told where the map lies it is that of the place in the survey's frame instead.
-    """
-    out, yaw, tie, moving = np.empty((3, 3)), float(state.T_map_odom[2]), state.absolute, state.fused
-    if tie is not None and tie.placed:
-        turn(tie.P, yaw, out)
-    else:
-        hang(state.T_odom_anchor, moving.T_odom_base, state.P_anchor, moving.P, yaw, out)
-    return out
+    local = matching.local_map
+    if local is not None:
+        gate = 3.0 * max(matching.noise_m, LEAST_NOISE_M)
+        found = agreement(points, local.axis, local.lines, T_odom_base, gate)
+        matching.residual_sums = (1.0 - LEARNING) * matching.residual_sums + LEARNING * found[:2]

@@ -24,11 +24,14 @@ from typing import Final
 import numpy as np
 
 from estimator.fusion.light_inflation import BESIDE_M, doubted_covariance
-from estimator.fusion.map_odom_filter import pose_at
+from estimator.fusion.light_witness import pose_at
+from estimator.fusion.map_pose import MapPose
+from estimator.fusion.motion_model import Motion
+from estimator.light_filter.light_channel import Light
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Fix, Protection
-from estimator.state import State
+from estimator.scan_matching.match_memory import MatchMemory
 
 RISK: Final = 1e-4
 """Probability with which an error may be above its bound, a pose."""
@@ -53,59 +56,60 @@ K_FAULT: Final = ALIKE * math.sqrt(-2.0 * math.log(0.25 * RISK / FAULTY))
 """The same with one of two witnesses wrong, each of which may take a quarter of the risk."""
 
 
-def bound(state: State, P: Array) -> Protection | None:
+def bound(pose: MapPose, motion: Motion, light: Light | None, matching: MatchMemory, P: Array) -> Protection | None:
     """Bound on the error of the pose after this step, ``P`` being its covariance; None: there is none."""
-    tie = state.absolute
-    laser = state.local is not None and (state.fused.t_mono - state.t_match < 1.0)
-    lit = tie is not None and tie.placed and state.light is not None and state.light.result.fix is Fix.GOOD
-    _watch(state, P)
+    alignment = pose.alignment
+    laser = matching.local_map is not None and (motion.t_mono - matching.t_match < 1.0)
+    lit = alignment is not None and alignment.placed and light is not None and light.result.fix is Fix.GOOD
+    _snapshot(pose, matching.steps, P)
     horizontal, yaw = spread(P, K_PLAIN if laser and lit else ALONE * K_PLAIN)
     if laser and lit:
-        yaw *= 1.0 if on_wheels(state) else ALONE
-        for other in (_without_light(state), _without_laser(state)):
+        yaw *= 1.0 if on_wheels(light) else ALONE
+        assert light is not None
+        for other in (_without_light(pose, motion, matching.steps), _without_laser(pose, motion, light)):
             horizontal, yaw = max(horizontal, other[0]), max(yaw, other[1])
     horizontal, yaw = horizontal + UNKNOWN_M, min(yaw + UNKNOWN_RAD, math.pi)
     if not horizontal < MOST_M:
         return None
-    return Protection(horizontal, yaw, laser, lit, state.fused.odometry)
+    return Protection(horizontal, yaw, laser, lit, motion.odometry)
 
 
-def on_wheels(state: State) -> bool:
-    """Whether light hears from wheels how the robot moves."""
-    return state.light is not None and state.light.on_wheels
+def on_wheels(light: Light | None) -> bool:
+    """Whether wheels move the light filter."""
+    return light is not None and light.on_wheels
 
 
-def _watch(state: State, P: Array) -> None:
-    """Keep the tie that light is held against, as long as the laser carries the pose on from it."""
-    tie = state.absolute
-    if tie is None:
+def _snapshot(pose: MapPose, steps: float, P: Array) -> None:
+    """Keep T_map_odom for light to be compared with, as long as the laser carries the pose on from it."""
+    alignment = pose.alignment
+    if alignment is None:
         return
-    if not tie.placed or not tie.proved or tie.broken:
-        state.frozen.forget()
+    if not alignment.placed or not alignment.proved or alignment.broken:
+        pose.history.forget()
     else:
-        state.frozen.take(state.T_map_odom, P, state.way)
+        pose.history.take(pose.T_map_odom, P, steps)
 
 
-def _without_light(state: State) -> tuple[float, float]:
-    """What the laser alone says, light not believed since the tie was frozen: separation and spread."""
-    if not state.frozen.kept:
+def _without_light(pose: MapPose, motion: Motion, steps: float) -> tuple[float, float]:
+    """The solution of the laser alone, without light since the oldest snapshot: separation and spread (m, rad)."""
+    if not pose.history.kept:
         return 0.0, 0.0
-    T_map_odom, P, way = state.frozen.kept[0]
-    T_odom_base = state.fused.T_odom_base
-    off = se2.between(se2.compose(T_map_odom, T_odom_base), se2.compose(state.T_map_odom, T_odom_base))
-    far, turned = spread(P + max(state.way - way, 0.0) * STRAIN, K_FAULT)
+    T_map_odom, P, begun = pose.history.kept[0]
+    T_odom_base = motion.T_odom_base
+    off = se2.between(se2.compose(T_map_odom, T_odom_base), pose.here(T_odom_base))
+    far, turned = spread(P + max(steps - begun, 0.0) * STRAIN, K_FAULT)
     return math.hypot(off[0], off[1]) + far, abs(float(off[2])) + turned
 
 
-def _without_laser(state: State) -> tuple[float, float]:
+def _without_laser(pose: MapPose, motion: Motion, light: Light) -> tuple[float, float]:
     """What light alone says: separation and spread. Without wheels it says nothing of the heading."""
-    tie, light = state.absolute, state.light
-    assert tie is not None
-    assert light is not None
-    wheels = on_wheels(state)
-    in_row = tie.row.narrow(BESIDE_M)
-    said, (covered, _) = light.result, doubted_covariance(light.result, tie.way - tie.way_young, wheels, in_row)
-    here = se2.compose(state.T_map_odom, pose_at(state, max(said.t_mono, said.t_pose)))
+    alignment = pose.alignment
+    assert alignment is not None
+    wheels = light.on_wheels
+    in_row = alignment.row.narrow(BESIDE_M)
+    said, young_m = light.result, alignment.way - alignment.way_young
+    covered, _ = doubted_covariance(said, young_m, wheels, in_row)
+    here = pose.here(pose_at(pose, motion, max(said.t_mono, said.t_pose)))
     off = said.T_map_base - here
     far, turned = spread(covered, K_FAULT)
     heading = 0.0 if not wheels else abs(se2.wrap(float(off[2]))) + turned

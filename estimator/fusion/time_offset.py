@@ -66,7 +66,7 @@ in logs of robots that nothing was wrong with.
 
 
 @dataclass(slots=True, eq=False)
-class TimeLag:
+class TimeOffset:
     """What is remembered.
 
     Attributes:
@@ -96,7 +96,7 @@ class TimeLag:
         self.sums[:] = self.own[:] = 0.0
 
 
-def on_odometry(lag: TimeLag, record: Odometry) -> None:
+def on_odometry(lag: TimeOffset, record: Odometry) -> None:
     """Follow the wheels. A reading that does not follow on the last one, and a laser's silence, end what was known."""
     t_end, yaw, last = record.t_end, float(record.delta[2]), lag.points - 1
     follows = last >= 0 and abs(record.t_begin - lag.times[last]) < 1e-6 and 0.0 <= t_end - record.t_begin <= LONGEST_S
@@ -115,7 +115,7 @@ def on_odometry(lag: TimeLag, record: Odometry) -> None:
         lag.forget()
 
 
-def on_match(lag: TimeLag, scan: Scan, match: MatchResult) -> None:
+def on_match(lag: TimeOffset, scan: Scan, match: MatchResult) -> None:
     """Take in a match. Stamps that have gone back, and wheels that are silent, end what was known."""
     if not lag.points:
         return
@@ -133,7 +133,7 @@ def on_match(lag: TimeLag, scan: Scan, match: MatchResult) -> None:
         compare(lag, *lag.waiting.popleft())
 
 
-def compare(lag: TimeLag, t_mono: float, yaw: float) -> None:
+def compare(lag: TimeOffset, t_mono: float, yaw: float) -> None:
     """Hold the turn that a match at an instant has shown since the one before against the wheels', at each lag."""
     if t_mono - LAGS[-1] < lag.times[0]:
         lag.before = None
@@ -160,7 +160,7 @@ def left_over(sums: Array, own: Array) -> Array:
     return np.asarray(own[..., 1:] - sums[..., 0, :] ** 2 / np.maximum(sums[..., 1, :], NOISE_RAD**2))
 
 
-def judged(lag: TimeLag) -> Lag | None:
+def judged(lag: TimeOffset) -> Lag | None:
     """The lag, where it is beyond doubt; one that has been told stays until there is some."""
     sums, own = lag.sums.sum(0), lag.own.sum(0)
     R, count = left_over(sums, own), float(own[0])
@@ -186,7 +186,7 @@ def judged(lag: TimeLag) -> Lag | None:
     return Lag(tau, sigma) if abs(tau) - SIGMAS * sigma > (0.5 * LEAST_S if lag.told else LEAST_S) else None
 
 
-def left_out(lag: TimeLag) -> Array:
+def left_out(lag: TimeOffset) -> Array:
     """R, (n, lags), with each two blocks in a row left out that hold something.
 
     Slip is over within two blocks: it would have to come again, and in the same way, to speak for a lag in all rows.

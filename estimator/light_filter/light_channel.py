@@ -80,13 +80,13 @@ class Light:
             light_filter.predict(self.filter, record)
 
     @property
-    def told(self) -> bool:
-        """Whether the `lights` filter hears how the robot moves, by wheels or by the laser."""
+    def has_motion(self) -> bool:
+        """Whether wheels or matches give the motion to the light filter."""
         return self.filter.course.wheels
 
     @property
     def on_wheels(self) -> bool:
-        """Whether it is wheels that tell it."""
+        """Whether it is wheels that give it."""
         return self.filter.course.wheels and not self.filter.course.matched
 
     def move(self, record: Odometry, velocity: Array) -> None:

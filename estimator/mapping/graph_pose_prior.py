@@ -1,10 +1,10 @@
 """The map as a witness of the pose that light holds: what it knows better is taken from it.
 
-Light ties the odom frame to the survey, epoch by epoch; where it is blind (across a row of lamps, where none are lit)
-the tie grows vague, though the robot may drive through what it has mapped many times. There the graph knows more: by
-its loops, and by what light said of all the submaps. What it says without the tie is compared with the tie, and in each
-direction only what it knows *more* is added: the two have much in common, and a robot that hears the same map again
-learns nothing.
+Light aligns the odom frame with the survey, epoch by epoch. Where it is blind (across a row of lamps, where none are
+lit) the alignment grows vague, though the robot may drive through what it has mapped many times. There the graph knows
+more: by its loops, and by the light at all the submaps. The place by the graph without the alignment is compared with
+the alignment, and in each direction only what the graph knows *more* is added: the two have much in common, and the
+same map seen again adds nothing.
 """
 
 from __future__ import annotations
@@ -14,8 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.fusion import map_odom_filter
+from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_history import positive
-from estimator.mapping.map_frame import move_map, shift_map
+from estimator.fusion.motion_model import Motion
+from estimator.mapping.map_frame import apply_correction
+from estimator.mapping.map_state import MapState
 from estimator.mapping.pose_graph import Graph, Solution, optimise
 from estimator.mapping.relative_covariance import UNTIED
 from estimator.numerics import se2
@@ -23,7 +26,6 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import hang
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE
-from estimator.state import State
 
 NARROWEST = 1e-12
 """Share of the largest eigenvalue below which one of an information is taken for nothing but rounding."""
@@ -49,7 +51,7 @@ class Said:
 
 
 def said(graph: Graph, solution: Solution, ties: Array, how: tuple[int, float, float]) -> Said | None:
-    """What the graph says of its last pose without the last anchor, which is the tie; None without another anchor.
+    """The graph's place of its last pose without the last anchor, the alignment; None without another anchor.
 
     Args:
         graph: whose last anchor is of the last pose.
@@ -69,43 +71,46 @@ def said(graph: Graph, solution: Solution, ties: Array, how: tuple[int, float, f
     return Said(freed.poses[-1], R @ freed.covariance @ R.T)
 
 
-def take(state: State, word: Said) -> None:
-    """Add to the tie what the map knows more of the newest submap's place; that moves the robot and this submap alone.
+def take(map_: MapState, pose: MapPose, motion: Motion, word: Said) -> None:
+    """Add to the alignment what the map knows more of the newest submap's place.
 
-    Nothing is taken while light and pose disagree, while the robot is adrift or its place is being watched: then it may
+    That moves the robot and this submap alone.
+
+    Nothing is taken while light and pose disagree, while a part of the map is detached or on trial: then it may
     be the map that is wrong.
     """
-    atlas, tie, moving = state.atlas, state.absolute, state.fused
-    newest = atlas.newest
+    graph, alignment = map_.graph, pose.alignment
+    newest = graph.newest
     assert newest is not None
-    assert tie is not None
-    doubtful = tie.odd_since is not None or atlas.adrift is not None or atlas.watch is not None
-    if doubtful or not positive(tie.P):
+    assert alignment is not None
+    parts = graph.parts
+    doubtful = alignment.odd_since is not None or parts.detached is not None or parts.trial is not None
+    if doubtful or not positive(alignment.P):
         return
     R = se2.rotation(newest.T_odom_submap[2])
-    P_anchor, P_map = atlas.reached(R @ word.P @ R.T, state.T_odom_anchor), np.empty((3, 3))
-    hang(state.T_odom_anchor, moving.T_odom_base, P_anchor, moving.P, 0.0, P_map)
-    T_map_base = se2.compose(state.T_map_odom, moving.T_odom_base)
+    P_anchor, P_map = graph.reached(R @ word.P @ R.T, pose.T_odom_anchor), np.empty((3, 3))
+    hang(pose.T_odom_anchor, motion.T_odom_base, P_anchor, motion.P, 0.0, P_map)
+    T_map_base = pose.here(motion.T_odom_base)
     T_map_odom = se2.compose(word.T_map_newest, se2.inverse(newest.T_odom_submap))
-    off = se2.compose(T_map_odom, moving.T_odom_base) - T_map_base
+    off = se2.compose(T_map_odom, motion.T_odom_base) - T_map_base
     off[2] = se2.wrap(float(off[2]))
-    R = se2.rotation(state.T_map_odom[2])
+    R = se2.rotation(pose.T_map_odom[2])
     off = R.T @ off
-    if not (np.isfinite(P_map).all() and off @ invert3(P_map + tie.P + map_odom_filter.TOLERANCE) @ off <= SURPRISE):
+    P = P_map + alignment.P + map_odom_filter.TOLERANCE
+    if not (np.isfinite(P_map).all() and off @ invert3(P) @ off <= SURPRISE):
         return  # light has the last word
-    L_before = invert3(tie.P)
+    L_before = invert3(alignment.P)
     G = surplus(invert3(P_map), L_before)
     if not G.any():
         return
-    tie.P = invert3(L_before + G)
-    map_odom_filter.leave(state, tie.P @ L_before)
-    made = tie.P @ (G @ off)
-    T_map_odom = se2.compose(T_map_base + R @ made, se2.inverse(moving.T_odom_base))
-    shift_map(state, se2.compose(T_map_odom, se2.inverse(state.T_map_odom)), newest.first)
-    move_map(state, T_map_odom)
+    alignment.P = invert3(L_before + G)
+    map_odom_filter.leave(pose, motion, alignment.P @ L_before)
+    made = alignment.P @ (G @ off)
+    T_map_odom = se2.compose(T_map_base + R @ made, se2.inverse(motion.T_odom_base))
+    apply_correction(map_, pose, T_map_odom, newest.first, motion.T_odom_base)
     way, turn = float(np.hypot(made[0], made[1])), abs(float(made[2]))
-    tie.broken |= way > LED_M or turn > LED_RAD
-    atlas.stale |= max(way, turn) > SETTLED_M
+    alignment.broken |= way > LED_M or turn > LED_RAD
+    graph.stale |= max(way, turn) > SETTLED_M
 
 
 def surplus(L: Array, than: Array) -> Array:

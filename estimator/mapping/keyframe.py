@@ -1,22 +1,23 @@
-"""A scan that is kept: compact beams and the place they were seen from."""
+"""Keyframes (kept scans) and submaps (stretches of the way that the pose graph moves as one piece)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.measurements import Beams, Scan
+from estimator.measurements import Beam, Beams, Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Virtual
 from estimator.scan_matching import local_map
-from estimator.scan_matching.deskew import unturned
-from estimator.scan_matching.local_map import LocalMap
+from estimator.scan_matching.deskew import ScanPoints, unturned
+from estimator.scan_matching.line_features import lines_of
+from estimator.scan_matching.local_map import LocalMap, MapSettings
 
 Square = tuple[int, int, int]
 Elements = npt.NDArray[np.float32]
@@ -114,6 +115,10 @@ class Keyframe:
         return unturned(self.bearing_rad, self.turned_rad), self.range_m.astype(np.float64), self.beam
 
 
+SIZE = 12
+"""Keyframes in a submap: some three metres of way."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Settled:
     """What a finished submap consists of.
@@ -170,3 +175,22 @@ def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -
         range_m=np.clip(scan.range_m, -LONGEST_M, LONGEST_M).astype(np.float32),
         beam=scan.beam,
     )
+
+
+def settle(frames: Sequence[Keyframe], T_odom_submap: Array, sigma: float) -> Settled:
+    """Merge the lines of keyframes (at least one) into one submap whose frame lay at ``T_odom_submap``."""
+    local = local_map.empty(np.zeros(2))
+    placed = [replace(frame, T_odom_keyframe=se2.between(T_odom_submap, frame.T_odom_keyframe)) for frame in frames]
+    for frame in placed:
+        lines = lines_of(points_of_frame(frame, sigma))
+        local = local_map.update(local, frame, lines, MapSettings(age=len(placed) + 1), sigma)
+    return Settled(local.elements.astype(np.float32), placed[len(placed) // 2], sigma)
+
+
+def points_of_frame(frame: Keyframe, sigma: float) -> ScanPoints:
+    """Surface points of a keyframe in its base frame."""
+    bearing, distance, kind = frame.beams()
+    hit = (kind == Beam.HIT) & np.isfinite(distance) & (distance > 0.0)
+    angle, reach = bearing[hit] + frame.T_base_lidar[2], distance[hit]
+    xy = np.column_stack((reach * np.cos(angle), reach * np.sin(angle))) + frame.T_base_lidar[:2]
+    return ScanPoints(np.ascontiguousarray(xy), np.ascontiguousarray(frame.T_base_lidar[:2]), 0.0, sigma)

@@ -8,23 +8,22 @@ from itertools import islice
 
 import numpy as np
 
-from estimator.fusion import map_odom_filter
-from estimator.fusion.pose_update import covariance, noise_of
+from estimator.fusion.light_witness import blind
+from estimator.fusion.map_pose import MapPose
+from estimator.fusion.motion_model import Motion
 from estimator.mapping import keyframe
-from estimator.mapping.keyframe import Keyframe, Submap, near, square_of, squares_about
-from estimator.mapping.loop_closure import keyframe_laid
-from estimator.mapping.submap import SIZE
+from estimator.mapping.keyframe import SIZE, Keyframe, Submap, near, square_of, squares_about
+from estimator.mapping.map_state import MappingSettings, MapState
 from estimator.mapping.submap_graph import OWN
 from estimator.measurements import Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
-from estimator.relocalisation import relocalisation, relocalisation_check, unaligned_map
 from estimator.result import MatchResult
 from estimator.scan_matching import local_map
 from estimator.scan_matching.deskew import ScanPoints
 from estimator.scan_matching.line_features import lines_of
-from estimator.scan_matching.matcher_choice import Matcher
-from estimator.state import State
+from estimator.scan_matching.local_map import MapSettings
+from estimator.scan_matching.match_memory import MatchMemory
 
 PATIENCE = 3
 """Scans in a row that may fail to match before the local map is begun anew from the present one."""
@@ -44,141 +43,145 @@ AGAIN = 8
 NOTHING = 1e-9 * np.eye(3)
 
 
-def keyframe_due(state: State, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether the robot has left its newest keyframe, sees something else, or is lost; never from next to nothing."""
-    settings = state.settings
-    if len(points.xy) < settings.matching.min_points:
-        return False
-    if state.local is None or not match.ok:
-        return lost(state)
-    changed = match.inliers < settings.keyframe_share * match.queries and state.since_keyframe >= PATIENCE
-    if settings.matcher is not Matcher.LINE:  # the newest keyframe is all their map, and its error is kept for good
-        return changed or away(state) > 1.0
-    paces = math.floor(state.way)
-    due = changed or (paces != state.paces and away(state) > NEAR)
-    state.paces = paces if due else state.paces
+def keyframe_due(
+    map_: MapState, pose: MapPose, motion: Motion, matching: MatchMemory, match: MatchResult, every_step: bool
+) -> bool:
+    """Whether the robot has left its newest keyframe, sees something else, or has lost its local map.
+
+    Args:
+        map_: to be extended.
+        pose: hangs on the newest keyframe.
+        motion: after the match.
+        matching: as the match has left it.
+        match: of the present scan.
+        every_step: keyframes come by the count of :func:`count_steps`, not by their distance alone.
+    """
+    settings = map_.settings
+    if matching.local_map is None or not match.ok:
+        return lost(motion, matching)
+    changed = match.inliers < settings.keyframe_share * match.queries and matching.scans_since_keyframe >= PATIENCE
+    if not every_step:  # the newest keyframe is all of the map, and its error is kept for good
+        return changed or away(map_, pose, motion) > 1.0
+    step = math.floor(matching.steps)
+    due = changed or (step != map_.newest_step and away(map_, pose, motion) > NEAR)
+    map_.newest_step = step if due else map_.newest_step
     return due
 
 
-def lost(state: State) -> bool:
+def lost(motion: Motion, matching: MatchMemory) -> bool:
     """Whether there is no local map, or none of the scans that have seen something has fitted it for long enough."""
-    if state.local is None:
+    if matching.local_map is None:
         return True
-    waited = state.fused.t_mono - state.t_match
-    return state.failures >= PATIENCE and (not state.fused.odometry or waited >= PATIENCE_S)
+    waited = motion.t_mono - matching.t_match
+    return matching.failures >= PATIENCE and (not motion.odometry or waited >= PATIENCE_S)
 
 
-def away(state: State) -> float:
+def away(map_: MapState, pose: MapPose, motion: Motion) -> float:
     """How far the robot is from its newest keyframe, in keyframes: the larger one of its way and its turn."""
-    x, y, yaw = se2.between(state.T_odom_anchor, state.fused.T_odom_base).tolist()
-    return float(max(math.hypot(x, y) / state.settings.keyframe_m, abs(yaw) / state.settings.keyframe_rad))
+    x, y, yaw = se2.between(pose.T_odom_anchor, motion.T_odom_base).tolist()
+    return float(max(math.hypot(x, y) / map_.settings.keyframe_m, abs(yaw) / map_.settings.keyframe_rad))
 
 
-def walk(state: State) -> None:
-    """Count the way since the last scan, by the prediction.
+def count_steps(settings: MappingSettings, motion: Motion, matching: MatchMemory) -> None:
+    """Count the way since the last scan, by the prediction, in keyframe distances.
 
     Keyframes are laid where this count passes a whole number, and not at a distance from the last one: so a hair's
     breadth in one match does not choose other scans for all keyframes to come, and with them another map.
     """
-    x, y, yaw = se2.between(state.T_odom_scan, state.fused.T_odom_base).tolist()
-    state.way += math.hypot(x, y) / state.settings.keyframe_m + abs(yaw) / state.settings.keyframe_rad
+    x, y, yaw = se2.between(matching.T_odom_scan, motion.T_odom_base).tolist()
+    matching.steps += math.hypot(x, y) / settings.keyframe_m + abs(yaw) / settings.keyframe_rad
 
 
-def lay_keyframe(state: State, scan: Scan, points: ScanPoints) -> int:
-    """Keep this scan and hang the coming poses on it; returns its ID."""
-    moving, key = state.fused, state.next_key
-    T = moving.T_odom_base
-    frame = keyframe.keep(key, se2.compose(state.T_map_odom, T), T, scan, points.turned_rad)
-    newest = state.keyframes.get(state.anchor)
+def make_keyframe(map_: MapState, pose: MapPose, motion: Motion, scan: Scan, turned_rad: float) -> Keyframe:
+    """A keyframe of a scan at the present pose; nothing hangs on it yet."""
+    T = motion.T_odom_base
+    frame = keyframe.keep(map_.next_key, pose.here(T), T, scan, turned_rad)
+    newest = map_.keyframes.get(pose.anchor)
     if newest is not None and np.array_equal(newest.bearing_rad, frame.bearing_rad):
         frame.bearing_rad = newest.bearing_rad
-    state.P_anchor = turned_back(state, covariance(state))
-    P, moving.P = moving.P, NOTHING.copy()
-    if state.absolute is not None:
-        state.absolute.X = np.zeros((3, 3))
-        frame.virtual = map_odom_filter.virtual(state)
-    anew = lost(state)
-    if anew and state.local is not None:
-        relocalisation.local_map_lost(state)
-    keyframe_laid(state, frame, P, noise_of(state, scan), anew)
-    relocalisation.keyframe_laid(state, frame)
-    relocalisation_check.keyframe_laid(state, frame)
-    unaligned_map.keyframe_laid(state, frame)
-    state.keyframes[key] = frame
-    state.anchor, state.T_odom_anchor, state.next_key, state.since_keyframe = key, T, key + 1, 0
-    return key
+    return frame
 
 
-def lay_anchor(state: State) -> None:
-    """Without a laser there is nothing to keep; every stretch of the way still hangs on a place that light has told."""
-    tie, T = state.absolute, state.fused.T_odom_base
-    settings = state.settings
-    near = away(state) <= 1.0
-    if tie is None or not tie.placed or not map_odom_filter.blind(state) or near:
+def hang_on(map_: MapState, pose: MapPose, motion: Motion, frame: Keyframe) -> Array:
+    """Hang the coming poses on a new keyframe; returns the pose's covariance (3, 3) since the keyframe before."""
+    P, T = motion.P, motion.T_odom_base
+    pose.P_anchor = turned_back(pose, pose.covariance(T, P))
+    motion.P = NOTHING.copy()
+    if pose.alignment is not None:
+        pose.alignment.X = np.zeros((3, 3))
+    map_.keyframes[frame.key] = frame
+    pose.anchor, pose.T_odom_anchor, map_.next_key = frame.key, T, frame.key + 1
+    return P
+
+
+def lay_anchor(map_: MapState, pose: MapPose, motion: Motion) -> None:
+    """Without a laser no scan is kept; every stretch of the way still hangs on a place that light has given."""
+    alignment, T = pose.alignment, motion.T_odom_base
+    near = away(map_, pose, motion) <= 1.0
+    if alignment is None or not alignment.placed or not blind(pose, motion) or near:
         return
-    if settings.history:
-        state.lone[state.next_key] = Submap(0, state.next_key, se2.compose(state.T_map_odom, T), T)
-    state.anchor, state.T_odom_anchor, state.next_key = state.next_key, T, state.next_key + 1
+    if map_.settings.history:
+        map_.light_anchors[map_.next_key] = Submap(0, map_.next_key, pose.here(T), T)
+    pose.anchor, pose.T_odom_anchor, map_.next_key = map_.next_key, T, map_.next_key + 1
 
 
-def turned_back(state: State, P_map: Array) -> Array:
+def turned_back(pose: MapPose, P_map: Array) -> Array:
     """A covariance of the map frame in the axes of the odom frame."""
-    R = se2.rotation(-state.T_map_odom[2])
+    R = se2.rotation(-pose.T_map_odom[2])
     return np.asarray(R @ P_map @ R.T)
 
 
-def update_map(state: State, scan: Scan, points: ScanPoints) -> None:
-    """Merge the newest keyframe into the local map, or begin a new one where the old one is lost."""
-    newest = state.keyframes[state.anchor]
-    local = state.local
-    if local is None or lost(state):
-        state.anew += local is not None
+def update_local_map(
+    matching: MatchMemory, newest: Keyframe, points: ScanPoints, settings: MapSettings, noise_m: float, anew: bool
+) -> None:
+    """Merge the newest keyframe into the local map, or begin a new one (``anew``) where the old one is lost."""
+    local = matching.local_map
+    if local is None or anew:
+        matching.restarts += local is not None
         local = local_map.empty(newest.T_odom_keyframe[:2])
-        if state.absolute is not None:
-            state.absolute.broken = True
-    state.local = local_map.update(local, newest, lines_of(points), state.settings.map, noise_of(state, scan))
-    state.failures = 0
-    retire(state, newest)
+    matching.local_map = local_map.update(local, newest, lines_of(points), settings, noise_m)
+    matching.failures = 0
 
 
-def retire(state: State, newest: Keyframe) -> None:
+def retire(map_: MapState, newest: Keyframe) -> None:
     """Bound what is kept per area: near one place, with one heading, the newest few of earlier passes stay.
 
     This pass's own are left alone: in a curve, or where the robot sways, they lie close together. Were all counted by
     the squares that list them, squares that a lap only touches would go on filling up for hours.
     """
-    T, atlas = newest.T_map_keyframe, state.atlas
-    # what is adrift, or watched, may lie elsewhere: it takes the place of nothing older
-    since = max(atlas.since, atlas.kept if atlas.held else 0, 0 if atlas.watch is None else atlas.watch.since)
-    here = sorted(key for key, T_key in listed(state, T, newest.key) if since <= key and near(T, T_key))
+    T, parts = newest.T_map_keyframe, map_.parts
+    # what is detached, or on trial, may lie elsewhere: it takes the place of nothing older
+    fixed, on_trial = parts.session_start if parts.fixed else 0, 0 if parts.trial is None else parts.trial.since
+    since = max(parts.detached_since, fixed, on_trial)
+    here = sorted(key for key, T_key in listed(map_, T, newest.key) if since <= key and near(T, T_key))
     earlier = [key for key in here if key <= newest.key - PASS]
-    for key in earlier[: max(0, len(earlier) + 1 - state.settings.keep)]:
-        drop(state, key)
-    if atlas.held:
-        own = [key for key in state.keyframes if key >= atlas.kept]
+    for key in earlier[: max(0, len(earlier) + 1 - map_.settings.keep)]:
+        drop(map_, key)
+    if parts.fixed:
+        own = [key for key in map_.keyframes if key >= parts.session_start]
         for key in own[: -OWN * SIZE]:
-            drop(state, key)
+            drop(map_, key)
 
 
-def listed(state: State, T_map: Array, newest: int) -> Iterator[tuple[int, Array]]:
+def listed(map_: MapState, T_map: Array, newest: int) -> Iterator[tuple[int, Array]]:
     """The newest keyframe and those about its place, with theirs; who has moved along with the map is listed anew.
 
     So are a few of those that have not been looked at for longest: a map that turns a little moves its far end by
     metres, where else they would be missed on the next pass.
     """
     about = [newest]
-    for square in (*squares_about(T_map), *islice(state.places, AGAIN)):
-        about += state.places.pop(square, ())
+    for square in (*squares_about(T_map), *islice(map_.places, AGAIN)):
+        about += map_.places.pop(square, ())
     for key in about:
-        frame = state.keyframes.get(key)
+        frame = map_.keyframes.get(key)
         if frame is not None:
             T_key = frame.T_map_keyframe
-            state.places.setdefault(square_of(T_key), []).append(key)
+            map_.places.setdefault(square_of(T_key), []).append(key)
             yield key, T_key
 
 
-def drop(state: State, key: int) -> None:
+def drop(map_: MapState, key: int) -> None:
     """Let go of a keyframe's scan."""
-    gone = state.keyframes.pop(key)
-    if state.settings.history:
-        state.retired[key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)
+    gone = map_.keyframes.pop(key)
+    if map_.settings.history:
+        map_.retired[key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)

@@ -10,21 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from estimator.job_queue import DRAW
 from estimator.mapping.grid_patches import SIDE, UNIT, Cells, Patch, Seen, Tile, compose, render
 from estimator.mapping.keyframe import Keyframe, Submap, hanging
 from estimator.mapping.occupancy_grid import Grid, blank
+from estimator.mapping.submap_graph import SubmapGraph
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
-
-if TYPE_CHECKING:
-    from estimator.state import State
-
-DRAW: Final = 9
-"""Priority of the jobs: after all that the pose waits for."""
 
 RENDERS, TILES = 2, 4
 """Patches rendered, and tiles composed, in one job: some 20 ms."""
@@ -96,7 +92,7 @@ class LiveMap:
     Attributes:
         resolution: m per cell. version: counts changes. tiles: cells, and the version they are of.
         submaps, drawn: by key, those whose patch lies in the tiles. fresh: keyframes of those to be rendered.
-        stale: tiles to be composed again. due: submaps may have moved. job: the one under way, 0 before the first.
+        stale: tiles to be composed again. due: submaps may have moved.
         rendered, composed: patches and tiles, counted.
     """
 
@@ -108,7 +104,6 @@ class LiveMap:
     fresh: dict[int, tuple[Seen, ...]] = field(default_factory=dict)
     stale: frozenset[Tile] = frozenset()
     due: bool = False
-    job: int = 0
     rendered: int = 0
     composed: int = 0
 
@@ -118,9 +113,9 @@ class LiveMap:
         self.due = True
         self.fresh[submap.key] = tuple((se2.between(submap.T_odom_submap, f.T_odom_lidar), f) for f in frames)
 
-    def task(self, adrift: float = math.inf) -> Task:
-        """The next piece of work; it finds out itself what has moved. Submaps from key ``adrift`` on are left out."""
-        ready = sorted(key for key in self.fresh if key < adrift)
+    def task(self, detached: float = math.inf) -> Task:
+        """The next piece of work; it finds out itself what has moved. Submaps from key ``detached`` on are left out."""
+        ready = sorted(key for key in self.fresh if key < detached)
         fresh = {key: self.fresh[key] for key in ready[:RENDERS]}
         self.due = False
         shown = self.drawn.keys() | fresh.keys()
@@ -149,16 +144,16 @@ class LiveMap:
         shown = self.tiles.get(tile)
         return bool(cells.any()) if shown is None else not np.array_equal(shown[1], cells)
 
-    def busy(self, adrift: float = math.inf) -> bool:
+    def busy(self, detached: float = math.inf) -> bool:
         """Whether there is work, or may be because submaps were moved; arguments as of :meth:`task`."""
-        return bool(self.stale) or self.due or any(key < adrift for key in self.fresh)
+        return bool(self.stale) or self.due or any(key < detached for key in self.fresh)
 
     def clear(self) -> None:
         """Forget the map; whoever has seen its tiles is told that they are empty."""
         self.version += bool(self.tiles)
         empty = np.zeros((SIDE, SIDE), np.int8)
         self.tiles = dict.fromkeys(self.tiles, (self.version, empty))
-        self.submaps, self.drawn, self.fresh, self.stale, self.job = {}, {}, {}, frozenset(), 0
+        self.submaps, self.drawn, self.fresh, self.stale = {}, {}, {}, frozenset()
         self.due = False
 
     def changed(self, since: int) -> tuple[int, dict[Tile, Cells]]:
@@ -187,63 +182,60 @@ class LiveMap:
         return Grid(origin, self.resolution, np.ascontiguousarray(part))
 
 
-def follow(state: State, before: Submap | None, frames: Sequence[Keyframe]) -> None:
+def follow(live: LiveMap | None, graph: SubmapGraph, before: Submap | None, frames: Sequence[Keyframe]) -> None:
     """A keyframe was laid; before it, ``before`` was the newest submap, with these keyframes."""
-    live, newest = state.live, state.atlas.newest
+    newest = graph.newest
     if live is None or newest is None:
         return
     if newest is not before:
-        if newest.key == state.atlas.adrift:  # what was adrift before has never been placed
+        if newest.key == graph.parts.detached:  # what was detached before has never been placed
             live.fresh = {key: seen for key, seen in live.fresh.items() if key < newest.key}
         if before is not None:
             live.laid(before, frames)
-    if len(state.atlas.frames) % EVERY == 1:
-        live.laid(newest, state.atlas.frames)
+    if len(graph.frames) % EVERY == 1:
+        live.laid(newest, graph.frames)
     live.due = True
-    go_on(state)
+    go_on(live, graph)
 
 
-def begin(state: State) -> None:
+def begin(live: LiveMap | None, keyframes: Iterable[Keyframe]) -> None:
     """Show what a restored map holds."""
-    if state.live is not None:
-        for submap, frames in hanging(state.keyframes.values()):
-            state.live.laid(submap, frames)
+    if live is not None:
+        for submap, frames in hanging(keyframes):
+            live.laid(submap, frames)
 
 
-def redraw(state: State) -> None:
+def redraw(live: LiveMap | None, graph: SubmapGraph, keyframes: Iterable[Keyframe]) -> None:
     """The map has become another one: show what it holds now; an answer that shows the other is not waited for."""
-    if state.live is not None:
-        state.atlas.asked.pop(state.live.job, None)
-        state.live.clear()
-        begin(state)
+    if live is not None:
+        graph.jobs.cancel(live)
+        live.clear()
+        begin(live, keyframes)
 
 
-def forget(state: State, first: int) -> None:
+def forget(live: LiveMap | None, graph: SubmapGraph, first: int) -> None:
     """The submaps from key ``first`` on are taken out of the map; an answer that still shows them is not waited for."""
-    live = state.live
     if live is None:
         return
-    state.atlas.asked.pop(live.job, None)
-    live.job = 0
+    graph.jobs.cancel(live)
     for key in [key for key in live.drawn if key >= first]:
         live.stale |= live.drawn.pop(key).tiles
     live.submaps = {key: submap for key, submap in live.submaps.items() if key < first}
     live.fresh = {key: seen for key, seen in live.fresh.items() if key < first}
 
 
-def go_on(state: State) -> None:
+def go_on(live: LiveMap | None, graph: SubmapGraph) -> None:
     """Hand out the next piece of work, if there is any and none is under way."""
-    live, atlas = state.live, state.atlas
-    adrift = math.inf if atlas.adrift is None else atlas.adrift
-    if live is None or not live.busy(adrift) or live.job in atlas.asked:
+    detached = math.inf if graph.parts.detached is None else graph.parts.detached
+    if live is None or not live.busy(detached) or graph.jobs.busy(live):
         return
-    task = live.task(adrift)
+    task = live.task(detached)
 
     def then(payload: object) -> None:
         assert isinstance(payload, Progress)
         live.take(payload)
 
-    live.job = atlas.ask(DRAW, lambda: advance(task), then)
+    graph.jobs.ask(DRAW, lambda: advance(task), then, owner=live)
 
 
 def place_of(submap: Submap) -> Place:

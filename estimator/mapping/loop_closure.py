@@ -14,20 +14,25 @@ from typing import Final
 import numpy as np
 
 from estimator.fusion import map_odom_filter
+from estimator.fusion.map_pose import MapPose
+from estimator.fusion.motion_model import Motion
+from estimator.job_queue import SEARCH, SOLVE
 from estimator.mapping import graph_pose_prior, live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.loop_verification import Candidate, Found, LoopSettings, look, told_by_light
-from estimator.mapping.map_alignment_covariance import APART
-from estimator.mapping.map_frame import move_map
+from estimator.mapping.map_frame import APART
+from estimator.mapping.map_state import MapState
 from estimator.mapping.pose_graph import UPPER, Graph, Solution, optimise
 from estimator.mapping.relative_covariance import tied
-from estimator.mapping.submap_graph import LOOK, SOLVE, Atlas, Waiting
+from estimator.mapping.submap_graph import SOLUTION, SubmapGraph, Waiting
 from estimator.measurements import Answer
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Loop, LoopReason
-from estimator.state import State
+
+LOOP_SEARCH: Final = "search for a loop"
+"""Owner of the job that looks for one."""
 
 PHI: Final = 25.0
 """chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real rooms bend more than noise."""
@@ -47,46 +52,49 @@ AS_ONE: Final = 1e-6
 """Rounding (m, rad) of submaps that were moved together."""
 
 
-def take_answer(state: State, answer: Answer) -> None:
+def take_answer(map_: MapState, pose: MapPose, motion: Motion, answer: Answer) -> None:
     """Take in what a job has found."""
-    state.atlas.answer(answer)
-    solve_graph(state, state.atlas)
-    live_grid.go_on(state)
+    map_.graph.jobs.answer(answer)
+    solve_graph(map_, pose, motion)
+    live_grid.go_on(map_.live, map_.graph)
 
 
-def keyframe_laid(state: State, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
-    """Hang a new keyframe on the map and look whether this place is known; arguments as of `Atlas.add`."""
-    atlas, told = state.atlas, state.settings.loops
-    before, frames = atlas.newest, atlas.frames
-    atlas.add(frame, P, sigma, anew)
-    live_grid.follow(state, before, frames)
-    if told is not None and not atlas.looking and atlas.since_look >= told.every:
-        look_back(state, told, frame)
+def add_keyframe(map_: MapState, pose: MapPose, frame: Keyframe, odometry: tuple[Array, float, bool]) -> None:
+    """Hang a new keyframe on the graph and look whether this place is known.
+
+    ``odometry``: covariance since the keyframe before, range noise, and whether the local map was lost, see
+    `SubmapGraph.add`.
+    """
+    graph, loops = map_.graph, map_.settings.loops
+    before, frames = graph.newest, graph.frames
+    graph.add(frame, *odometry)
+    live_grid.follow(map_.live, graph, before, frames)
+    if loops is not None and not graph.jobs.busy(LOOP_SEARCH) and graph.since_look >= loops.every:
+        look_back(graph, pose, loops, frame)
 
 
-def look_back(state: State, told: LoopSettings, frame: Keyframe) -> None:
+def look_back(graph: SubmapGraph, pose: MapPose, told: LoopSettings, frame: Keyframe) -> None:
     """Hand out the search for a keyframe in the submaps that may lie here."""
-    atlas = state.atlas
-    asked = candidates(state, told, frame)
+    asked = candidates(graph, pose, told, frame)
     if not asked:
         return
-    atlas.since_look = 0
+    graph.since_look = 0
 
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
         for found in payload:
-            found_again(atlas, told, frame, found)
+            found_again(graph, told, frame, found)
 
-    atlas.look = atlas.ask(LOOK, lambda: look(frame, asked, told), then)
+    graph.jobs.ask(SEARCH, lambda: look(frame, asked, told), then, owner=LOOP_SEARCH)
 
 
-def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
+def candidates(graph: SubmapGraph, pose: MapPose, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
     """The nearest submaps that may be where the keyframe is, and were not left only just now."""
-    T, atlas = frame.T_map_keyframe, state.atlas
+    T = frame.T_map_keyframe
     here_x, here_y, _ = T.tolist()
-    near, left_before, most_m = [], atlas.way_m - told.recent_m, told.most_m
-    vaguest = placed_trace(state)  # no submap is less certain, so that most are passed over without knowing how much
-    for submap in atlas.of_part(frame.submap):
+    near, left_before, most_m = [], graph.way_m - told.recent_m, told.most_m
+    vaguest = placed_trace(pose)  # no submap is less certain, so that most are passed over without knowing how much
+    for submap in graph.of_part(frame.submap):
         settled = submap.settled
         if settled is None or submap.way_m >= left_before:
             continue
@@ -100,7 +108,7 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
         if far >= min(told.most_m, told.reach_m + 3.0 * math.sqrt(vaguest)):
             continue
         if far >= told.reach_m:
-            P = certainty(state, submap, frame)
+            P = certainty(graph, pose, submap, frame)
             if far >= told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])):
                 continue
         # who looks the other way sees little of the same
@@ -108,71 +116,71 @@ def candidates(state: State, told: LoopSettings, frame: Keyframe) -> tuple[Candi
     near.sort(key=lambda one: one[:2])
     made = []
     for _, key, submap, settled in near[: told.candidates]:
-        R, P = se2.rotation(-submap.T_map_submap[2]), certainty(state, submap, frame)
+        R, P = se2.rotation(-submap.T_map_submap[2]), certainty(graph, pose, submap, frame)
         said = told_by_light(frame, submap, told)
         made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T, said))
     return tuple(made)
 
 
-def certainty(state: State, submap: Submap, frame: Keyframe) -> Array:
+def certainty(graph: SubmapGraph, pose: MapPose, submap: Submap, frame: Keyframe) -> Array:
     """Covariance (map axes) of the newest keyframe relative to a submap: by the way, by loops, or by light."""
-    P = state.atlas.apart(submap, frame.T_odom_keyframe)
-    tie = state.absolute
-    if tie is not None and np.trace(P) > placed_trace(state):
-        P = tie.P
-    return turned(state, P)
+    P = graph.apart(submap, frame.T_odom_keyframe)
+    alignment = pose.alignment
+    if alignment is not None and np.trace(P) > placed_trace(pose):
+        P = alignment.P
+    return turned(pose, P)
 
 
-def placed_trace(state: State) -> float:
+def placed_trace(pose: MapPose) -> float:
     """Trace of the covariance (any axes) by which light has placed the pose; without end where it has not."""
-    tie = state.absolute
-    return float(np.trace(tie.P)) if tie is not None and tie.placed else math.inf
+    alignment = pose.alignment
+    return float(np.trace(alignment.P)) if alignment is not None and alignment.placed else math.inf
 
 
-def lit(state: State) -> bool:
+def lit(pose: MapPose) -> bool:
     """Whether light has told where the map lies, and so holds the pose in it."""
-    return state.absolute is not None and state.absolute.placed
+    return pose.alignment is not None and pose.alignment.placed
 
 
-def turned(state: State, P_odom: Array) -> Array:
+def turned(pose: MapPose, P_odom: Array) -> Array:
     """A covariance of the odom frame in the axes of the map."""
-    R = se2.rotation(state.T_map_odom[2])
+    R = se2.rotation(pose.T_map_odom[2])
     return np.asarray(R @ P_odom @ R.T)
 
 
-def found_again(atlas: Atlas, told: LoopSettings, frame: Keyframe, found: Found) -> None:
+def found_again(graph: SubmapGraph, told: LoopSettings, frame: Keyframe, found: Found) -> None:
     """Accept a loop, or let it wait for others that agree where it would move the pose far."""
-    if found.key not in atlas.submaps or atlas.submaps.get(frame.submap.key) is not frame.submap:
+    if found.key not in graph.submaps or graph.submaps.get(frame.submap.key) is not frame.submap:
         return  # forgotten meanwhile, and its key may have been given to another
     if not found.alone:  # places repeat here: what has agreed so far may have been the other one all along
-        atlas.waiting = []
+        graph.waiting = []
         return
     one = Waiting(found, frame, se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe)))
     if not within(found.moved, told, 1.0) and found.reason is not LoopReason.LIT:  # there light is the second witness
-        friends = supporters(atlas, told, one)
+        friends = supporters(graph, told, one)
         far = min(math.hypot(*found.moved[:2]), told.most_m)
         if not friends or max(apart(one, other) for other in friends) < far:
-            atlas.waiting = [*atlas.waiting[-TOGETHER:], one]
+            graph.waiting = [*graph.waiting[-TOGETHER:], one]
             return
-        atlas.waiting = [other for other in atlas.waiting if other not in friends]
+        graph.waiting = [other for other in graph.waiting if other not in friends]
         for other in friends:
-            join(atlas, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
+            join(graph, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
         found = replace(found, reason=LoopReason.SUPPORTED)
-    atlas.waiting = [  # the others are refuted, or were left long ago
-        other for other in atlas.waiting if comparable(atlas, one, other) and within(off(atlas, one, other), told, 1.0)
+    graph.waiting = [  # the others are refuted, or were left long ago
+        other for other in graph.waiting if comparable(graph, one, other) and within(off(graph, one, other), told, 1.0)
     ]
-    join(atlas, frame, found)
+    join(graph, frame, found)
 
 
-def supporters(atlas: Atlas, told: LoopSettings, one: Waiting) -> list[Waiting]:
+def supporters(graph: SubmapGraph, told: LoopSettings, one: Waiting) -> list[Waiting]:
     """The loops that agree with this one, newest first, as far back as none contradicts it."""
     friends: list[Waiting] = []
-    for other in reversed(atlas.waiting):
-        if not comparable(atlas, one, other):
+    for other in reversed(graph.waiting):
+        if not comparable(graph, one, other):
             continue
-        if not within(off(atlas, one, other), told, 1.0):
+        if not within(off(graph, one, other), told, 1.0):
             break
-        if within(off(atlas, one, other), told, 0.5):
+        if within(off(graph, one, other), told, 0.5):
             friends.append(other)
     return friends
 
@@ -188,16 +196,16 @@ def apart(one: Waiting, other: Waiting) -> float:
     return math.inf if abs(yaw) > TURNED else math.hypot(x, y)
 
 
-def comparable(atlas: Atlas, one: Waiting, other: Waiting) -> bool:
+def comparable(graph: SubmapGraph, one: Waiting, other: Waiting) -> bool:
     """Whether two loops tell of the same stretch of the way, in submaps that are still there."""
     laid = other.frame.submap
-    there = one.found.key in atlas.submaps and other.found.key in atlas.submaps and atlas.submaps.get(laid.key) is laid
+    there = one.found.key in graph.submaps and other.found.key in graph.submaps and graph.submaps.get(laid.key) is laid
     return there and one.frame.key - other.frame.key <= TOGETHER
 
 
-def off(atlas: Atlas, one: Waiting, other: Waiting) -> Array:
+def off(graph: SubmapGraph, one: Waiting, other: Waiting) -> Array:
     """How far (x, y, yaw) the place where one loop puts its keyframe is from where another one would put it."""
-    a, b = atlas.submaps[one.found.key], atlas.submaps[other.found.key]
+    a, b = graph.submaps[one.found.key], graph.submaps[other.found.key]
     T_b_a = se2.between(b.T_map_submap, a.T_map_submap)
     there = se2.compose(other.T_found_odom, one.frame.T_odom_keyframe)
     return se2.between(there, se2.compose(T_b_a, one.found.T_submap_keyframe))
@@ -209,40 +217,41 @@ def within(moved: Array, told: LoopSettings, share: float) -> bool:
     return math.hypot(x, y) <= share * told.supported_m and abs(yaw) <= share * told.supported_rad
 
 
-def join(atlas: Atlas, frame: Keyframe, found: Found) -> None:
+def join(graph: SubmapGraph, frame: Keyframe, found: Found) -> None:
     """Add a loop to the graph: from the submap that was found to the one that the keyframe hangs on."""
     T_keyframe_submap = se2.between(frame.T_odom_keyframe, frame.submap.T_odom_submap)
     R, A = se2.rotation(-found.T_submap_keyframe[2]), se2.adjoint(se2.inverse(T_keyframe_submap))
     P = A @ R @ found.P @ R.T @ A.T
-    atlas.constraints.add(found.key, frame.submap.key, se2.compose(found.T_submap_keyframe, T_keyframe_submap), P, True)
-    atlas.closures += 1
-    first = atlas.submaps[found.key].first
-    atlas.news = Loop(atlas.closures, frame.key, first, found.residual_m, found.reason)
-    atlas.stale = True
+    graph.constraints.add(found.key, frame.submap.key, se2.compose(found.T_submap_keyframe, T_keyframe_submap), P, True)
+    graph.closures += 1
+    first = graph.submaps[found.key].first
+    graph.news = Loop(graph.closures, frame.key, first, found.residual_m, found.reason)
+    graph.stale = True
 
 
-def solve_graph(state: State, atlas: Atlas) -> None:
+def solve_graph(map_: MapState, pose: MapPose, motion: Motion) -> None:
     """Hand out the graph, if it has changed and is not being solved."""
-    newest = atlas.newest
-    begun = newest is not None and (atlas.adrift is None or newest.key >= atlas.adrift)
-    if atlas.solving or not atlas.stale or not begun:
+    graph = map_.graph
+    newest, detached = graph.newest, graph.parts.detached
+    begun = newest is not None and (detached is None or newest.key >= detached)
+    if graph.jobs.busy(SOLUTION) or not graph.stale or not begun:
         return
-    atlas.stale = False
-    submaps = tuple(atlas.submaps.values())
-    graph = graph_of(state, atlas, submaps)
+    graph.stale = False
+    submaps = tuple(graph.submaps.values())
+    problem = graph_of(graph, pose, submaps)
 
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
-        before, solution, ties = along(submaps, graph.poses, *payload[:2])
-        if correct(state, atlas, submaps, before, solution):
-            if payload[2] is not None and lit(state) and submaps[-1] is atlas.newest:
-                graph_pose_prior.take(state, payload[2])
-            R = se2.rotation(-state.T_map_odom[2])
-            atlas.tied = submaps[-1]
+        before, solution, ties = along(submaps, problem.poses, *payload[:2])
+        if correct(map_, pose, motion, submaps, (before, solution)):
+            if payload[2] is not None and lit(pose) and submaps[-1] is graph.newest:
+                graph_pose_prior.take(map_, pose, motion, payload[2])
+            R = se2.rotation(-pose.T_map_odom[2])
+            graph.tied = submaps[-1]
             turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
-            atlas.ties = dict(zip([submap.key for submap in submaps], turned, strict=True))
+            graph.ties = dict(zip([submap.key for submap in submaps], turned, strict=True))
 
-    atlas.solution = atlas.ask(SOLVE, lambda: solved(graph), then)
+    graph.jobs.ask(SOLVE, lambda: solved(problem), then, owner=SOLUTION)
 
 
 def solved(graph: Graph) -> tuple[Solution, Array, graph_pose_prior.Said | None]:
@@ -253,29 +262,29 @@ def solved(graph: Graph) -> tuple[Solution, Array, graph_pose_prior.Said | None]
     return solution, ties, graph_pose_prior.said(graph, solution, ties, (MOST, SETTLED, PHI))
 
 
-def graph_of(state: State, atlas: Atlas, submaps: tuple[Submap, ...]) -> Graph:
+def graph_of(graph: SubmapGraph, pose: MapPose, submaps: tuple[Submap, ...]) -> Graph:
     """The submaps as a graph: joined by the way and by loops, and anchored where light has told a place."""
-    joined = atlas.constraints
+    joined = graph.constraints
     keys = np.array([submap.key for submap in submaps])
     poses = np.array([submap.T_map_submap for submap in submaps])
     edges = np.searchsorted(keys, joined.between)
-    if atlas.held:
-        held = np.array([atlas.is_held(submap) for submap in submaps])
+    if graph.parts.fixed:
+        held = np.array([graph.is_held(submap) for submap in submaps])
         return Graph(poses, edges, joined.T, joined.information, joined.loop, held=held)
-    if not lit(state):
+    if not lit(pose):
         return Graph(poses, edges, joined.T, joined.information, joined.loop)
-    anchored, at, certainty = anchors(state, atlas, keys)
+    anchored, at, certainty = anchors(graph, pose, keys)
     return Graph(poses, edges, joined.T, joined.information, joined.loop, anchored, at, certainty)
 
 
-def anchors(state: State, atlas: Atlas, keys: Ints) -> tuple[Ints, Array, Array]:
+def anchors(graph: SubmapGraph, pose: MapPose, keys: Ints) -> tuple[Ints, Array, Array]:
     """Absolute constraints: what light said at earlier submaps, and where the pose holds the newest."""
-    newest, tie = atlas.newest, state.absolute
+    newest, alignment = graph.newest, pose.alignment
     assert newest is not None
-    assert tie is not None
-    told = [(submap.key, *submap.light) for submap in atlas.submaps.values() if submap.light and submap is not newest]
+    assert alignment is not None
+    told = [(submap.key, *submap.light) for submap in graph.submaps.values() if submap.light and submap is not newest]
     told = [(key, T, APART * P) for key, T, P in told]
-    told.append((newest.key, newest.T_map_submap, turned(state, tie.P)))
+    told.append((newest.key, newest.T_map_submap, turned(pose, alignment.P)))
     anchored, at = np.searchsorted(keys, [key for key, _, _ in told]), np.array([T for _, T, _ in told])
     return anchored, at, information(at, np.array([P for _, _, P in told]))
 
@@ -320,57 +329,62 @@ def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: 
     return places, solution, np.asarray(R @ ties @ R.T)
 
 
-def correct(state: State, atlas: Atlas, submaps: tuple[Submap, ...], before: Array, solution: Solution) -> bool:
+def correct(
+    map_: MapState, pose: MapPose, motion: Motion, submaps: tuple[Submap, ...], result: tuple[Array, Solution]
+) -> bool:
     """Move the submaps to where the graph has them, and the robot with the newest one, unless light holds it.
+
+    ``result``: places (n, 3) of the submaps that the solution has begun from, and the solution.
 
     Returns whether it did: a solution of what has been moved or forgotten meanwhile is thrown away, and the graph
     solved once more.
     """
-    newest = atlas.newest
-    held, last = lit(state) and not atlas.held, submaps[-1]
+    graph, (before, solution) = map_.graph, result
+    newest = graph.newest
+    held, last = lit(pose) and not graph.parts.fixed, submaps[-1]
     counts = np.array([submap.into is None and not (held and submap is last) for submap in submaps])
-    known = atlas.submaps.get
+    known = graph.submaps.get
     there = all(submap.into is not None or known(submap.key) is submap for submap in submaps)
     same = there and np.array_equal(np.array([submap.T_map_submap for submap in submaps])[counts], before[counts])
     if newest is None or not same or not np.isfinite(solution.poses).all():
-        atlas.stale |= not same
+        graph.stale |= not same
         return False
     moved = se2.compose(solution.poses[-1], se2.inverse(last.T_map_submap))
     first = se2.compose(solution.poses[0], se2.inverse(submaps[0].T_map_submap))
-    if state.live is not None:
-        state.live.due = True
+    if map_.live is not None:
+        map_.live.due = True
     for submap, T in zip(submaps, solution.poses, strict=True):
         if not (held and submap is last):
             submap.T_map_submap = T
-    state.T_map_start = se2.compose(first, state.T_map_start)
+    map_.T_map_start = se2.compose(first, map_.T_map_start)
     if held:
         return True
-    for submap in atlas.submaps.values():
+    for submap in graph.submaps.values():
         if submap.key > last.key:
             submap.T_map_submap = se2.compose(moved, submap.T_map_submap)
-    before_map = state.T_map_odom
-    move_map(state, se2.compose(newest.T_map_submap, se2.inverse(newest.T_odom_submap)))
+    before_map = pose.T_map_odom
+    pose.move(se2.compose(newest.T_map_submap, se2.inverse(newest.T_odom_submap)), motion.T_odom_base)
     if newest is last:
-        R = se2.rotation(-state.T_map_odom[2])
-        atlas.marginal = R @ solution.covariance @ R.T
-        state.P_anchor = surer(state, atlas.spread(state.T_odom_anchor), before_map)
-        if state.absolute is not None and atlas.held:
-            map_odom_filter.hang_on_anchor(state)
+        R = se2.rotation(-pose.T_map_odom[2])
+        graph.marginal = R @ solution.covariance @ R.T
+        pose.P_anchor = surer(pose, graph.spread(pose.T_odom_anchor), before_map)
+        if pose.alignment is not None and graph.parts.fixed:
+            map_odom_filter.hang_on_anchor(pose, motion)
     else:
-        atlas.stale = True  # the newest one's certainty is not known yet
+        graph.stale = True  # the newest one's certainty is not known yet
     return True
 
 
-def surer(state: State, P_graph: Array, T_map_odom_before: Array) -> Array:
+def surer(pose: MapPose, P_graph: Array, T_map_odom_before: Array) -> Array:
     """Covariance (odom axes) of the newest keyframe's place in the map after the graph has moved it.
 
     The graph reckons with what real rooms bend a stretch by at worst, so that its loops may be believed. A loop takes
     nothing from what matching itself knew of the place, unless it finds it elsewhere than that allows.
     """
-    T_anchor = state.T_odom_anchor
-    off = se2.compose(state.T_map_odom, T_anchor) - se2.compose(T_map_odom_before, T_anchor)
+    T_anchor = pose.T_odom_anchor
+    off = se2.compose(pose.T_map_odom, T_anchor) - se2.compose(T_map_odom_before, T_anchor)
     off[2] = se2.wrap(float(off[2]))
-    off = se2.rotation(-state.T_map_odom[2]) @ off
-    P_way = state.P_anchor
+    off = se2.rotation(-pose.T_map_odom[2]) @ off
+    P_way = pose.P_anchor
     fits = float(off @ invert3(P_way + TREMBLE) @ off) <= SURPRISE
     return P_way if fits and np.trace(P_way) < np.trace(P_graph) else P_graph

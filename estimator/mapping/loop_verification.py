@@ -17,8 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.mapping.keyframe import Keyframe, Settled, Submap
-from estimator.mapping.submap import points_of_frame
+from estimator.mapping.keyframe import Keyframe, Settled, Submap, points_of_frame
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3

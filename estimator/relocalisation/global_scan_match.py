@@ -18,9 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from estimator.mapping.keyframe import Keyframe, Settled
+from estimator.mapping.keyframe import Keyframe, Settled, points_of_frame
 from estimator.mapping.loop_verification import LoopSettings
-from estimator.mapping.submap import points_of_frame
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3

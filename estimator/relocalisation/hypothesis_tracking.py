@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from estimator.mapping.keyframe import Keyframe
+from estimator.mapping.map_parts import SetAside, Trial
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.relocalisation.global_scan_match import Fit, Looked, Terrain, Verdict, same
@@ -105,7 +106,7 @@ class Seek:
     Attributes:
         alive: places left. past: some earlier keyframes that were looked for. complete: the latest search was; then
             nothing but ``alive`` is left. searched: where that was (odom frame). terrain: of the latest look.
-        job: ID of the look under way. looks: so far. hint: T_map_odom by a person who has said where the robot is, and
+        looks: so far. hint: T_map_odom by a person who has said where the robot is, and
             how many looks have not found it there. lit: keyframe of the latest look. around: light's windows where it
             was searched.
         t_begin: instant of the first keyframe. way_begin: way driven when light was first good.
@@ -117,7 +118,6 @@ class Seek:
     complete: bool = False
     searched: Array | None = None
     terrain: Terrain | None = None
-    job: int = 0
     looks: int = 0
     hint: tuple[Array, int] | None = field(default=None)
     lit: int = 0
@@ -227,25 +227,25 @@ def nearly(one: Hypothesis) -> Hypothesis | None:
     return replace(one, T_map_odom=carried(frame, fit), held=((frame, fit),), idle=0)
 
 
-@dataclass(slots=True, eq=False)
-class Watch:
-    """A place that was found is watched for a while.
+@dataclass(slots=True, eq=False, kw_only=True)
+class Watch(Trial):
+    """A place that was found is confirmed, or refuted, by looks while the robot drives on.
 
     Attributes:
-        first: key of the first submap that is no part of the map it was found in. until_m: way until then.
-        strikes: looks that have spoken against it since one held it. job: ID of the look under way. terrain: of the
-            latest. since: first keyframe of that part. alone: the laser alone has decided. foreign_m: way driven when a
-            map in a frame of its own began to be looked in, None: it lies in the survey's, or there is no light.
+        until_m: way until which it is watched, m. strikes: looks that have spoken against it since one held it.
+        terrain: of the latest look.
     """
 
-    first: int
     until_m: float
-    terrain: Terrain | None
     strikes: int = 0
-    job: int = 0
-    since: int = 0
-    alone: bool = False
-    foreign_m: float | None = None
+    terrain: Terrain | None = None
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class SearchedAside(SetAside):
+    """A stored map that is set aside while the robot is looked for in it; ``search``: so far."""
+
+    search: Seek
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -278,7 +278,7 @@ class Suspicion:
             scan; gone: how far they have turned since then. strange_s: for so long more of it has been since;
             t_strange: when it last was.
         period_s: usual time between two matches, 0 before it is known.
-        question: what the look under way decides, None: there is none. job: its ID. t_asked: when it was asked for.
+        question: what the look under way decides, None: there is none. t_asked: when it was asked for.
         again: the next one may search more.
         since: ID of the first keyframe that may be of another place, 0: none.
         leap: what is remembered of the latest scans. t_leap: instant of one that nobody has judged yet. leapt: what is
@@ -300,7 +300,6 @@ class Suspicion:
     t_strange: float = -math.inf
     period_s: float = 0.0
     question: Question | None = None
-    job: int = 0
     t_asked: float = -math.inf
     again: bool = False
     since: int = 0

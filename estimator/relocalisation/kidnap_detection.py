@@ -24,12 +24,12 @@ from typing import Final
 
 import numpy as np
 
-from estimator.commands import forget
-from estimator.fusion import map_odom_filter
+from estimator.fusion import light_witness
+from estimator.fusion.light_witness import light_holds
 from estimator.fusion.motion_model import too_far
 from estimator.fusion.pose_update import BLIND, noise_of
+from estimator.job_queue import SEARCH
 from estimator.mapping import keyframe
-from estimator.mapping.submap_graph import LOOK
 from estimator.measurements import Odometry, Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
@@ -37,11 +37,12 @@ from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation import global_scan_match, relocalisation
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, Verdict
 from estimator.relocalisation.hypothesis_tracking import BEHIND, Question
+from estimator.relocalisation.map_reset import forget_map
+from estimator.relocalisation.owners import Owners
 from estimator.relocalisation.scene_change import glance
 from estimator.result import MatchResult
 from estimator.scan_matching import local_map
 from estimator.scan_matching.deskew import ScanPoints, unturned
-from estimator.state import State
 
 SURPRISE: Final = 25.0
 """Squared Mahalanobis distance of a correction that no driving explains; as that of `matching.demand_on`."""
@@ -80,9 +81,9 @@ PATIENCE_S, GIVEN_UP_S = 2.0, 10.0
 answer is bad. One that has not come by the latter never will: it is asked anew."""
 
 
-def on_odometry(state: State, record: Odometry) -> None:
+def on_odometry(state: Owners, record: Odometry) -> None:
     """Take in whether the wheels stand; as long as they tell nothing, they are not known to turn."""
-    doubt = state.suspicion
+    doubt = state.relocalisation.suspicion
     moved = doubt.moved + record.delta
     if not all(map(math.isfinite, moved.tolist())):
         return
@@ -103,54 +104,56 @@ def turned(moved: Array, most_m: float = STILL_M, most_rad: float = STILL_RAD) -
     return math.hypot(x, y) > most_m or abs(yaw) > most_rad
 
 
-def waits(state: State) -> bool:
+def waits(state: Owners) -> bool:
     """Whether nothing may be laid into the map now, because the robot may be elsewhere."""
-    doubt = state.suspicion
-    looking = doubt.question is not None and state.fused.t_mono - doubt.t_asked < PATIENCE_S
+    doubt = state.relocalisation.suspicion
+    looking = doubt.question is not None and state.motion.t_mono - doubt.t_asked < PATIENCE_S
     return looking or doubt.fitted > 0
 
 
-def raised(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
+def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
     """Whether the place is to be looked for now; to be asked before the match is fused."""
-    doubt, atlas = state.suspicion, state.atlas
+    doubt, graph = state.relocalisation.suspicion, state.map.graph
     strange = was_strange(state, scan, points, match)
-    if not match.ok or state.local is None:
+    if not match.ok or state.matching.local_map is None:
         return False
     alone, leapt = unwatched(state), leaps(state, scan, points, match, strange)
-    if map_odom_filter.tells(state) or atlas.adrift is not None or state.settings.loops is None:
+    detached = graph.parts.detached is not None
+    if light_holds(state.pose, state.motion, state.light) or detached or state.map.settings.loops is None:
         doubt.end()
-        atlas.own = 0
+        graph.cut_at = 0
         return False
     share, odd = match.inliers / max(1, match.queries), surprising(state, match)
-    made = se2.between(state.T_odom_scan, match.T_odom_base)  # wheels that lie move the prediction, not the robot
-    jump = odd and all(too_far(T, state.fused.t_mono - state.t_match) for T in (match.correction, made))
+    dt = state.motion.t_mono - state.matching.t_match
+    made = se2.between(state.matching.T_odom_scan, match.T_odom_base)  # wrong wheels move the prediction alone
+    jump = odd and all(too_far(T, dt) for T in (match.correction, made))
     doubt.jumped |= jump
     doubt.leapt |= leapt
-    if doubt.fitted or alone or jump or state.failures >= ROW or leapt:
+    if doubt.fitted or alone or jump or state.matching.failures >= ROW or leapt:
         doubt.odd |= odd
         doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
         doubt.fitted = 0  # the same picture from the same place
-    if doubt.question is not None and state.fused.t_mono - doubt.t_asked > GIVEN_UP_S:
+    if doubt.question is not None and state.motion.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
     return doubt.fitted >= ROW and doubt.question is None
 
 
-def was_strange(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
+def was_strange(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
     """Whether for a while much of the map was looked through, the wheels standing, and is not now, or still is.
 
     So it is where the robot was carried on by hand to where it looks alike: from one scan to the next little changes.
     What the map has wrong there was looked through already when the wheels stopped. Told once.
     """
-    doubt, now = state.suspicion, state.fused.t_mono
-    rests_s, silent = now - doubt.t_rest, now - state.fused.t_odometry >= RESTED_S
+    doubt, now = state.relocalisation.suspicion, state.motion.t_mono
+    rests_s, silent = now - doubt.t_rest, now - state.motion.t_odometry >= RESTED_S
     share = looked_through(state, scan, points, match) if rests_s >= ROLLS_S and not silent else -1.0
     if share >= 0.0 and (doubt.through < 0.0 or rests_s < RESTED_S):
         doubt.through = share if doubt.through < 0.0 else min(doubt.through, share)
     if share > doubt.through + STRANGE:
-        doubt.strange_s += min(max(0.0, now - state.t_scan), doubt.period_s, STRANGE_S / ROW)
+        doubt.strange_s += min(max(0.0, now - state.matching.t_scan), doubt.period_s, STRANGE_S / ROW)
         doubt.t_strange = now
         if doubt.strange_s < LASTING_S or not match.ok:
             return False
@@ -163,45 +166,45 @@ def was_strange(state: State, scan: Scan, points: ScanPoints, match: MatchResult
     return enough
 
 
-def looked_through(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
+def looked_through(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
     """Share of the local map in view that a scan looks through from where it was taken; negative: it shows nothing."""
-    if state.local is None or match.reason in BLIND:
+    if state.matching.local_map is None or match.reason in BLIND:
         return -1.0
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-    return local_map.looked_through(state.local, eye, beams, noise_of(state, scan))
+    return local_map.looked_through(state.matching.local_map, eye, beams, noise_of(state.matching, scan))
 
 
-def leaps(state: State, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:
+def leaps(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:
     """Whether what is seen has changed all at once, or was `strange`: now, or while light told the place and not since.
 
     Where the robot is put down there may be no lamp, and for a moment nobody knows that it has been one.
     """
-    doubt = state.suspicion
+    doubt = state.relocalisation.suspicion
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
-    doubt.leap.take(glance(scan.t_end, eye, beams), noise_of(state, scan), doubt.period_s)
+    doubt.leap.take(glance(scan.t_end, eye, beams), noise_of(state.matching, scan), doubt.period_s)
     if doubt.leap.seen or strange:
         doubt.t_leap = scan.t_end
-    if map_odom_filter.tells(state) or not doubt.t_leap > map_odom_filter.told_last(state):
+    if light_holds(state.pose, state.motion, state.light) or not doubt.t_leap > light_witness.last_used(state.light):
         return False
     doubt.t_leap = -math.inf
     return True
 
 
-def give_up(state: State, question: Question) -> None:
+def give_up(state: Owners, question: Question) -> None:
     """Wait for an answer no longer; what was asked has to be asked again."""
-    doubt = state.suspicion
-    state.atlas.asked.pop(doubt.job, None)
+    doubt = state.relocalisation.suspicion
+    state.map.graph.jobs.cancel(question)
     doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
     doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
     doubt.leapt |= question.leapt
 
 
-def unwatched(state: State) -> bool:
+def unwatched(state: Owners) -> bool:
     """Whether the robot has stood, or nobody knows, for long without a match; another one has come now."""
-    doubt, now = state.suspicion, state.fused.t_mono
-    usual, since = doubt.period_s, now - state.t_match
+    doubt, now = state.relocalisation.suspicion, state.motion.t_mono
+    usual, since = doubt.period_s, now - state.matching.t_match
     alone_s = min(since, max(doubt.unwatched_s, now - doubt.t_still))
     doubt.t_still, doubt.moved, doubt.unwatched_s = now, np.zeros(3), 0.0
     if math.isfinite(since):
@@ -209,45 +212,47 @@ def unwatched(state: State) -> bool:
     return usual > 0.0 and alone_s >= max(UNWATCHED_S, MISSED * usual)
 
 
-def surprising(state: State, match: MatchResult) -> bool:
+def surprising(state: Owners, match: MatchResult) -> bool:
     """Whether a match has moved the pose farther than the prediction allows."""
     off = match.correction
-    return float(off @ invert3(state.fused.P) @ off) > SURPRISE
+    return float(off @ invert3(state.motion.P) @ off) > SURPRISE
 
 
-def look(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> None:
+def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> None:
     """Ask whether the place, after the match is fused, stands a search of the whole map."""
-    atlas, told, doubt = state.atlas, state.settings.loops, state.suspicion
+    graph, told, doubt = state.map.graph, state.map.settings.loops, state.relocalisation.suspicion
     assert told is not None
-    assert state.local is not None
-    T = state.fused.T_odom_base
-    frame = keyframe.keep(state.next_key, se2.compose(state.T_map_odom, T), T, scan, points.turned_rad)
-    against = local_map.contradicted(state.local, frame.T_odom_lidar, frame.beams(), noise_of(state, scan))
+    assert state.matching.local_map is not None
+    T = state.motion.T_odom_base
+    frame = keyframe.keep(state.map.next_key, state.pose.here(T), T, scan, points.turned_rad)
+    noise_m = noise_of(state.matching, scan)
+    against = local_map.contradicted(state.matching.local_map, frame.T_odom_lidar, frame.beams(), noise_m)
     share = match.inliers / max(1, match.queries)
     holds = global_scan_match.judged(match, share, against, told) is Verdict.HOLDS
     asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt)
     doubt.fitted, doubt.jumped, doubt.odd, doubt.again, doubt.leapt = 0, False, False, False, False
-    doubt.since = doubt.since or state.next_key
-    older = [one for one in atlas.settled() if one.first < doubt.since]
+    doubt.since = doubt.since or state.map.next_key
+    older = [one for one in graph.settled() if one.first < doubt.since]
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
     if pieces:
         nodes = global_scan_match.NODES if asked.again else NODES
-        query = Query(frame, pieces, atlas.seek.terrain, (frame.T_map_keyframe,), (), nodes=nodes)
-        doubt.job = atlas.ask(LOOK, partial(global_scan_match.look, query, told), partial(answered, state, asked))
-        doubt.question, doubt.t_asked, atlas.own = asked, state.fused.t_mono, doubt.since
+        query = Query(frame, pieces, state.relocalisation.search.terrain, (frame.T_map_keyframe,), (), nodes=nodes)
+        run, then = partial(global_scan_match.look, query, told), partial(answered, state, asked)
+        graph.jobs.ask(SEARCH, run, then, owner=asked)
+        doubt.question, doubt.t_asked, graph.cut_at = asked, state.motion.t_mono, doubt.since
     elif asked.jumped:  # nothing of the map is finished yet that could be searched
         carried_off(state)
     else:
         doubt.since = 0
 
 
-def answered(state: State, asked: Question, payload: object) -> None:
+def answered(state: Owners, asked: Question, payload: object) -> None:
     """Be adrift if the place is not the only one, or does not hold after a jump; look again if that was not found out.
 
     An answer that comes late counts as well: what was laid meanwhile is of the place that it is about.
     """
     assert isinstance(payload, Looked)
-    doubt = state.suspicion
+    doubt = state.relocalisation.suspicion
     if doubt.question is not asked:
         return  # light tells the place, the robot is adrift, or the map has been begun anew since
     doubt.question = None
@@ -260,19 +265,19 @@ def answered(state: State, asked: Question, payload: object) -> None:
     if not (alone and holds):
         carried_off(state)
     elif payload.complete:
-        doubt.since = state.atlas.own = 0
+        doubt.since = state.map.graph.cut_at = 0
     elif asked.jumped or asked.again:
         carried_off(state)
     else:
         doubt.fitted, doubt.odd, doubt.again, doubt.leapt = ROW, True, True, doubt.leapt or asked.leapt
 
 
-def carried_off(state: State) -> None:
+def carried_off(state: Owners) -> None:
     """Be adrift; a map of one scan, in which nobody can be looked for, is begun anew: it would be one of two places."""
-    atlas, since = state.atlas, state.suspicion.since
-    first = next((one.key for one in atlas.submaps.values() if one.first >= since > 0), None)
+    graph, since = state.map.graph, state.relocalisation.suspicion.since
+    first = next((one.key for one in graph.submaps.values() if one.first >= since > 0), None)
     if first is not None:
         relocalisation.disown(state, first, since)
-    if not relocalisation.afresh(state) and atlas.adrift is None:
-        forget(state)
-        state.anew += 1
+    if not relocalisation.afresh(state) and graph.parts.detached is None:
+        forget_map(state)
+        state.matching.restarts += 1

@@ -16,17 +16,18 @@ from typing import Final
 import numpy as np
 
 from estimator.cdma.epoch import UNUSABLE
+from estimator.fusion.map_pose import SurveyAlignment
 from estimator.light_filter.collinear_lamps import ACROSS_M, ROW_M, spread
 from estimator.light_filter.filter_state import Lights, Track
 from estimator.light_filter.grid_likelihood import CAP
 from estimator.light_filter.initialisation import RIVAL, Place, direct, places, probabilities, straight
 from estimator.light_filter.light_channel import SILENT_S, Asked, Light, silent, too_strong_at
 from estimator.light_filter.link_association import NEARER_M, strong_at
+from estimator.mapping.submap_graph import SubmapGraph
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Fix, Link, LinkState
-from estimator.state import State
 
 CHANCE: Final = 1e-4
 """A hypothesis of light less likely than that is none."""
@@ -69,31 +70,32 @@ class Window:
     chance: float
 
 
-def told(state: State) -> bool:
+def told(light: Light | None, graph: SubmapGraph) -> bool:
     """Whether there is light, and the map's frame is that of its survey."""
-    if state.light is None:
+    if light is None:
         return False
-    return any(submap.light is not None for submap in state.atlas.settled())
+    return any(submap.light is not None for submap in graph.settled())
 
 
-def windows(state: State, T_base_frame: Array | None = None) -> tuple[Window, ...]:
+def windows(light: Light | None, graph: SubmapGraph, T_base_frame: Array | None = None) -> tuple[Window, ...]:
     """Where light allows the robot to be, likeliest first; none where it says nothing.
 
     Where the links contradict the place that the `lights` filter still holds, as when the robot has been carried off,
     the latest epoch is read by itself.
 
     Args:
-        state: all of the estimator.
+        light: decoder and light filter.
+        graph: of the map.
         T_base_frame: where, seen from the base now, what is to be looked for was seen; None: here.
     """
-    if not told(state):
+    if not told(light, graph):
         return ()
-    assert state.light is not None
-    lights, epoch = state.light.filter, state.light.epoch
+    assert light is not None
+    lights, epoch = light.filter, light.epoch
     if epoch is None or lights.course.t_mono - lights.t_epoch > SILENT_S:
         return ()
     if contradicted(lights):
-        return tuple(about(lights, place) for place in glimpsed(state.light))
+        return tuple(about(lights, place) for place in glimpsed(light))
     if lights.result is not None and lights.result.fix is Fix.HELD:
         return ()
     return clustered(lights, se2.identity() if T_base_frame is None else T_base_frame)
@@ -120,69 +122,68 @@ def contradicted(lights: Lights) -> bool:
     return len(lights.tracks) == 1 and (math.isfinite(lights.t_lost) or math.isfinite(lights.t_odd))
 
 
-def disputed(state: State) -> bool:
+def disputed(light: Light | None, graph: SubmapGraph) -> bool:
     """Whether what is received does not fit the place that was held, or a new one has had to be looked for."""
-    return state.light is not None and (contradicted(state.light.filter) or state.light.filter.lost) and told(state)
+    return light is not None and (contradicted(light.filter) or light.filter.lost) and told(light, graph)
 
 
-def elsewhere(state: State, T_map_base: Array) -> bool:
+def elsewhere(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool:
     """Whether light has the robot under one set of lamps, and not here."""
-    return compatible(state, T_map_base) is False and under_the_same_lamps(state)
+    return compatible(light, graph, T_map_base) is False and under_the_same_lamps(light, graph)
 
 
-def out_of_place(state: State, T_map_base: Array) -> bool:
+def out_of_place(light: Light | None, T_map_base: Array) -> bool:
     """Whether a lamp is received now that cannot be received about a pose, as strong as it is.
 
     It asks the latest epoch alone, not the `lights` filter, which wheels that turn more than they say can lead astray;
     and not the heading, of which strengths know nothing. Of lamps of one code the nearest counts.
     """
-    return any(too_strong_at(state.light, T_map_base))
+    return any(too_strong_at(light, T_map_base))
 
 
-def misplaced(state: State, T_map_base: Array) -> bool:
+def misplaced(light: Light | None, alignment: SurveyAlignment | None, T_map_base: Array) -> bool:
     """Whether most of the lamps received, two at least, are stronger than they can be about a pose.
 
     What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
     not the most of them: so it is the robot that is elsewhere, whatever the `lights` filter has made of it so far.
     An epoch is asked once, unless the pose is moved meanwhile.
     """
-    if state.light is None or state.absolute is None or silent(state.light):
+    if light is None or alignment is None or silent(light):
         return False
-    asked, epoch, compared = state.light.asked, state.light.epoch, state.absolute.gap is not None
+    asked, epoch, compared = light.asked, light.epoch, alignment.gap is not None
     same = asked is not None and asked.epoch is epoch and asked.compared == compared
     if asked is None or not same or math.hypot(*(T_map_base - asked.T_map_base)[:2].tolist()) > ASKED_M:
         assert epoch is not None
-        state.light.asked = asked = Asked(epoch, T_map_base, compared, _misplaced(state, T_map_base, compared))
+        light.asked = asked = Asked(epoch, T_map_base, compared, _misplaced(light, T_map_base, compared))
     return asked.misplaced
 
 
-def _misplaced(state: State, T_map_base: Array, compared: bool) -> bool:
-    assert state.light is not None
-    result = state.light.result
+def _misplaced(light: Light, T_map_base: Array, compared: bool) -> bool:
+    result = light.result
     heard = sum(link.state not in UNHEARD for link in result.links)
     if heard < MISPLACED or (compared and 2 * len(result.accepted) >= heard):
         return False  # what is used fits where the filter is, and where that is, is held against the pose: costs less
-    strong = too_strong_at(state.light, T_map_base)
+    strong = too_strong_at(light, T_map_base)
     return sum(strong) >= MISPLACED and 2 * sum(strong) > len(strong)
 
 
-def glimpsed_elsewhere(state: State, T_map_base: Array) -> bool:
+def glimpsed_elsewhere(light: Light | None, T_map_base: Array) -> bool:
     """Whether the latest epoch, read by itself, has the robot nowhere within `NEARER_M`, but somewhere.
 
     Wheels that turn more than they say lead the filter astray, and not one epoch; it says more than that the lamps of
     the place are received, which they are a few metres beside it too.
     """
-    if state.light is None or not too_strong_at(state.light, T_map_base):
+    if light is None or not too_strong_at(light, T_map_base):
         return False
-    rx, found = state.light.filter.survey.receiver, glimpsed(state.light)
+    rx, found = light.filter.survey.receiver, glimpsed(light)
     (x, y) = se2.apply(T_map_base, np.array(((rx.x, rx.y),)))[0].tolist()
     return len(found) > 0 and all(math.hypot(one.x - x, one.y - y) > NEARER_M for one in found)
 
 
-def in_place(state: State, T_map_base: Array) -> bool:
+def in_place(light: Light | None, T_map_base: Array) -> bool:
     """Whether lamps enough are received now, all of them as strong as they can be about a pose, and it may be there."""
-    strong = too_strong_at(state.light, T_map_base)
-    return len(strong) >= LEAST and not any(strong) and not glimpsed_elsewhere(state, T_map_base)
+    strong = too_strong_at(light, T_map_base)
+    return len(strong) >= LEAST and not any(strong) and not glimpsed_elsewhere(light, T_map_base)
 
 
 def about(lights: Lights, place: Place) -> Window:
@@ -228,16 +229,16 @@ def beside(lights: Lights) -> float:
     return ACROSS_M * math.exp(-spread(at)[1] / ROW_M**2) if at else ACROSS_M
 
 
-def compatible(state: State, T_map_base: Array) -> bool | None:
+def compatible(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool | None:
     """Whether light allows a pose of the robot now; None where it says nothing."""
-    around = windows(state)
+    around = windows(light, graph)
     if not around:
         return None
     x, y, _ = T_map_base.tolist()
     if not any(math.hypot(window.x - x, window.y - y) < window.reach_m for window in around):
         return False
-    assert state.light is not None
-    lights = state.light.filter
+    assert light is not None
+    lights = light.filter
     if contradicted(lights) or lights.course.way - lights.way_start < HEADED_M:
         return True
     return any(fits(track, T_map_base) for track in likely(lights))
@@ -256,19 +257,19 @@ def fits(track: Track, T_map_base: Array) -> bool:
     return float(off @ invert3(FACTOR * track.P[:3, :3] + SLACK) @ off) < SURPRISE
 
 
-def witness(state: State, T_map_base: Array) -> bool:
+def witness(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool:
     """Whether light counts as the second witness of a pose that the laser has found.
 
     It does where lamps are used and few are against it, and where the same lamps allow no other part of the building:
     where codes repeat there are several. On which side of a row of lamps it stands the laser tells.
     """
-    if compatible(state, T_map_base) is not True or not under_the_same_lamps(state):
+    if compatible(light, graph, T_map_base) is not True or not under_the_same_lamps(light, graph):
         return False
-    assert state.light is not None
-    lights = state.light.filter
+    assert light is not None
+    lights = light.filter
     if contradicted(lights):
         x, y, _ = T_map_base.tolist()
-        place = min(glimpsed(state.light), key=lambda one: math.hypot(one.x - x, one.y - y))
+        place = min(glimpsed(light), key=lambda one: math.hypot(one.x - x, one.y - y))
         return place.of - place.fits <= AGAINST * place.of
     if lights.result is None:
         return False
@@ -278,13 +279,13 @@ def witness(state: State, T_map_base: Array) -> bool:
     return used >= LEAST and against <= AGAINST * (used + against)
 
 
-def under_the_same_lamps(state: State) -> bool:
+def under_the_same_lamps(light: Light | None, graph: SubmapGraph) -> bool:
     """Whether what is received comes from the same lamps at all places that light allows."""
-    around = windows(state)
+    around = windows(light, graph)
     if len(around) < 2:
         return True
-    assert state.light is not None
-    lights, epoch = state.light.filter, state.light.epoch
+    assert light is not None
+    lights, epoch = light.filter, light.epoch
     assert epoch is not None
     seen = {frozenset(s.lamp.lamp_id for s in direct(lights, epoch, one.x, one.y) if s.lamp) for one in around}
     return len(seen) == 1

@@ -16,23 +16,24 @@ from typing import Final
 import numpy as np
 
 from estimator.fusion import map_odom_filter
+from estimator.fusion.light_witness import blind, light_holds
+from estimator.job_queue import SEARCH
 from estimator.mapping import live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.loop_closure import join
 from estimator.mapping.loop_verification import Found
-from estimator.mapping.map_alignment_covariance import askew_at
-from estimator.mapping.map_frame import move_map, rehang, shift_map, unlist
-from estimator.mapping.submap_graph import LOOK, Atlas
+from estimator.mapping.map_frame import alignment_covariance, relist, shift_map, unlist
+from estimator.mapping.submap_graph import SubmapGraph
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, look
-from estimator.relocalisation.hypothesis_tracking import WATCH_M, Hypothesis, Seek, Watch
+from estimator.relocalisation.hypothesis_tracking import WATCH_M, Hypothesis, SearchedAside, Seek, Watch
+from estimator.relocalisation.owners import Owners
 from estimator.result import Fix, LoopReason
 from estimator.scan_matching.branch_and_bound import Around
-from estimator.state import State
 
-Take = Callable[[State, Seek, Keyframe, tuple[Hypothesis, ...], object], None]
+Take = Callable[[Owners, Seek, Keyframe, tuple[Hypothesis, ...], object], None]
 """Takes in what a look has found: for which search, at which keyframe, for which places it was asked."""
 
 HINT_M, HINT_RAD = 1.0, 0.5
@@ -57,95 +58,97 @@ SURPRISE: Final = 16.3
 """Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
 
 
-def begin(state: State) -> bool:
+def begin(state: Owners) -> bool:
     """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in.
 
     A map of one submap that is not finished will do: the robot begins another one, and that one is finished then. So
     will one whose submaps are just being finished.
     """
-    atlas = state.atlas
-    young = atlas.adrift is None and (len(atlas.frames) >= YOUNG or len(atlas.submaps) > 1)
-    if state.settings.loops is None or not (young or atlas.settled()):
+    graph = state.map.graph
+    young = graph.parts.detached is None and (len(graph.frames) >= YOUNG or len(graph.submaps) > 1)
+    if state.map.settings.loops is None or not (young or graph.settled()):
         return False
-    if atlas.adrift is not None:
-        forget_adrift(state)
+    if graph.parts.detached is not None:
+        forget_detached(state)
     else:
         leave_map(state)
-    state.suspicion.end()
-    state.suspicion.leap.forget()
-    atlas.cut(state.next_key)
-    atlas.seek = Seek()
-    if atlas.aside is not None:
-        atlas.aside.seek = Seek()
+    state.relocalisation.suspicion.end()
+    state.relocalisation.suspicion.leap.forget()
+    graph.detach(state.map.next_key)
+    state.relocalisation.search = Seek()
+    aside = graph.parts.aside
+    if isinstance(aside, SearchedAside):
+        aside.search = Seek()
     return True
 
 
-def leave_map(state: State) -> None:
+def leave_map(state: Owners) -> None:
     """Keep how surely the map lies in the survey, as of the latest match with it; zero where light has not told it."""
-    tie, atlas = state.absolute, state.atlas
-    atlas.T_askew, atlas.askew = (se2.identity(), np.zeros((3, 3))) if tie is None or not tie.placed else tie.kept
+    alignment, memory = state.pose.alignment, state.relocalisation
+    placed = alignment is not None and alignment.placed
+    memory.T_left, memory.P_left = alignment.kept if alignment and placed else (se2.identity(), np.zeros((3, 3)))
 
 
-def local_map_lost(state: State) -> None:
+def local_map_lost(state: Owners) -> None:
     """The local map is begun anew: the robot may have been carried off, unless light that tells now holds it here.
 
     Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One
     that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
     """
-    tie = state.absolute
+    alignment = state.pose.alignment
     held = False
-    if tie is not None and map_odom_filter.tells(state) and tie.gap is not None:
+    if alignment is not None and light_holds(state.pose, state.motion, state.light) and alignment.gap is not None:
         from estimator.relocalisation.light_evidence import in_place
 
-        here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-        held = tie.gap <= SURPRISE or (tie.proved and in_place(state, here))
-    if not held or state.atlas.adrift is not None:
+        here = state.pose.here(state.motion.T_odom_base)
+        held = alignment.gap <= SURPRISE or (alignment.proved and in_place(state.light, here))
+    if not held or state.map.parts.detached is not None:
         begin(state)
 
 
-def forget_adrift(state: State) -> None:
+def forget_detached(state: Owners) -> None:
     """Let go of the keyframes of a part that has never been placed."""
-    gone = [frame for key, frame in state.keyframes.items() if key >= state.atlas.since]
+    gone = [frame for key, frame in state.map.keyframes.items() if key >= state.map.parts.detached_since]
     for frame in gone:
-        del state.keyframes[frame.key]
-        if state.settings.history:
-            state.retired[frame.key] = frame.submap, se2.between(frame.submap.T_odom_submap, frame.T_odom_keyframe)
-    unlist(state, state.atlas.since)
+        del state.map.keyframes[frame.key]
+        if state.map.settings.history:
+            state.map.retired[frame.key] = frame.submap, se2.between(frame.submap.T_odom_submap, frame.T_odom_keyframe)
+    unlist(state.map, state.map.parts.detached_since)
 
 
-def disown(state: State, first: int, since: int) -> None:
+def disown(state: Owners, first: int, since: int) -> None:
     """The place was the wrong one: what was mapped since lies in it, and is what the next `begin` lets go of.
 
     Else the robot would find itself again in what it has laid there. ``first``: key of the first submap of that,
     ``since``: ID of its first keyframe.
     """
-    if state.atlas.adrift is None:
+    if state.map.parts.detached is None:
         leave_map(state)
-    state.atlas.adrift, state.atlas.since, state.atlas.stale = first, since, True
-    live_grid.forget(state, first)
+    state.map.parts.detached, state.map.parts.detached_since, state.map.graph.stale = first, since, True
+    live_grid.forget(state.map.live, state.map.graph, first)
 
 
-def places(state: State) -> int | None:
+def places(state: Owners) -> int | None:
     """How many places fit, None where the place is known (see `StepResult.places`); light alone may know it too."""
-    if state.atlas.adrift is None:
+    if state.map.parts.detached is None:
         return None
-    lit = map_odom_filter.tells(state) and map_odom_filter.blind(state)
+    lit = light_holds(state.pose, state.motion, state.light) and blind(state.pose, state.motion)
     if lit:
         from estimator.relocalisation.light_evidence import disputed  # costs nothing where there is no photodiode
 
-        lit = not disputed(state)
-    return None if lit else len(state.atlas.seek.alive)
+        lit = not disputed(state.light, state.map.graph)
+    return None if lit else len(state.relocalisation.search.alive)
 
 
-def hinted(state: State) -> None:
+def hinted(state: Owners) -> None:
     """A person has just said where the robot is: it is looked for there first."""
-    state.atlas.seek = Seek(terrain=state.atlas.seek.terrain, hint=(state.T_map_odom, 0))
+    state.relocalisation.search = Seek(terrain=state.relocalisation.search.terrain, hint=(state.pose.T_map_odom, 0))
 
 
-def keyframe_laid(state: State, frame: Keyframe) -> None:
+def keyframe_laid(state: Owners, frame: Keyframe) -> None:
     """Look for a new keyframe, if the robot is adrift and no other look is under way."""
-    atlas, told = state.atlas, state.settings.loops
-    if atlas.adrift is None or told is None or atlas.seek.job in atlas.asked:
+    graph, told = state.map.graph, state.map.settings.loops
+    if graph.parts.detached is None or told is None or graph.jobs.busy(state.relocalisation.search):
         return
     around = windows(state, frame)
     if around is None and light_is_coming(state):
@@ -153,16 +156,16 @@ def keyframe_laid(state: State, frame: Keyframe) -> None:
     look_for(state, frame, around)
 
 
-def look_for(state: State, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
+def look_for(state: Owners, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
     """Hand out a look for a keyframe in what is not adrift."""
-    hand_out(state, state.atlas.seek, frame, state.atlas.settled(), around, take_look)
+    hand_out(state, state.relocalisation.search, frame, state.map.graph.settled(), around, take_look)
 
 
 def hand_out(
-    state: State, seek: Seek, frame: Keyframe, among: Iterable[Submap], around: tuple[Around, ...] | None, take: Take
+    state: Owners, seek: Seek, frame: Keyframe, among: Iterable[Submap], around: tuple[Around, ...] | None, take: Take
 ) -> None:
     """Hand out a look for a keyframe among submaps."""
-    atlas, told = state.atlas, state.settings.loops
+    graph, told = state.map.graph, state.map.settings.loops
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in among if one.settled is not None)
     if not pieces or told is None:
         return
@@ -175,61 +178,68 @@ def hand_out(
     firm = tuple(one.firm() for one in asked)
     query = Query(frame, pieces, seek.terrain, guesses, seek.past, due, around, outvoted=around is not None, firm=firm)
     then = partial(take, state, seek, frame, asked)
-    seek.job = atlas.ask(LOOK, partial(look, query, told), then)
+    graph.jobs.ask(SEARCH, partial(look, query, told), then, owner=seek)
 
 
-def step_done(state: State) -> None:
+def step_done(state: Owners) -> None:
     """Look again at the newest keyframe when light has come to say where it is, or says otherwise: robots may stand.
 
     And decide, when light has become a witness since.
     """
-    atlas, frame = state.atlas, state.keyframes.get(state.anchor)
+    graph, frame = state.map.graph, state.map.keyframes.get(state.pose.anchor)
     if state.light is None:
         return
-    if atlas.adrift is None:
+    if graph.parts.detached is None:
         doubt(state)
         return
-    if frame is None or frame.key < atlas.since:
+    if frame is None or frame.key < graph.parts.detached_since:
         return
-    seek = atlas.seek
-    if seek.job in atlas.asked or seek.hint is not None:
+    seek = state.relocalisation.search
+    if graph.jobs.busy(seek) or seek.hint is not None:
         return
     decide(state)
-    if state.atlas.adrift is None or by_light_alone(state):
+    if state.map.parts.detached is None or by_light_alone(state):
         return
     allowed = windows(state, frame)
-    if allowed is None and not (seek.looks == 0 and state.fused.t_mono - seek.t_begin > PATIENCE_S):
+    if allowed is None and not (seek.looks == 0 and state.motion.t_mono - seek.t_begin > PATIENCE_S):
         return
     asked = seek.lit == frame.key and not seek.elsewhere(allowed or ())
-    stale = asked and seek.looks and not seek.alive and state.since_keyframe > STALE
-    if stale or (allowed and state.failures >= UNFIT):
+    stale = asked and seek.looks and not seek.alive and state.matching.scans_since_keyframe > STALE
+    if stale or (allowed and state.matching.failures >= UNFIT):
         afresh(state)  # it stands and was not found, or was just put down: what was kept says nothing of where it is
     elif not asked:
         seek.searched = None
         look_for(state, frame, allowed)
 
 
-def by_light_alone(state: State) -> bool:
+def by_light_alone(state: Owners) -> bool:
     """End being adrift where light has long told the place, in a part of the building that the map does not know.
 
     Both parts of the graph then hang on what light has said of them.
     """
     from estimator.relocalisation.light_evidence import told
 
-    atlas, seek, tie, light = state.atlas, state.atlas.seek, state.absolute, state.light
-    if tie is None or light is None or light.result.fix is not Fix.GOOD or tie.gap is None or tie.gap > SURPRISE:
+    graph, seek, alignment, light = state.map.graph, state.relocalisation.search, state.pose.alignment, state.light
+    good = light is not None and light.result.fix is Fix.GOOD
+    if alignment is None or not good or alignment.gap is None or alignment.gap > SURPRISE:
         return False
     if not math.isfinite(seek.way_begin):
-        seek.way_begin = tie.way
-    if seek.alive or not seek.looks or tie.way - seek.way_begin < ALONE_M or not told(state):
+        seek.way_begin = alignment.way
+    if (
+        seek.alive
+        or not seek.looks
+        or alignment.way - seek.way_begin < ALONE_M
+        or not told(state.light, state.map.graph)
+    ):
         return False
-    since = atlas.since
-    atlas.adrift, atlas.since, atlas.bridge, atlas.seek = None, 0, None, Seek()
-    rehang(state, since)
+    since = graph.parts.detached_since
+    graph.parts.attach()
+    graph.parts.bridge, state.relocalisation.search = None, Seek()
+    relist(state.map, since)
     return True
 
 
-def doubt(state: State) -> None:
+def doubt(state: Owners) -> None:
     """Say that the robot was carried off where light says so: at once if scans fit no more, else after a while.
 
     The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here. Where
@@ -240,52 +250,54 @@ def doubt(state: State) -> None:
     """
     from estimator.relocalisation import light_evidence
 
-    tie, light = state.absolute, state.light
-    assert tie is not None
+    alignment, light = state.pose.alignment, state.light
+    assert alignment is not None
     assert light is not None
-    if not light_evidence.disputed(state):
-        tie.elsewhere_since, tie.aside_since, tie.unheard = None, None, False
+    if not light_evidence.disputed(state.light, state.map.graph):
+        alignment.elsewhere_since, alignment.aside_since, alignment.unheard = None, None, False
         return
-    if tie.gap is not None and tie.gap <= SURPRISE and not light_evidence.contradicted(light.filter):
-        tie.unheard = False  # the filter is at a new place already, and that is here
-    now = state.fused.t_mono
-    tie.elsewhere_since = now if tie.elsewhere_since is None else tie.elsewhere_since
-    here = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    unfit = state.failures >= UNFIT
-    aside = (unfit or tie.broken) and light_evidence.glimpsed_elsewhere(state, here)
-    tie.aside_since = (now if tie.aside_since is None else tie.aside_since) if aside else None
-    aside = tie.aside_since is not None and (unfit or now - tie.aside_since >= ASIDE_S)
-    held = tie.proved and not (tie.unheard and unfit)
-    if held and not aside and not light_evidence.out_of_place(state, here):
+    if alignment.gap is not None and alignment.gap <= SURPRISE and not light_evidence.contradicted(light.filter):
+        alignment.unheard = False  # the filter is at a new place already, and that is here
+    now = state.motion.t_mono
+    alignment.elsewhere_since = now if alignment.elsewhere_since is None else alignment.elsewhere_since
+    here = state.pose.here(state.motion.T_odom_base)
+    unfit = state.matching.failures >= UNFIT
+    aside = (unfit or alignment.broken) and light_evidence.glimpsed_elsewhere(state.light, here)
+    alignment.aside_since = (now if alignment.aside_since is None else alignment.aside_since) if aside else None
+    aside = alignment.aside_since is not None and (unfit or now - alignment.aside_since >= ASIDE_S)
+    held = alignment.proved and not (alignment.unheard and unfit)
+    if held and not aside and not light_evidence.out_of_place(state.light, here):
         return
-    sure = now - tie.elsewhere_since >= ELSEWHERE_S and light_evidence.elsewhere(state, here)
+    sure = now - alignment.elsewhere_since >= ELSEWHERE_S and light_evidence.elsewhere(
+        state.light, state.map.graph, here
+    )
     if (sure or unfit or aside) and afresh(state):
-        tie.elsewhere_since, tie.aside_since, tie.broken = None, None, True
+        alignment.elsewhere_since, alignment.aside_since, alignment.broken = None, None, True
 
 
-def afresh(state: State) -> bool:
+def afresh(state: Owners) -> bool:
     """Be adrift from the next scan on, with a new local map."""
     if not begin(state):
         return False
-    state.local, state.failures = None, 0
+    state.matching.local_map, state.matching.failures = None, 0
     return True
 
 
-def light_is_coming(state: State) -> bool:
+def light_is_coming(state: Owners) -> bool:
     """Whether light may tell within a moment, so that the whole map need not be searched: it has just come on."""
-    seek = state.atlas.seek
+    seek = state.relocalisation.search
     if not math.isfinite(seek.t_begin):
-        seek.t_begin = state.fused.t_mono
-    if state.light is None or seek.looks or state.fused.t_mono - seek.t_begin > PATIENCE_S:
+        seek.t_begin = state.motion.t_mono
+    if state.light is None or seek.looks or state.motion.t_mono - seek.t_begin > PATIENCE_S:
         return False
     from estimator.relocalisation import light_evidence
 
-    return light_evidence.told(state)
+    return light_evidence.told(state.light, state.map.graph)
 
 
-def windows(state: State, frame: Keyframe) -> tuple[Around, ...] | None:
+def windows(state: Owners, frame: Keyframe) -> tuple[Around, ...] | None:
     """Where a keyframe is to be searched for, by what a person or light says; everywhere if None."""
-    hint = state.atlas.seek.hint
+    hint = state.relocalisation.search.hint
     if hint is not None:
         T_map_lidar = se2.compose(se2.compose(hint[0], frame.T_odom_keyframe), frame.T_base_lidar)
         return (Around(T_map_lidar, HINT_M, HINT_RAD),)
@@ -294,14 +306,16 @@ def windows(state: State, frame: Keyframe) -> tuple[Around, ...] | None:
     from estimator.relocalisation import light_evidence  # costs nothing where there is no photodiode
 
     lever = math.hypot(*frame.T_base_lidar[:2].tolist())
-    allowed = light_evidence.windows(state, se2.between(state.fused.T_odom_base, frame.T_odom_keyframe))
+    allowed = light_evidence.windows(
+        state.light, state.map.graph, se2.between(state.motion.T_odom_base, frame.T_odom_keyframe)
+    )
     return tuple(Around(np.array((one.x, one.y, 0.0)), one.reach_m + lever, math.pi) for one in allowed) or None
 
 
-def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
+def take_look(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
     """Take in what a look has found; and the decision, if it is one."""
     assert isinstance(payload, Looked)
-    if state.atlas.seek is not seek or state.atlas.adrift is None:
+    if state.relocalisation.search is not seek or state.map.parts.detached is None:
         return
     seek.take(frame, asked, payload)
     if seek.hint is not None and not seek.alive:
@@ -311,7 +325,7 @@ def take_look(state: State, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis
     decide(state)
 
 
-def ruled_out(state: State, one: Hypothesis) -> bool:
+def ruled_out(state: Owners, one: Hypothesis) -> bool:
     """Whether light has no hypothesis there; for good, which one epoch by itself cannot say."""
     if state.light is None or said(state, one) is not False:
         return False
@@ -320,9 +334,9 @@ def ruled_out(state: State, one: Hypothesis) -> bool:
     return not contradicted(state.light.filter)
 
 
-def decide(state: State) -> None:
+def decide(state: Owners) -> None:
     """Take the robot to the place that is sure, if one is."""
-    seek = state.atlas.seek
+    seek = state.relocalisation.search
     one = seek.favourite()
     if one is not None:
         witnessed = said(state, one) is True
@@ -334,96 +348,111 @@ def decide(state: State) -> None:
         land(state, one, said(state, one) is not True)
 
 
-def said(state: State, one: Hypothesis) -> bool | None:
+def said(state: Owners, one: Hypothesis) -> bool | None:
     """Whether a person or light says that this is the place (True) or that it is not; None where neither can tell."""
-    if state.atlas.seek.hint is not None:
+    if state.relocalisation.search.hint is not None:
         return True  # it was looked for nowhere else
     if state.light is None:
         return None
     from estimator.relocalisation import light_evidence
 
-    T_map_base = se2.compose(one.T_map_odom, state.fused.T_odom_base)
-    if light_evidence.witness(state, T_map_base):
+    T_map_base = se2.compose(one.T_map_odom, state.motion.T_odom_base)
+    if light_evidence.witness(state.light, state.map.graph, T_map_base):
         return True
-    return False if light_evidence.compatible(state, T_map_base) is False else None
+    return False if light_evidence.compatible(state.light, state.map.graph, T_map_base) is False else None
 
 
-def land(state: State, one: Hypothesis, alone: bool) -> None:
+def land(state: Owners, one: Hypothesis, alone: bool) -> None:
     """The place is known: join what was mapped adrift to the older map, and take the robot there.
 
     A map in a frame of its own is taken to the robot instead, if light has told where that is. ``alone``: by the laser
     alone.
     """
-    atlas, (frame, fit) = state.atlas, one.held[-1]
-    found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in atlas.submaps]
-    if fit.key not in atlas.submaps or not found:
+    graph, (frame, fit) = state.map.graph, one.held[-1]
+    found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in graph.submaps]
+    if fit.key not in graph.submaps or not found:
         return
-    T_map_keyframe = se2.compose(atlas.submaps[fit.key].T_map_submap, fit.T_submap_keyframe)
+    T_map_keyframe = se2.compose(graph.submaps[fit.key].T_map_submap, fit.T_submap_keyframe)
     T_map_odom = se2.compose(T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
-    moved = se2.compose(T_map_odom, se2.inverse(state.T_map_odom))
-    stays = atlas.foreign and state.absolute is not None and state.absolute.placed
-    since, first, was = atlas.since, atlas.adrift, state.T_map_odom
-    shift_map(state, moved, since)
+    moved = se2.compose(T_map_odom, se2.inverse(state.pose.T_map_odom))
+    stays = state.relocalisation.unaligned and state.pose.alignment is not None and state.pose.alignment.placed
+    parts, was = graph.parts, state.pose.T_map_odom
+    since, first = parts.detached_since, parts.detached
+    shift_map(state.map, moved, since)
     if stays:
-        state.T_map_odom = T_map_odom  # for the moment: it is no jump
+        state.pose.T_map_odom = T_map_odom  # for the moment: it is no jump
     else:
-        move_map(state, T_map_odom)
+        state.pose.move(T_map_odom, state.motion.T_odom_base)
     if first is not None:
-        watch = Watch(first, atlas.way_m + WATCH_M, atlas.seek.terrain, since=since, alone=alone)
-        atlas.watch = replace(watch, foreign_m=atlas.way_m if atlas.foreign else None)
-    atlas.adrift, atlas.since, atlas.seek = None, 0, Seek()
+        parts.trial = Watch(
+            first=first,
+            until_m=graph.way_m + WATCH_M,
+            terrain=state.relocalisation.search.terrain,
+            since=since,
+            alone=alone,
+            foreign_m=graph.way_m if state.relocalisation.unaligned else None,
+        )
+    parts.attach()
+    state.relocalisation.search = Seek()
     for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
-        if it.key in atlas.submaps:
-            R = se2.rotation(-atlas.submaps[it.key].T_map_submap[2])
+        if it.key in graph.submaps:
+            R = se2.rotation(-graph.submaps[it.key].T_map_submap[2])
             P = R @ it.P @ R.T
             close = Found(it.key, it.T_submap_keyframe, P, it.share, it.against, it.residual_m, np.zeros(3))
-            join(atlas, at, replace(close, reason=LoopReason.PLACED))
-    bridge(atlas, first)
+            join(graph, at, replace(close, reason=LoopReason.PLACED))
+    bridge(graph, first)
     resettle(state, frame, fit.P, first)
     if stays:
-        shift_map(state, se2.inverse(moved), 0)
-        state.T_map_odom = was
-    rehang(state, 0 if stays else since)
+        shift_map(state.map, se2.inverse(moved), 0)
+        state.pose.T_map_odom = was
+    relist(state.map, 0 if stays else since)
 
 
-def bridge(atlas: Atlas, first: int | None) -> None:
+def bridge(graph: SubmapGraph, first: int | None) -> None:
     """The way driven across the break counts as one that may be false, where what was found agrees with it."""
-    told, atlas.bridge = atlas.bridge, None
-    if told is None or first not in atlas.submaps or told[0] not in atlas.submaps:
+    told, graph.parts.bridge = graph.parts.bridge, None
+    if told is None or first not in graph.submaps or told[0] not in graph.submaps:
         return
     key, T, P = told
-    before, after = atlas.submaps[key], atlas.submaps[first]
+    before, after = graph.submaps[key], graph.submaps[first]
     off = se2.between(T, se2.between(before.T_map_submap, after.T_map_submap))
     if float(off @ invert3(P) @ off) < SURPRISE:
-        atlas.constraints.add(key, after.key, T, P, True)
+        graph.constraints.add(key, after.key, T, P, True)
 
 
-def resettle(state: State, frame: Keyframe, P_map: Array, first: int | None) -> None:
+def resettle(state: Owners, frame: Keyframe, P_map: Array, first: int | None) -> None:
     """How sure the pose is now: by the match that has decided, the way since, and the map it was found in.
 
     ``first``: key of the first submap that is no part of that map.
     """
-    atlas = state.atlas
-    newest = atlas.newest
+    graph = state.map.graph
+    newest = graph.newest
     assert newest is not None
     T_keyframe_newest = se2.between(frame.T_odom_keyframe, newest.T_odom_submap)
-    R = se2.rotation(-state.T_map_odom[2])
+    R = se2.rotation(-state.pose.T_map_odom[2])
     P = se2.carry(frame.T_map_keyframe, T_keyframe_newest, P_map)
-    atlas.marginal = R @ P @ R.T
-    state.P_anchor = atlas.spread(state.T_odom_anchor)
-    tie = state.absolute
-    if tie is None:
+    graph.marginal = R @ P @ R.T
+    state.pose.P_anchor = graph.spread(state.pose.T_odom_anchor)
+    alignment = state.pose.alignment
+    if alignment is None:
         return
     from estimator.relocalisation.light_evidence import disputed, told
 
-    if atlas.foreign:  # map and robot are one again: light takes both to where they are, as after a first start
-        tie.since, atlas.foreign = 0, False
-    elif tie.placed or told(state):  # the map's frame is the survey's
-        map_odom_filter.hang_on_anchor(state)
-        askew = askew_at(atlas, se2.compose(state.T_map_odom, state.fused.T_odom_base), first)
-        tie.P = tie.P + R @ askew @ R.T  # no surer in the survey's frame than the map is
-        tie.placed, tie.proved, tie.broken = True, True, False
-        tie.gap, tie.odd_since, tie.since = None, None, state.next_key
-        map_odom_filter.told_anew(tie, True)
-        tie.way_start = -math.inf if state.light is None else state.light.filter.way_start
-        tie.unheard, tie.t_match = disputed(state), state.fused.t_mono  # the laser has just told the place
+    if state.relocalisation.unaligned:  # map and robot are one again: light moves both, as after a first start
+        alignment.since, state.relocalisation.unaligned = 0, False
+    elif alignment.placed or told(state.light, state.map.graph):  # the map's frame is the survey's
+        map_odom_filter.hang_on_anchor(state.pose, state.motion)
+        here, left = (
+            state.pose.here(state.motion.T_odom_base),
+            (state.relocalisation.T_left, state.relocalisation.P_left),
+        )
+        P_map_survey = alignment_covariance(graph.submaps.values(), here, first, left)
+        alignment.P = alignment.P + R @ P_map_survey @ R.T  # no surer in the survey's frame than the map is
+        alignment.placed, alignment.proved, alignment.broken = True, True, False
+        alignment.gap, alignment.odd_since, alignment.since = None, None, state.map.next_key
+        map_odom_filter.place_given(alignment, True)
+        alignment.way_start = -math.inf if state.light is None else state.light.filter.way_start
+        alignment.unheard, alignment.t_match = (
+            disputed(state.light, state.map.graph),
+            state.motion.t_mono,
+        )  # the laser has just told the place

@@ -15,7 +15,7 @@ from estimator.measurements import Scan
 from estimator.numerics.arrays import Array
 from estimator.result import Reason
 from estimator.scan_matching.deskew import ScanPoints
-from estimator.state import State
+from estimator.scan_matching.match_memory import MatchMemory
 
 LONGEST_SWEEP_S = 10.0
 FARTHEST_MOUNT_M = 100.0
@@ -26,12 +26,12 @@ FULL_TURN = 2.0 * math.pi + 0.1
 """Bearings of one sweep span no more than this; nor is one of them, or a mount's yaw, farther from zero."""
 
 
-def refused(state: State, scan: Scan) -> Reason | None:
+def refused(matching: MatchMemory, scan: Scan) -> Reason | None:
     """Why a scan may not be looked at, None if it may; what has been found good of it is remembered."""
-    if not (well_formed(scan) and even(state, scan.bearing_rad)):
+    if not (well_formed(scan) and even(matching, scan.bearing_rad)):
         return Reason.MALFORMED
-    late = scan.t_end < state.t_newest_scan
-    state.t_newest_scan = scan.t_end
+    late = scan.t_end < matching.t_newest_scan
+    matching.t_newest_scan = scan.t_end
     return Reason.LATE if late else None
 
 
@@ -50,16 +50,16 @@ def well_formed(scan: Scan) -> bool:
     return placed and timed and 0.0 <= scan.sigma_m < LARGEST_NOISE_M
 
 
-def even(state: State, bearing: Array) -> bool:
+def even(matching: MatchMemory, bearing: Array) -> bool:
     """Whether bearings run one way, within a turn; looked at once for all scans that share the array."""
-    if bearing is state.bearing_rad or len(bearing) < 2:
+    if bearing is matching.bearing_rad or len(bearing) < 2:
         return True
     steps = np.diff(bearing) if np.isfinite(bearing).all() else np.zeros(1)
     one_way = bool((steps > 0.0).all() or (steps < 0.0).all())
     first, last = float(bearing[0]), float(bearing[-1])
     if not one_way or max(abs(first), abs(last), abs(last - first)) > FULL_TURN:
         return False
-    state.bearing_rad = bearing
+    matching.bearing_rad = bearing
     return True
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from daemon.maps.autosave import About, Keeper
 from daemon.maps.store import Start, Store
-from estimator.mapping.map_snapshot import restored
 from estimator.state import State
+from estimator.stored_map import restored
 from tests.daemon.mapmaker import Shape, image
 
 
@@ -49,8 +49,8 @@ class Bench:
 
     def drive(self) -> None:
         assert self.state is not None
-        self.state.next_key += 1
-        self.state.atlas.adrift = None
+        self.state.map.next_key += 1
+        self.state.map.parts.detached = None
 
     @property
     def files(self) -> int:

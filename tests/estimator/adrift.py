@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimator.mapping.keyframe import Settled, Submap, keep
-from estimator.mapping.submap import SIZE, settle
-from estimator.mapping.submap_graph import Atlas
+from estimator.mapping.keyframe import SIZE, Settled, Submap, keep, settle
+from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import UNLIMITED, Answer, Array, Beam, Command, Job, Odometry, Record
 from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state, step
@@ -73,14 +72,14 @@ def mapped(scene: Scene, corners: Corners, seed: int = 0) -> list[tuple[Array, S
 def stored(submaps: list[tuple[Array, Settled]], settings: Settings | None = None) -> State:
     """A state that has just been switched on with this map, and believes to be somewhere else."""
     state = new_state(settings)
-    atlas: Atlas = state.atlas
+    atlas: SubmapGraph = state.map.graph
     for key, (T, settled) in enumerate(submaps, 1):
         atlas.submaps[key] = Submap(key, key, T.copy(), T.copy(), -1000.0, settled)
         if key > 1:
             atlas.constraints.add(key - 1, key, se2.between(submaps[key - 2][0], T), SMALL, False)
-    atlas.adrift, atlas.since, state.next_key = len(submaps) + 1, 1000, 1000
-    atlas.kept, atlas.held = 1000, state.settings.localise
-    state.T_map_odom = np.array((40.0, -7.0, 1.0))
+    atlas.parts.detached, atlas.parts.detached_since, state.map.next_key = len(submaps) + 1, 1000, 1000
+    atlas.parts.session_start, atlas.parts.fixed = 1000, state.settings.localise
+    state.pose.T_map_odom = np.array((40.0, -7.0, 1.0))
     return state
 
 
@@ -141,5 +140,5 @@ class Robot:
     def off(self) -> tuple[float, float]:
         """Error of the pose: metres, radians."""
         assert self.T is not None
-        x, y, yaw = se2.between(self.T, se2.compose(self.state.T_map_odom, self.state.fused.T_odom_base)).tolist()
+        x, y, yaw = se2.between(self.T, se2.compose(self.state.pose.T_map_odom, self.state.motion.T_odom_base)).tolist()
         return float(np.hypot(x, y)), abs(yaw)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.mapping.keyframe import keep
-from estimator.mapping.loop_closure import keyframe_laid, take_answer
+from estimator.mapping.loop_closure import add_keyframe, take_answer
 from estimator.mapping.loop_verification import LoopSettings
 from estimator.measurements import Answer, Array, Job
 from estimator.numerics import se2
@@ -40,19 +40,19 @@ def drifted(truth: Array, scale: float, turn: float) -> Array:
 def run_jobs(state: State) -> list[Job]:
     """Every job at once, and what its answer asks for; returns them."""
     done = []
-    while jobs := state.atlas.take_jobs():
+    while jobs := state.jobs.take():
         for job in jobs:
-            take_answer(state, Answer(0.0, job.job_id, job.run()))
+            take_answer(state.map, state.pose, state.motion, Answer(0.0, job.job_id, job.run()))
             done.append(job)
     return done
 
 
 def lay(state: State, T_odom: Array, T_true: Array, rng: np.random.Generator, key: int, anew: bool = False) -> None:
     scan = scan_in(paper_room(), T_true, HALF, rng)
-    state.fused.T_odom_base = state.T_odom_anchor = T_odom
-    frame = keep(key, se2.compose(state.T_map_odom, T_odom), T_odom, scan, 0.0)
-    keyframe_laid(state, frame, SMALL, 0.01, anew)
-    state.keyframes[key] = frame
+    state.motion.T_odom_base = state.pose.T_odom_anchor = T_odom
+    frame = keep(key, se2.compose(state.pose.T_map_odom, T_odom), T_odom, scan, 0.0)
+    add_keyframe(state.map, state.pose, frame, (SMALL, 0.01, anew))
+    state.map.keyframes[key] = frame
 
 
 def driven(
@@ -65,10 +65,10 @@ def driven(
     state, truth = new_state(), circuit(laps=laps)
     state.settings = replace(state.settings, loops=settings)
     rng = np.random.default_rng(2)
-    state.fused.T_odom_base = state.T_map_start = truth[0]
+    state.motion.T_odom_base = state.map.T_map_start = truth[0]
     for key, (T_odom, T_true) in enumerate(zip(drifted(truth, 1.004, turn), truth, strict=True), 1):
         lay(state, T_odom, T_true, rng, key)
         run_jobs(state)
         if news is not None:
-            news.append(state.atlas.take_news())
+            news.append(state.map.graph.take_news())
     return state, truth

@@ -95,6 +95,6 @@ def together(*streams: Iterable[Record]) -> Iterator[Record]:
 def lights_at(T: Array, accepted: frozenset[int], state: State) -> LightsResult:
     """Sure of a place, by these lamps."""
     P = np.diag((0.05**2, 0.05**2, 0.02**2))
-    now = state.fused.t_mono
+    now = state.motion.t_mono
     nothing = np.zeros((3, 3))
     return LightsResult(now, Fix.GOOD, T, P, (), accepted, nothing, np.zeros(3), t_pose=now)

@@ -85,14 +85,14 @@ def settled(matcher: Matcher, scans: int = 12) -> tuple[State, Array]:
             records.append(Odometry(0.05 * (k - 1), 0.05 * k, se2.between(truth[k - 1], T)))
         step(state, records, UNLIMITED)
     for _ in range(10):
-        t = state.fused.t_mono + 0.05
+        t = state.motion.t_mono + 0.05
         stand(state, t, scan_at(truth[-1], t, 49, noise))
     return state, truth[-1]
 
 
 def stand(state: State, t: float, scan: Scan | None) -> StepResult:
     """Wheels that say that the robot stands, and a scan."""
-    wheels = Odometry(state.fused.t_odometry, t, STILL)
+    wheels = Odometry(state.motion.t_odometry, t, STILL)
     return step(state, [wheels] if scan is None else [wheels, scan], UNLIMITED)
 
 
@@ -108,7 +108,7 @@ def honest(result: StepResult, truth: Array) -> bool:
 @pytest.mark.parametrize("name", MALFORMED)
 def test_what_is_no_scan_is_refused(name: str) -> None:
     state, T = settled(Matcher.LINE, 4)
-    before = state.fused.T_odom_base
+    before = state.motion.T_odom_base
     scan = MALFORMED[name](scan_at(T, 0.7, 50))
     result = stand(state, 0.7, scan)
     assert result.match is not None
@@ -135,7 +135,7 @@ def test_a_robot_that_is_switched_on_with_it_waits_for_a_scan(name: str) -> None
 @pytest.mark.parametrize("matcher", Matcher)
 def test_scans_without_points_say_so(matcher: Matcher) -> None:
     state, T = settled(matcher)
-    t, before = 1.2, state.fused.T_odom_base
+    t, before = 1.2, state.motion.T_odom_base
     for k, change in enumerate(WITHOUT_POINTS.values()):
         result = stand(state, t + 0.05 * k, change(scan_at(T, t + 0.05 * k, 50 + k)))
         assert result.match is not None

@@ -34,11 +34,11 @@ def test_no_keyframe_and_no_job_comes_of_a_step_without_map_work(rung: Rung) -> 
     state = new_state()
     for k in range(20):
         at(state, k, UNLIMITED)
-    before, map_before = len(state.keyframes), state.local
+    before, map_before = len(state.map.keyframes), state.matching.local_map
     left_out = [at(state, k, replace(UNLIMITED, rung=rung)) for k in range(20, 80)]
     assert all(result.keyframe < 0 and not result.jobs for result in left_out)
-    assert len(state.keyframes) == before
-    assert state.local is map_before
+    assert len(state.map.keyframes) == before
+    assert state.matching.local_map is map_before
     assert any(at(state, k, UNLIMITED).keyframe >= 0 for k in range(80, 100))
 
 

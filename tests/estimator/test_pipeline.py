@@ -105,7 +105,7 @@ def bad(kind: str) -> Scan:
 @pytest.mark.parametrize("fresh", [True, False])
 def test_bad_scans_say_why_and_move_nothing(kind: str, fresh: bool) -> None:
     state, truth = (new_state(Settings()), np.zeros(3)) if fresh else driven(30)
-    before = state.fused.T_odom_base.copy()
+    before = state.motion.T_odom_base.copy()
     records: list[Record] = [bad(kind)]
     if not fresh:
         records.insert(0, Odometry(1.45, 16.0, np.zeros(3)))
@@ -125,7 +125,7 @@ def test_bad_scans_say_why_and_move_nothing(kind: str, fresh: bool) -> None:
 
 def test_set_pose_moves_the_map_and_counts_a_jump() -> None:
     state, _ = driven(60)
-    before = state.fused.T_odom_base.copy()
+    before = state.motion.T_odom_base.copy()
     wanted = np.array((10.0, -3.0, 1.0))
     result = step(state, [Command(3.1, Order.SET_POSE, wanted)], UNLIMITED)
     np.testing.assert_allclose(se2.compose(result.T_map_odom, result.T_odom_base), wanted, atol=1e-9)

@@ -23,7 +23,8 @@ from daemon.maps.image import meta_of, packed
 from daemon.maps.schema import digest_of, read
 from daemon.maps.store import Start
 from daemon.snapshot import Snapshot, State
-from estimator.mapping.map_snapshot import Identity, image_of
+from estimator.mapping.map_snapshot import Identity
+from estimator.stored_map import image_of
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit

@@ -163,7 +163,7 @@ def without_light(watch: Callable[..., None]) -> Callable[..., None]:
     """Keep from the graph what light says of submaps."""
 
     def seen(state: State, result: StepResult, done: list[tuple[Any, Any]]) -> None:
-        for submap in state.atlas.submaps.values():
+        for submap in state.map.graph.submaps.values():
             submap.light = None
         watch(state, result, done)
 

@@ -91,7 +91,7 @@ async def _run(seconds: int, seed: int, say: Callable[[str], None]) -> Days:
         finally:
             await sender.close()
             await modbus.close()
-    kept = len(state.keyframes), len(state.atlas.submaps), len(state.atlas.constraints.loop)
+    kept = len(state.map.keyframes), len(state.map.graph.submaps), len(state.map.graph.constraints.loop)
     return Days(watch, tracking, float(np.median(errors)), kept)
 
 

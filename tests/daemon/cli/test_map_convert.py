@@ -22,10 +22,11 @@ from daemon.maps.edit import LONGEST_NAME, fitted, opened
 from daemon.maps.image import image_from, meta_of, packed
 from daemon.maps.store import Store
 from estimator.mapping.keyframe import Keyframe
-from estimator.mapping.map_snapshot import Identity, MapImage, image_of
+from estimator.mapping.map_snapshot import Identity, MapImage
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import Array, Beam
 from estimator.numerics import se2
+from estimator.stored_map import image_of
 from tests.daemon.mapmaker import Shape, content, image
 from tests.estimator.circuit import driven
 

@@ -179,9 +179,9 @@ def test_a_save_that_cannot_begin_is_told_and_tried_again(
         with monkeypatch.context() as without:
             without.setattr(*((threading.Thread, "start") if str(failure) else (bench.keeper, "_image")), fail)
             bench.drive()
-            bench.state.keyframes[0] = None  # type: ignore[assignment]  # there is something of a map
+            bench.state.map.keyframes[0] = None  # type: ignore[assignment]  # there is something of a map
             bench.keeper.ask(bench.told.append)
-            bench.state.keyframes.clear()
+            bench.state.map.keyframes.clear()
         assert len(bench.told) == 1
         assert repr(failure) in bench.told[0]
         assert repr(failure) in bench.keeper.error
@@ -234,7 +234,7 @@ def test_a_map_just_loaded_is_not_saved_until_the_robot_knows_its_place_in_it(tm
         bench = Bench(tmp_path, start=Start(content(), read(content())))
         bench.keeper.loaded()
         assert bench.state is not None
-        bench.state.next_key += 9
+        bench.state.map.next_key += 9
         await bench.turn(EVERY_S)
         await bench.keeper.finish()
         assert bench.files == 0

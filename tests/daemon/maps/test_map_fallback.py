@@ -14,7 +14,9 @@ from daemon.maps.autosave import ADRIFT, EVERY_S, FIRST_S
 from daemon.maps.map_fallback import another, let_go
 from daemon.maps.schema import read
 from daemon.maps.store import Start, Store
+from estimator.mapping.map_parts import Trial
 from estimator.relocalisation import unaligned_map
+from estimator.relocalisation.hypothesis_tracking import Seek
 from estimator.result import Loop, LoopReason, StepResult
 from tests.daemon.keeping import Bench
 from tests.daemon.mapmaker import Shape, content
@@ -58,7 +60,7 @@ def test_a_map_that_was_let_go_of_is_followed_by_one_of_another_identity() -> No
     assert ids[-1] == another(ids[0], step.result.t_mono) != another(ids[0], step.result.t_mono + 10.0)
 
 
-def test_a_map_put_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its_own(tmp_path: Path) -> None:
+def test_a_map_set_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its_own(tmp_path: Path) -> None:
     async def run() -> None:
         store = Store(tmp_path)
         stored = content(Shape(map_id=0x77))
@@ -67,17 +69,17 @@ def test_a_map_put_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its
         bench = Bench(tmp_path, start=Start(stored, read(stored)))
         state = bench.state
         assert state is not None
-        first = max(state.atlas.submaps)
-        state.atlas.adrift, since = first, state.atlas.submaps[first].first
+        first = max(state.map.graph.submaps)
+        state.map.parts.detached, since = first, state.map.graph.submaps[first].first
         bench.keeper.loaded()
-        unaligned_map.put_aside(state, first, since, 0.0)
-        state.next_key += 30
+        unaligned_map.set_aside(state, Trial(first=first, since=since), 0.0, Seek())
+        state.map.next_key += 30
         await bench.turn(FIRST_S)
         await bench.turn(2.0 * EVERY_S)
         assert bench.keeper.saves == 0
         bench.keeper.ask(bench.told.append)
         assert bench.told == [ADRIFT]
-        state.atlas.aside, bench.map_id = None, 0x78
+        state.map.parts.aside, bench.map_id = None, 0x78
         await bench.turn(1.0)
         assert bench.keeper.saves == 1
         assert old.read_bytes() == stored

@@ -400,4 +400,4 @@ def test_a_map_to_be_used_as_it_is_is_known_as_such_to_the_estimator(tmp_path: P
         assert start is not None
         state = new_state(None, start=start)
         assert state.settings.localise is localise
-        assert len(state.atlas.submaps) == 4
+        assert len(state.map.graph.submaps) == 4

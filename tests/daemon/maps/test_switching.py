@@ -27,8 +27,9 @@ from daemon.recording.recorder import Recorder
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
-from estimator.mapping.map_snapshot import MapImage, restored
+from estimator.mapping.map_snapshot import MapImage
 from estimator.numerics import se2
+from estimator.stored_map import restored
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
@@ -341,8 +342,9 @@ class _Later:
 
 def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> None:
     """Else it would be saved at once, without its name and without what a person has surveyed of it."""
-    atlas = SimpleNamespace(unproved=None, closures=3)
-    state: Any = SimpleNamespace(atlas=atlas, next_key=9, light=None, keyframes={1: None})
+    parts, graph = SimpleNamespace(unproved=None, detached=None), SimpleNamespace(closures=3)
+    held = SimpleNamespace(graph=graph, parts=parts, next_key=9, keyframes={1: None})
+    state: Any = SimpleNamespace(map=held, light=None)
     used, start = [1], SimpleNamespace()
     saved: list[object] = []
 

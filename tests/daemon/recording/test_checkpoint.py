@@ -8,11 +8,11 @@ import pytest
 
 from daemon.recording.checkpoint import take
 from daemon.recording.restore import restore
-from estimator.mapping.map_snapshot import restored
 from estimator.measurements import UNLIMITED, LightEpoch, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import step
 from estimator.state import State
+from estimator.stored_map import restored
 from tests.daemon.mapmaker import Shape, image
 from tests.estimator.lit import lit_state, scans, together
 from tools.sim.light.link_drive import room_run
@@ -29,13 +29,15 @@ def test_what_is_pickled_at_once_does_not_grow_with_the_submaps() -> None:
 
 def test_submaps_are_those_that_were_there_when_it_was_taken() -> None:
     before = state(5)
-    keys, places = list(before.atlas.submaps), [submap.place() for submap in before.atlas.submaps.values()]
-    taken = take(before, {"one": before.atlas.submaps[keys[2]]})
-    del before.atlas.submaps[keys[0]]
+    keys, places = list(before.map.graph.submaps), [submap.place() for submap in before.map.graph.submaps.values()]
+    taken = take(before, {"one": before.map.graph.submaps[keys[2]]})
+    del before.map.graph.submaps[keys[0]]
     after, rest = restore(taken.pieces())
-    assert list(after.atlas.submaps) == keys
-    assert rest["one"] is after.atlas.submaps[keys[2]]
-    assert all((one.place() == place).all() for one, place in zip(after.atlas.submaps.values(), places, strict=True))
+    assert list(after.map.graph.submaps) == keys
+    assert rest["one"] is after.map.graph.submaps[keys[2]]
+    assert all(
+        (one.place() == place).all() for one, place in zip(after.map.graph.submaps.values(), places, strict=True)
+    )
 
 
 @pytest.mark.jit
@@ -52,7 +54,7 @@ def test_a_drive_in_which_the_laser_tells_light_the_way_goes_on_from_any_moment(
         if count % 37 == 36:
             then, _ = restore(take(first, {}).pieces())
             assert first.light is not None
-            guided += first.light.told
+            guided += first.light.has_motion
         if isinstance(record, Scan) and 6.0 < record.t_end < 6.3:  # somebody stands before it, all at once
             record = pending[-1] = replace(record, range_m=record.range_m.clip(max=1.5))
         one = step(first, pending, UNLIMITED)

@@ -15,8 +15,9 @@ from daemon.maps.image import meta_of, packed
 from daemon.maps.store import START, Start, Store, started
 from daemon.replay.sources import open_log
 from daemon.snapshot import State
-from estimator.mapping.map_snapshot import Identity, image_of
+from estimator.mapping.map_snapshot import Identity
 from estimator.numerics import se2
+from estimator.stored_map import image_of
 from tests.daemon.replay.test_recorded_run import Bench, assert_the_same, calm, record, replay
 
 MAP = 0xABC

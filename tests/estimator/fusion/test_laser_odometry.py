@@ -243,8 +243,8 @@ def test_the_way_is_told_where_every_axis_holds(monkeypatch: pytest.MonkeyPatch)
         (scanned(), 2.0, 2.95, 6, 5),
     ]
     for match, t, x, moves, alone in steps:
-        state.fused.t_mono, state.fused.T_odom_base = t, np.array((x, 0.0, 0.3))
-        laser_odometry.guide(state, match)
+        state.motion.t_mono, state.motion.T_odom_base = t, np.array((x, 0.0, 0.3))
+        laser_odometry.guide(state.light, state.motion, match)
         assert (len(told.moves), told.alone) == (moves, alone), t
     assert (told.moves[1].t_begin, told.moves[1].t_end) == (0.4, 0.5)
     assert told.moves[1].delta.tolist() == pytest.approx([0.05 * math.cos(0.3), -0.05 * math.sin(0.3), 0.0])
@@ -256,13 +256,13 @@ def test_the_noise_of_matches_is_no_way(speed: float, spin: float) -> None:
     """Forty times a second it would be one on which strengths seem to say something new of the heading."""
     state = lit_state(room_run(seed=1, people=0))
     assert state.light is not None
-    rng, moving = np.random.default_rng(1), state.fused
+    rng, moving = np.random.default_rng(1), state.motion
     for k in range(400):
         t = 0.025 * k
         moving.T_odom_base = np.array((speed * t, 0.0, se2.wrap(spin * t))) + rng.normal(0.0, 0.0015, 3)
         moving.velocity = np.array((speed, 0.0, spin)) + rng.normal(0.0, 0.02, 3)  # as the fused filter has it
         moving.t_mono = t
-        laser_odometry.guide(state, scanned())
+        laser_odometry.guide(state.light, state.motion, scanned())
     course = state.light.filter.course
     assert course.way == pytest.approx(speed * 10.0, rel=0.05, abs=0.1)
     assert np.abs(course.velocity - (speed, 0.0, spin)).max() < 0.1, "a correction by a match is no speed"
@@ -270,11 +270,11 @@ def test_the_noise_of_matches_is_no_way(speed: float, spin: float) -> None:
 
 def test_while_wheels_tell_the_way_the_laser_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     told, state = Told(monkeypatch), lit_state(room_run(seed=1, people=0))
-    state.fused.t_odometry = 0.0
+    state.motion.t_odometry = 0.0
     for k in range(100):
-        state.fused.t_mono = 0.1 * k
-        state.fused.T_odom_base = np.array((0.01 * k, 0.0, 0.0))
-        laser_odometry.guide(state, scanned())
+        state.motion.t_mono = 0.1 * k
+        state.motion.T_odom_base = np.array((0.01 * k, 0.0, 0.0))
+        laser_odometry.guide(state.light, state.motion, scanned())
         assert bool(told.moves) is (k > 10.0 * laser_odometry.WHEELS_GONE_S), "these are gone"
     assert not told.alone
 
@@ -292,8 +292,8 @@ def test_without_wheels_the_pose_is_known_as_soon_as_with_them() -> None:
         state = lit_state(run)
         logs.append(play(state, records, run.truth))
         assert state.light is not None
-        assert state.light.told
-        assert not state.fused.odometry
+        assert state.light.has_motion
+        assert not state.motion.odometry
         known = next(r.t_mono for r in logs[-1].results if r.placed and r.covariance[2, 2] < 0.04**2)
         assert known < 16.0, "rad, where TRACKING begins"
     for begin, metres, degrees in ((8.0, 0.25, 2.0), (12.0, 0.15, 1.5)):

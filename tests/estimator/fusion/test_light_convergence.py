@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.fusion import map_odom_filter
+from estimator.fusion import light_witness, map_odom_filter
 from estimator.fusion.heading_stability import SWING_RAD
 from estimator.fusion.map_odom_filter import APART
 from estimator.measurements import Array, Command, Order
 from estimator.numerics import se2
+from estimator.pipeline import fuse_light
 from estimator.result import SURPRISE, Fix, LightsResult
 from estimator.state import State
 from tests.estimator.lit import lights_at, lit_state, play, scans, together
@@ -31,40 +32,40 @@ def driven() -> State:
 
 def epoch_of(state: State, off: Array, fix: Fix = Fix.GOOD) -> LightsResult:
     """The next epoch, which finds the robot by so much beside the pose, its heading to 5 deg, and adds nothing."""
-    assert state.absolute is not None
-    here = se2.compose(state.T_map_odom, state.fused.T_odom_base) + off
+    assert state.pose.alignment is not None
+    here = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base) + off
     P = np.diag((0.05**2, 0.05**2, 0.09**2))
     return replace(lights_at(here, frozenset((1, 4, 13, 16)), state), fix=fix, covariance=P)
 
 
 def test_pose_and_light_are_apart_where_they_agree_no_better_than_by_chance(driven: State) -> None:
     state = copy.deepcopy(driven)
-    tie = state.absolute
+    tie = state.pose.alignment
     assert tie is not None
     assert not tie.apart, "after a whole drive in good light"
-    map_odom_filter.on_lights(state, epoch_of(state, np.array((0.0, 0.2, 0.0))))
+    fuse_light(state, epoch_of(state, np.array((0.0, 0.2, 0.0))))
     assert tie.gap is not None
     assert APART < tie.gap < SURPRISE
     assert tie.apart
-    map_odom_filter.on_lights(state, epoch_of(state, np.zeros(3), Fix.HELD))
+    fuse_light(state, epoch_of(state, np.zeros(3), Fix.HELD))
     assert tie.gap is None
     assert tie.apart, "what light said last counts while it says nothing"
-    map_odom_filter.on_lights(state, epoch_of(state, np.zeros(3)))
+    fuse_light(state, epoch_of(state, np.zeros(3)))
     assert not tie.apart
 
 
 def test_pose_and_light_are_apart_while_light_swings_and_that_ends_with_an_order(driven: State) -> None:
     state = copy.deepcopy(driven)
-    tie = state.absolute
+    tie = state.pose.alignment
     assert tie is not None
     assert state.light is not None
     for turn in (0.0, SWING_RAD + 0.01, 0.0):
-        map_odom_filter.on_lights(state, epoch_of(state, np.array((0.0, 0.0, turn))))
+        fuse_light(state, epoch_of(state, np.array((0.0, 0.0, turn))))
     assert tie.apart
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    map_odom_filter.on_order(state, Command(state.fused.t_mono, Order.SET_POSE, T))
+    T = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
+    map_odom_filter.on_order(state.pose, state.motion, state.light, Command(state.motion.t_mono, Order.SET_POSE, T))
     assert not tie.apart
-    map_odom_filter.on_lights(state, epoch_of(state, np.zeros(3)))
+    fuse_light(state, epoch_of(state, np.zeros(3)))
     assert not tie.apart
 
 
@@ -72,22 +73,22 @@ def test_a_pose_that_the_map_has_told_may_be_as_far_from_light_as_chance_will_ha
     driven: State,
 ) -> None:
     state = copy.deepcopy(driven)
-    tie = state.absolute
+    tie = state.pose.alignment
     assert tie is not None
-    map_odom_filter.told_anew(tie, by_map=True)
-    map_odom_filter.on_lights(state, epoch_of(state, np.array((0.0, 0.2, 0.0))))
+    map_odom_filter.place_given(tie, by_map=True)
+    fuse_light(state, epoch_of(state, np.array((0.0, 0.2, 0.0))))
     assert not tie.apart
-    map_odom_filter.on_lights(state, epoch_of(state, np.array((0.0, 1.0, 0.0))))
+    fuse_light(state, epoch_of(state, np.array((0.0, 1.0, 0.0))))
     assert tie.apart, "no chance"
 
 
 def test_a_heading_from_light_that_is_not_used_swings_in_vain(driven: State) -> None:
     state = copy.deepcopy(driven)
-    tie = state.absolute
+    tie = state.pose.alignment
     assert tie is not None
     assert state.light is not None
     state.light.filter.course.wheels = False
-    assert map_odom_filter.holds_heading(state)
+    assert light_witness.holds_heading(state.pose, state.motion, state.light)
     for turn in (0.0, SWING_RAD + 0.01, 0.0):
-        map_odom_filter.on_lights(state, epoch_of(state, np.array((0.0, 0.0, turn))))
+        fuse_light(state, epoch_of(state, np.array((0.0, 0.0, turn))))
     assert not tie.apart

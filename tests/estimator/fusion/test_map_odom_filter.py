@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from daemon.integrity.evidence import VAGUE_RAD
-from estimator.fusion import map_odom_filter
+from estimator.fusion import light_witness
 from estimator.light_filter.collinear_lamps import doubt
 from estimator.measurements import UNLIMITED, Array, Command, LightEpoch, Odometry, Order, Record, Scan
 from estimator.numerics import se2
-from estimator.pipeline import State, keyframe_poses, step
+from estimator.pipeline import State, fuse_light, keyframe_poses, step
 from estimator.result import SURPRISE, Fix
 from tests.estimator.lit import Log, Truth, lights_at, lit_state, play, scans, together
 from tools.sim.building.buildings import building
@@ -122,7 +122,7 @@ def test_what_was_laid_before_the_place_was_known_comes_along() -> None:
     error = start - run.truth(np.zeros(1))[0]
     assert np.hypot(*error[:2]) < 0.3
     assert abs(se2.wrap(error[2])) < np.radians(6.0)
-    kept = next(reversed(state.keyframes.values())).virtual
+    kept = next(reversed(state.map.keyframes.values())).virtual
     assert kept is not None
     assert kept.accepted
 
@@ -172,11 +172,11 @@ def test_carried_to_where_the_room_looks_the_same() -> None:
 def contradict(state: State, fix: Fix) -> float:
     """Two seconds of light from two metres aside, sure or still looking; by how much the map moves, m."""
     assert state.light is not None
-    told, before = state.light.result, state.T_map_odom.copy()
+    told, before = state.light.result, state.pose.T_map_odom.copy()
     aside = replace(told, fix=fix, T_map_base=told.T_map_base + np.array((2.0, 0.0, 0.0)))
     for k in range(40):
-        map_odom_filter.on_lights(state, replace(aside, t_mono=told.t_mono + 0.05 * k))
-    return float(np.hypot(*(state.T_map_odom - before)[:2]))
+        fuse_light(state, replace(aside, t_mono=told.t_mono + 0.05 * k))
+    return float(np.hypot(*(state.pose.T_map_odom - before)[:2]))
 
 
 def test_light_that_is_still_looking_does_not_move_a_proved_pose_unless_the_laser_is_blind() -> None:
@@ -198,16 +198,16 @@ def test_a_heading_that_has_become_vague_makes_light_no_younger(driven: tuple[St
     assert state.light is not None
     told, lights = state.light.result, state.light.filter
     turned = replace(told, fix=Fix.STARTING, covariance=np.diag((0.1**2, 0.1**2, 1.0)))
-    assert not map_odom_filter.begun_anew(state, told)
-    assert not map_odom_filter.begun_anew(state, replace(told, fix=Fix.HELD))
-    assert not map_odom_filter.begun_anew(state, turned)
-    assert map_odom_filter.begun_anew(state, replace(turned, covariance=np.diag((0.4**2, 0.1**2, 1.0))))
+    assert not light_witness.restarting(state.light, told)
+    assert not light_witness.restarting(state.light, replace(told, fix=Fix.HELD))
+    assert not light_witness.restarting(state.light, turned)
+    assert light_witness.restarting(state.light, replace(turned, covariance=np.diag((0.4**2, 0.1**2, 1.0))))
     for fix in (Fix.NONE, Fix.AMBIGUOUS, Fix.LOST):
-        assert map_odom_filter.begun_anew(state, replace(told, fix=fix))
+        assert light_witness.restarting(state.light, replace(told, fix=fix))
     lights.lost = True
-    assert map_odom_filter.begun_anew(state, turned)
+    assert light_witness.restarting(state.light, turned)
     lights.lost, lights.tracks = False, [*lights.tracks, *lights.tracks]
-    assert map_odom_filter.begun_anew(state, turned)
+    assert light_witness.restarting(state.light, turned)
 
 
 def test_a_first_start_that_was_wrong_is_mended_while_light_still_looks() -> None:
@@ -215,9 +215,9 @@ def test_a_first_start_that_was_wrong_is_mended_while_light_still_looks() -> Non
     state = lit_state(run)
     log = play(state, everything(run), run.truth)
     assert Fix.GOOD not in log.fixes(0.0)
-    assert state.absolute is not None
-    assert state.absolute.placed
-    state.absolute.P = np.diag((0.1, 0.1, 0.05)) ** 2
+    assert state.pose.alignment is not None
+    assert state.pose.alignment.placed
+    state.pose.alignment.P = np.diag((0.1, 0.1, 0.05)) ** 2
     state.light.result = replace(state.light.result, covariance=np.diag((0.1, 0.1, 0.05)) ** 2)  # type: ignore[union-attr]  # it is lit
     assert contradict(state, Fix.STARTING) > 1.0
 
@@ -250,7 +250,7 @@ def test_light_and_odometry_alone_hold_the_pose_and_every_stretch_has_an_anchor(
     assert log.rmse(15.0)[0] < 0.2
     assert log.results[-1].anchor > 10
     assert np.hypot(*log.results[-1].T_anchor_base[:2]) < 0.6
-    assert state.keyframes == {}
+    assert state.map.keyframes == {}
 
 
 def test_an_order_places_the_map_and_light_takes_it_from_there() -> None:
@@ -297,10 +297,10 @@ def test_with_nobody_to_tell_the_way_light_says_nothing_of_a_keyframes_heading(d
     """It may have settled the wrong way round, and the submap's origin is found from here by that heading."""
     state = copy.deepcopy(driven[0])
     assert state.light is not None
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    state.fused.odometry = state.light.filter.course.wheels = False
+    T = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
+    state.motion.odometry = state.light.filter.course.wheels = False
     state.light.result = lights_at(T + np.array((0.02, -0.01, np.pi)), frozenset((1, 4, 13, 16)), state)
-    told = map_odom_filter.virtual(state)
+    told = light_witness.virtual(state.pose, state.motion, state.light)
     assert told is not None
     assert told.T_map_base == pytest.approx(T + np.array((0.02, -0.01, 0.0)), abs=1e-9)
     assert told.covariance[2, 2] > 3.0
@@ -322,16 +322,16 @@ def test_a_heading_from_light_is_followed_against_the_laser_only_if_light_has_lo
 ) -> None:
     state = copy.deepcopy(driven[0])
     assert state.light is not None
-    assert state.absolute is not None
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    assert state.pose.alignment is not None
+    T = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
     told = T + np.array((0.0, 0.0, 1.0))
     if anew:
         state.light.filter.way_start = state.light.filter.course.way
     for _ in range(30):
-        state.fused.t_mono += 0.05
-        state.absolute.t_match = state.fused.t_mono
-        map_odom_filter.on_lights(state, lights_at(told, frozenset((1, 4, 13, 16)), state))
-    now = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+        state.motion.t_mono += 0.05
+        state.pose.alignment.t_match = state.motion.t_mono
+        fuse_light(state, lights_at(told, frozenset((1, 4, 13, 16)), state))
+    now = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
     assert abs(se2.wrap(now[2] - T[2])) == pytest.approx(1.0 if followed else 0.0, abs=0.05)
 
 
@@ -351,17 +351,17 @@ def test_only_what_the_laser_could_have_lost_is_taken_from_light(
     driven: tuple[State, Log], off: tuple[float, float], broken: bool, lamps: tuple[int, ...], followed: bool
 ) -> None:
     state = copy.deepcopy(driven[0])
-    tie = state.absolute
+    tie = state.pose.alignment
     assert tie is not None
     assert tie.proved
     tie.broken = broken
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    T = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
     told = T + np.array((*off, 0.0))
     for _ in range(30):
-        state.fused.t_mono += 0.05
-        tie.t_match = state.fused.t_mono
-        map_odom_filter.on_lights(state, lights_at(told, frozenset(lamps), state))
-    now = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+        state.motion.t_mono += 0.05
+        tie.t_match = state.motion.t_mono
+        fuse_light(state, lights_at(told, frozenset(lamps), state))
+    now = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
     assert np.hypot(*(now - told)[:2]) < 0.05 if followed else np.hypot(*(now - T)[:2]) < 0.05
 
 
@@ -370,17 +370,17 @@ def test_one_lamp_beside_a_row_of_others_moves_nothing_until_it_has_been_there_f
 ) -> None:
     """What a row has led astray becomes sure with the first lamp beside it, and is as wrong as before."""
     state = copy.deepcopy(driven[0])
-    tie = state.absolute
+    tie = state.pose.alignment
     assert tie is not None
-    T = se2.compose(state.T_map_odom, state.fused.T_odom_base)
+    T = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
     told = T + np.array((1.2, 1.6, 0.0))
 
     def moved(lamps: tuple[int, ...], times: int) -> float:
         for _ in range(times):
-            state.fused.t_mono += 0.05
-            tie.t_match = state.fused.t_mono
-            map_odom_filter.on_lights(state, lights_at(told, frozenset(lamps), state))
-        return float(np.hypot(*(se2.compose(state.T_map_odom, state.fused.T_odom_base) - T)[:2]))
+            state.motion.t_mono += 0.05
+            tie.t_match = state.motion.t_mono
+            fuse_light(state, lights_at(told, frozenset(lamps), state))
+        return float(np.hypot(*(se2.compose(state.pose.T_map_odom, state.motion.T_odom_base) - T)[:2]))
 
     assert moved((1, 2, 3, 4), 30) < 0.05
     assert moved((1, 2, 3, 4, 13), 15) < 0.05

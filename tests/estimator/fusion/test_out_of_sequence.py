@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from estimator.fusion import map_odom_filter, motion_model, out_of_sequence
+from estimator.fusion.map_pose import SurveyAlignment
 from estimator.fusion.motion_history import KEPT_S, Trail, made
+from estimator.fusion.protection_level import on_wheels
 from estimator.measurements import UNLIMITED, Array, Odometry, Record
 from estimator.numerics import se2
 from estimator.numerics.symmetric3 import invert3
@@ -51,7 +53,7 @@ def test_late_scans_hold_the_pose_where_it_is_now(late: int) -> None:
     way = max(float(np.hypot(*se2.between(TRUTH[k - late], TRUTH[k])[:2])) for k in results)
     assert max(off(result, k) for k, result in results.items()) < 0.02 + 0.04 * way
     assert {result.t_mono for result in results.values()} == {PERIOD_S * k for k in results}, "the pose is of now"
-    assert state.anew == 0
+    assert state.matching.restarts == 0
     assert any(result.keyframe >= 0 for result in results.values()), "and the map goes on"
     for k, result in results.items():
         error = se2.between(TRUTH[k], result.T_odom_base)[:2]
@@ -72,7 +74,7 @@ def test_a_late_scan_is_worth_less_than_one_in_time() -> None:
         only_wheels(states[1], k)
     late = at(states[1], 66, 6)
     assert np.trace(late.covariance[:2, :2]) > np.trace(in_time.covariance[:2, :2])
-    assert np.linalg.eigvalsh(states[1].fused.P).min() > 0.0
+    assert np.linalg.eigvalsh(states[1].motion.P).min() > 0.0
 
 
 @pytest.mark.jit
@@ -83,27 +85,29 @@ def test_a_scan_older_than_what_is_remembered_is_not_matched() -> None:
     late = round((KEPT_S + 0.5) / PERIOD_S)
     for k in range(60, 60 + late):
         only_wheels(state, k)
-    before = state.fused.T_odom_base
+    before = state.motion.T_odom_base
     result = at(state, 60 + late, late)
     assert result.match is not None
     assert result.match.reason is Reason.LATE
     assert np.hypot(*se2.between(before, result.T_odom_base)[:2]) < 0.05, "and moves nothing"
-    assert state.failures == 0
+    assert state.matching.failures == 0
 
 
 def lit(state: State, follows: bool) -> None:
     """An epoch of light at the present pose: followed, or its information taken."""
-    T, P = state.fused.T_odom_base, np.diag((0.03**2, 0.03**2, 0.02**2))
+    T, P = state.motion.T_odom_base, np.diag((0.03**2, 0.03**2, 0.02**2))
     told = LightsResult(0.0, Fix.GOOD, T, P, (), frozenset(), 0.9 * invert3(P), np.zeros(3))
     if follows:
-        map_odom_filter.follow(state, told, T)
+        map_odom_filter.follow(state.pose, state.motion, told, T)
     else:
-        map_odom_filter.gain(state, told, T, np.zeros(3))
+        map_odom_filter.gain(
+            state.pose, state.motion, on_wheels(state.light), (told, T, np.zeros(3)), state.map.next_key
+        )
 
 
 def least(state: State) -> float:
     """Least eigenvalue of the correlation of both errors, the tie's and the pose's."""
-    tie, moving = state.absolute, state.fused
+    tie, moving = state.pose.alignment, state.motion
     assert tie is not None
     joint = np.block([[tie.P, tie.X], [tie.X.T, moving.P]])
     scale = np.sqrt(np.diag(joint))
@@ -117,15 +121,15 @@ def test_what_light_has_mended_is_not_taken_out_of_the_tie_for_a_late_scan(epoch
     Else a match of then would move the map against its own correction, and by many times that.
     """
     state = new_state()
-    moving, tie = state.fused, map_odom_filter.Absolute(placed=True, proved=True, t_match=0.0)
-    moving.t_mono, moving.P, state.absolute = 0.0, np.diag((0.01, 0.01, 0.003)) ** 2, tie
+    moving, tie = state.motion, SurveyAlignment(placed=True, proved=True, t_match=0.0)
+    moving.t_mono, moving.P, state.pose.alignment = 0.0, np.diag((0.01, 0.01, 0.003)) ** 2, tie
     tie.P, tie.X = np.diag((0.03, 0.03, 0.01)) ** 2 + moving.P, moving.P.copy()
     then: Array = np.zeros((3, 3))
     for k in range(20):
         before = moving.T_odom_base, moving.P, moving.t_mono
         delta = np.array((0.05, 0.0, 0.004))
         motion_model.on_odometry(moving, Odometry(PERIOD_S * k, PERIOD_S * (k + 1), delta), motion_model.MotionNoise())
-        map_odom_filter.on_motion(state, *before)
+        map_odom_filter.on_motion(state.pose, state.motion, *before)
         if k == 5:
             then = moving.P.copy()
         if k in epochs:
@@ -133,7 +137,7 @@ def test_what_light_has_mended_is_not_taken_out_of_the_tie_for_a_late_scan(epoch
     assert least(state) > 0.0
     now = tie.P.copy(), tie.X.copy(), moving.P.copy()
     scan = replace(scan_at(TRUTH[0], 0.0, 0, np.random.default_rng(0)), t_begin=5 * PERIOD_S, t_end=6 * PERIOD_S)
-    ahead = out_of_sequence.go_back(state, scan)
+    ahead = out_of_sequence.go_back(state.pose, moving, scan)
     assert ahead.known
     assert np.allclose(moving.P, then, rtol=1e-6, atol=1e-12)
     share = np.diag(tie.X @ np.linalg.inv(moving.P))
@@ -144,7 +148,7 @@ def test_what_light_has_mended_is_not_taken_out_of_the_tie_for_a_late_scan(epoch
     else:
         assert share == pytest.approx(np.ones(3), abs=1e-6)
     assert least(state) > 0.0
-    out_of_sequence.come_again(state, ahead)
+    out_of_sequence.come_again(state.pose, moving, ahead)
     for there, was in zip((tie.P, tie.X, moving.P), now, strict=True):
         assert np.allclose(there, was, rtol=1e-6, atol=1e-12)
 

@@ -13,9 +13,9 @@ import pytest
 from estimator.cdma.epoch import BlockFlag
 from estimator.fusion import protection_level
 from estimator.fusion.light_inflation import without_heading
-from estimator.fusion.map_odom_filter import Absolute, holds_heading
-from estimator.fusion.map_odom_history import FROZEN_M, Frozen
-from estimator.fusion.pose_update import covariance
+from estimator.fusion.light_witness import holds_heading
+from estimator.fusion.map_odom_history import SPACING_M, MapOdomHistory
+from estimator.fusion.map_pose import SurveyAlignment
 from estimator.fusion.protection_level import ALONE, FAULTY, K_FAULT, K_PLAIN, RISK, UNKNOWN_M, bound, spread
 from estimator.light_filter.light_channel import LightsSetup
 from estimator.light_filter.survey import Survey
@@ -38,12 +38,12 @@ def lights(T: Array, covariance: Array) -> LightsResult:
 def lit(light_at: tuple[float, float, float] = (0.0, 0.0, 0.0), wheels: bool = True) -> State:
     """A robot at the origin that light has placed and the laser holds."""
     state = new_state(lights=LightsSetup(Survey()))
-    tie = cast(Absolute, state.absolute)
+    tie = cast(SurveyAlignment, state.pose.alignment)
     tie.placed = tie.proved = True
     tie.P, tie.way = P.copy(), 100.0
-    state.fused.t_mono = state.t_match = tie.t_match = 1.0
-    state.fused.odometry = wheels
-    state.local = cast(Any, SimpleNamespace())
+    state.motion.t_mono = state.matching.t_match = tie.t_match = 1.0
+    state.motion.odometry = wheels
+    state.matching.local_map = cast(Any, SimpleNamespace())
     assert state.light is not None
     state.light.filter.course.wheels = wheels
     state.light.result = lights(np.array(light_at), P)
@@ -52,7 +52,13 @@ def lit(light_at: tuple[float, float, float] = (0.0, 0.0, 0.0), wheels: bool = T
 
 def held_by(state: State) -> Protection | None:
     """The bound as a step asks for it."""
-    return bound(state, covariance(state))
+    return bound(
+        state.pose,
+        state.motion,
+        state.light,
+        state.matching,
+        state.pose.covariance(state.motion.T_odom_base, state.motion.P),
+    )
 
 
 def test_the_quantiles_are_those_of_the_stated_risk() -> None:
@@ -74,7 +80,7 @@ def test_a_hundred_thousand_gaussian_errors_are_within_it() -> None:
 def test_light_whose_lamps_are_bent_or_in_a_row_bounds_it_less_at_a_start() -> None:
     def level(bent: float, in_row: bool) -> float:
         state = lit()
-        tie = cast(Absolute, state.absolute)
+        tie = cast(SurveyAlignment, state.pose.alignment)
         tie.way_young = tie.way
         tie.row.left = np.diag((1.0, 1.0, 0.2**2)) * float(in_row)
         assert state.light is not None
@@ -113,14 +119,14 @@ def test_without_wheels_light_says_nothing_against_the_heading() -> None:
 def test_a_pose_that_light_has_drawn_away_from_the_laser_is_bounded_by_both() -> None:
     state = lit()
     held_by(state)
-    state.way += FROZEN_M + 1.0
-    state.T_map_odom = np.array((0.8, 0.0, 0.0))
+    state.matching.steps += SPACING_M + 1.0
+    state.pose.T_map_odom = np.array((0.8, 0.0, 0.0))
     assert state.light is not None
     state.light.result = lights(np.array((0.8, 0.0, 0.0)), P)
     held = held_by(state)
     assert held is not None
     assert held.horizontal_m > 0.8, "light may have gone wrong: the laser alone would be 0.8 m away"
-    state.frozen.forget()
+    state.pose.history.forget()
     again = held_by(state)
     assert again is not None
     assert again.horizontal_m < 0.5
@@ -130,7 +136,7 @@ def test_one_witness_alone_bounds_less() -> None:
     state = lit()
     assert state.light is not None
     both = held_by(state)
-    state.t_match = -math.inf
+    state.matching.t_match = -math.inf
     dark = held_by(state)
     assert both is not None
     assert dark is not None
@@ -140,25 +146,29 @@ def test_one_witness_alone_bounds_less() -> None:
 
 def test_a_pose_that_may_be_anywhere_has_no_bound() -> None:
     state = lit()
-    cast(Absolute, state.absolute).P = np.diag((100.0, 100.0, 9.0))
+    cast(SurveyAlignment, state.pose.alignment).P = np.diag((100.0, 100.0, 9.0))
     assert held_by(state) is None
 
 
 def test_ties_are_kept_for_one_to_two_stretches() -> None:
-    frozen = Frozen()
+    frozen = MapOdomHistory()
     for way in np.arange(0.0, 100.0, 0.5):
         frozen.take(np.zeros(3), P, float(way))
         assert len(frozen.kept) <= 2
-        assert way - frozen.kept[0][2] <= 2.0 * FROZEN_M
-        assert way < FROZEN_M or way - frozen.kept[0][2] >= FROZEN_M
+        assert way - frozen.kept[0][2] <= 2.0 * SPACING_M
+        assert way < SPACING_M or way - frozen.kept[0][2] >= SPACING_M
+
+
+def heading_held(state: State) -> bool:
+    return holds_heading(state.pose, state.motion, state.light)
 
 
 def test_the_laser_holds_a_heading_only_where_no_wheels_do() -> None:
-    assert holds_heading(lit(wheels=False))
-    assert not holds_heading(lit(wheels=True))
+    assert heading_held(lit(wheels=False))
+    assert not heading_held(lit(wheels=True))
     lost = lit(wheels=False)
-    cast(Absolute, lost.absolute).broken = True
-    assert not holds_heading(lost)
+    cast(SurveyAlignment, lost.pose.alignment).broken = True
+    assert not holds_heading(lost.pose, lost.motion, lost.light)
 
 
 def test_light_without_its_heading_tells_the_position_as_before() -> None:

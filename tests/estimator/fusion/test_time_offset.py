@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimator.fusion import time_offset
-from estimator.fusion.time_offset import DEPTH, LAGS, TimeLag
+from estimator.fusion.time_offset import DEPTH, LAGS, TimeOffset
 from estimator.measurements import UNLIMITED, Array, Beam, Command, Odometry, Order, Scan
 from estimator.pipeline import Settings, new_state, step
 from estimator.result import Lag, MatchResult, Reason
@@ -59,7 +59,7 @@ def scan_of(t_end: float) -> Scan:
 
 
 class Drive:
-    """A robot that turns; what its wheels and its laser say of it goes into a `TimeLag` in order of arrival.
+    """A robot that turns; what its wheels and its laser say of it goes into a `TimeOffset` in order of arrival.
 
     Attributes:
         told: the lag after each scan.
@@ -77,7 +77,7 @@ class Drive:
             wheels = wheels + ((self.t >= at) & (self.t < at + lasts)) * much
             at += rng.exponential(1.0 / slips_hz)
         self.yaw, self.wheels = np.cumsum(true) * DT, np.cumsum(wheels) * DT
-        self.lag = TimeLag()
+        self.lag = TimeOffset()
         self.told: list[Lag | None] = []
         self.read: tuple[float, float] | None = None
 
@@ -180,7 +180,7 @@ def test_a_lag_that_has_gone_is_told_no_more_after_the_next_turns() -> None:
     assert drive.told[-1] is None
 
 
-def told() -> TimeLag:
+def told() -> TimeOffset:
     """A lag that is told, at 30 s, and wheels that have come as far."""
     drive = Drive(3)
     drive.go(0.3, span=(0.1, 30.0))
@@ -221,7 +221,7 @@ def test_a_gap_of_the_wheels_ends_what_was_known(reading: Odometry) -> None:
 
 
 def test_scans_that_do_not_match_are_left_out() -> None:
-    lag = TimeLag()
+    lag = TimeOffset()
     for k in range(200):
         time_offset.on_odometry(lag, Odometry(0.05 * k, 0.05 * (k + 1), np.array((0.0, 0.0, 0.1 * math.sin(k)))))
         time_offset.on_match(lag, scan_of(0.05 * k), match_of(0.1 * k, Reason.REJECTED))
@@ -230,7 +230,7 @@ def test_scans_that_do_not_match_are_left_out() -> None:
 
 
 def test_what_is_kept_is_bounded_whatever_comes() -> None:
-    lag = TimeLag()
+    lag = TimeOffset()
     for k in range(20000):
         time_offset.on_odometry(lag, Odometry(1e-3 * k, 1e-3 * (k + 1), np.zeros(3)))
         if k % 2:
@@ -253,5 +253,5 @@ def test_the_estimator_tells_the_lag_of_a_simulated_robot_and_none_of_a_good_one
     assert (told[-1] is not None) == bool(late_s)
     assert all(one is None or abs(one.lag_s - late_s) < 0.03 for one in told)
     if late_s:
-        step(state, [Command(state.fused.t_mono, Order.RESET)], UNLIMITED)
+        step(state, [Command(state.motion.t_mono, Order.RESET)], UNLIMITED)
         assert step(state, [], UNLIMITED).lag is None

@@ -11,12 +11,13 @@ from estimator.mapping.floorplan_import import FREE, OCCUPIED, UNKNOWN, Cells, i
 from estimator.mapping.keyframe import keep
 from estimator.mapping.live_grid import at_once
 from estimator.mapping.loop_verification import Candidate, LoopSettings, look_in
-from estimator.mapping.map_snapshot import Identity, MapImage, finished, restored
+from estimator.mapping.map_snapshot import Identity, MapImage, finished
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import UNLIMITED, Answer, Array, Job, Odometry, Record
 from estimator.numerics import se2
 from estimator.pipeline import step
 from estimator.scan_matching.local_map import contradicted
+from estimator.stored_map import restored
 from tests.estimator.world import scan_in
 from tools.bench.support.scenes import Scene, bearings, office, paper_room
 
@@ -144,9 +145,9 @@ def test_the_image_is_one_map_that_a_robot_can_start_in_and_that_draws_itself() 
         places = {piece.key: piece.T_map_submap for piece in image.submaps}
         np.testing.assert_allclose(se2.between(places[a], places[b]), T, atol=1e-12)
     state = restored(image)
-    assert state.atlas.adrift == 1 + max(keys)
-    assert len(state.keyframes) == len(image.frames)
-    grid = at_once([(frame.submap, [frame]) for frame in state.keyframes.values()], 0.05)
+    assert state.map.parts.detached == 1 + max(keys)
+    assert len(state.map.keyframes) == len(image.frames)
+    grid = at_once([(frame.submap, [frame]) for frame in state.map.keyframes.values()], 0.05)
     again = trinary(grid)
     low = np.rint((grid.origin - at[:2]) / 0.05).astype(int)
     i, j = np.maximum(low, 0)

@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimator.fusion.map_odom_filter import Absolute, correct
+from estimator.fusion.map_odom_filter import correct
+from estimator.fusion.map_pose import SurveyAlignment
 from estimator.mapping.graph_pose_prior import Said, said, surplus, take
 from estimator.mapping.loop_closure import take_answer
+from estimator.mapping.map_frame import shift_map
 from estimator.mapping.pose_graph import UPPER, Graph, optimise
 from estimator.mapping.relative_covariance import tied
 from estimator.measurements import Answer, Array
@@ -29,20 +31,20 @@ def lit(tie: Array, told: Array = SURE) -> tuple[State, Array]:
     """After a drive, light has said of each submap but the newest where it lies; the tie is as sure as said."""
     state, truth = driven(settings=None)
     state.settings = replace(state.settings, loops=TOLD)
-    state.absolute = Absolute(placed=True, P=tie.copy())
-    for submap in state.atlas.submaps.values():
+    state.pose.alignment = SurveyAlignment(placed=True, P=tie.copy())
+    for submap in state.map.graph.submaps.values():
         submap.light = truth[submap.first - 1], told
     return state, truth[-1]
 
 
 def solve(state: State) -> None:
-    state.atlas.stale = True
-    take_answer(state, Answer(0.0, -1, None))
+    state.map.graph.stale = True
+    take_answer(state.map, state.pose, state.motion, Answer(0.0, -1, None))
     run_jobs(state)
 
 
 def off(state: State, truth: Array) -> float:
-    x, y, _ = se2.between(truth, se2.compose(state.T_map_odom, state.fused.T_odom_base)).tolist()
+    x, y, _ = se2.between(truth, se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)).tolist()
     return float(np.hypot(x, y))
 
 
@@ -50,25 +52,25 @@ def test_a_robot_that_light_hardly_holds_is_moved_by_what_the_map_knows() -> Non
     state, truth = lit(VAGUE)
     before = off(state, truth)
     solve(state)
-    assert state.absolute is not None
+    assert state.pose.alignment is not None
     assert before > 0.25
     assert off(state, truth) < 0.12
-    assert np.all(np.diag(state.absolute.P) < 0.25 * np.diag(VAGUE))
+    assert np.all(np.diag(state.pose.alignment.P) < 0.25 * np.diag(VAGUE))
 
 
 @pytest.mark.parametrize("since", [0, 61])
 def test_hearing_the_map_does_not_move_the_map(since: int) -> None:
     """The solution has put it where it belongs; moved with the robot once more, it tore where ``since`` lies."""
     state, truth = lit(VAGUE)
-    assert state.absolute is not None
-    state.absolute.since = since
+    assert state.pose.alignment is not None
+    state.pose.alignment.since = since
     solve(state)
-    *older, newest = state.atlas.submaps.values()
+    *older, newest = state.map.graph.submaps.values()
     places = circuit()
     away = [np.hypot(*se2.between(places[piece.first - 1], piece.T_map_submap)[:2]) for piece in older]
     assert max(away) < 0.08
-    T = se2.compose(newest.T_map_submap, se2.between(newest.T_odom_submap, state.fused.T_odom_base))
-    assert np.hypot(*se2.between(T, se2.compose(state.T_map_odom, state.fused.T_odom_base))[:2]) < 1e-9
+    T = se2.compose(newest.T_map_submap, se2.between(newest.T_odom_submap, state.motion.T_odom_base))
+    assert np.hypot(*se2.between(T, se2.compose(state.pose.T_map_odom, state.motion.T_odom_base))[:2]) < 1e-9
     assert off(state, truth) < 0.12
 
 
@@ -77,13 +79,15 @@ def test_what_the_map_says_is_of_the_survey_even_if_light_moves_it_meanwhile() -
     ends = []
     for moved in (0.0, 0.15):
         state, truth = lit(VAGUE)
-        state.atlas.stale = True
-        take_answer(state, Answer(0.0, -1, None))
-        answers = [Answer(0.0, job.job_id, job.run()) for job in state.atlas.take_jobs()]
-        T_map_base = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-        correct(state, T_map_base + np.array((moved, 0.0, 0.0)), state.fused.T_odom_base)
+        state.map.graph.stale = True
+        take_answer(state.map, state.pose, state.motion, Answer(0.0, -1, None))
+        answers = [Answer(0.0, job.job_id, job.run()) for job in state.jobs.take()]
+        T_map_base = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
+        T_odom_base = state.motion.T_odom_base
+        shift = correct(state.pose, T_map_base + np.array((moved, 0.0, 0.0)), T_odom_base, T_odom_base)
+        shift_map(state.map, shift.moved, shift.since)
         for answer in answers:
-            take_answer(state, answer)
+            take_answer(state.map, state.pose, state.motion, answer)
         run_jobs(state)
         ends.append(off(state, truth))
     assert max(ends) < 0.15
@@ -92,73 +96,73 @@ def test_what_the_map_says_is_of_the_survey_even_if_light_moves_it_meanwhile() -
 def test_a_map_that_was_wrong_is_given_up_for_light_that_comes_back() -> None:
     """A pose that the map has moved far is held by nothing that light could not take back at once."""
     state, _ = lit(VAGUE)
-    tie, newest = state.absolute, state.atlas.newest
+    tie, newest = state.pose.alignment, state.map.graph.newest
     assert tie is not None
     assert newest is not None
     tie.proved = True
-    take(state, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
+    take(state.map, state.pose, state.motion, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
     assert not tie.broken
     tie.P = VAGUE.copy()
-    take(state, Said(newest.T_map_submap + np.array((0.8, 0.0, 0.0)), SURE))
+    take(state.map, state.pose, state.motion, Said(newest.T_map_submap + np.array((0.8, 0.0, 0.0)), SURE))
     assert tie.broken
 
 
 @pytest.mark.parametrize("how", ["light disagrees", "adrift", "watched"])
 def test_a_map_that_may_be_wrong_is_not_heard(how: str) -> None:
     state, _ = lit(VAGUE)
-    tie, newest = state.absolute, state.atlas.newest
+    tie, newest = state.pose.alignment, state.map.graph.newest
     assert tie is not None
     assert newest is not None
     if how == "light disagrees":
         tie.odd_since = 1.0
     elif how == "adrift":
-        state.atlas.adrift = 1
+        state.map.parts.detached = 1
     else:
-        state.atlas.watch = Watch(newest.key, 1.0, None)
-    take(state, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
+        state.map.parts.trial = Watch(first=newest.key, until_m=1.0)
+    take(state.map, state.pose, state.motion, Said(newest.T_map_submap + np.array((0.1, 0.0, 0.0)), SURE))
     np.testing.assert_array_equal(tie.P, VAGUE)
 
 
 def test_the_same_map_heard_again_tells_nothing_new() -> None:
     state, _ = lit(VAGUE)
     solve(state)
-    assert state.absolute is not None
-    P, T = state.absolute.P, state.T_map_odom
+    assert state.pose.alignment is not None
+    P, T = state.pose.alignment.P, state.pose.T_map_odom
     for _ in range(3):
         solve(state)
-    assert np.trace(state.absolute.P[:2, :2]) > 0.8 * np.trace(P[:2, :2])
-    np.testing.assert_allclose(state.T_map_odom, T, atol=0.02)
+    assert np.trace(state.pose.alignment.P[:2, :2]) > 0.8 * np.trace(P[:2, :2])
+    np.testing.assert_allclose(state.pose.T_map_odom, T, atol=0.02)
 
 
 def test_what_is_mended_is_taken_off_what_the_tie_shares_with_the_pose() -> None:
     state, _ = lit(VAGUE)
-    assert state.absolute is not None
-    state.absolute.X = 0.5 * VAGUE
+    assert state.pose.alignment is not None
+    state.pose.alignment.X = 0.5 * VAGUE
     solve(state)
-    assert np.all(np.diag(state.absolute.X) < 0.25 * np.diag(0.5 * VAGUE))
-    assert len(state.absolute.mended) >= 1
+    assert np.all(np.diag(state.pose.alignment.X) < 0.25 * np.diag(0.5 * VAGUE))
+    assert len(state.pose.alignment.mended) >= 1
 
 
 @pytest.mark.parametrize("tie", [np.diag((0.02**2, 0.02**2, 0.005**2)), 1e-4 * VAGUE])
 def test_a_robot_that_light_holds_better_stays_where_it_is(tie: Array) -> None:
     state, _ = lit(tie, told=VAGUE)
     solve(state)
-    assert state.absolute is not None
-    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
-    np.testing.assert_array_equal(state.absolute.P, tie)
+    assert state.pose.alignment is not None
+    np.testing.assert_array_equal(state.pose.T_map_odom, np.zeros(3))
+    np.testing.assert_array_equal(state.pose.alignment.P, tie)
 
 
 def test_a_map_that_contradicts_what_light_is_sure_of_is_not_followed() -> None:
     """Sure along x and y to a few cm, with the map elsewhere by far more than both allow, but a better heading."""
     tie = np.diag((0.03**2, 0.03**2, 0.3**2))
     state, _ = lit(tie, told=np.diag((0.01**2, 0.01**2, 0.002**2)))
-    for submap in state.atlas.submaps.values():
+    for submap in state.map.graph.submaps.values():
         T, P = submap.light  # type: ignore[misc]  # all are lit
         submap.light = T + np.array((2.0, -1.0, 0.0)), P
     solve(state)
-    assert state.absolute is not None
-    np.testing.assert_array_equal(state.absolute.P, tie)
-    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
+    assert state.pose.alignment is not None
+    np.testing.assert_array_equal(state.pose.alignment.P, tie)
+    np.testing.assert_array_equal(state.pose.T_map_odom, np.zeros(3))
 
 
 def chain(anchored: tuple[int, ...], edges: tuple[tuple[int, int], ...]) -> Graph:

@@ -18,10 +18,10 @@ SCAN = scan_in(paper_room(), se2.identity(), bearings(19, 180.0), np.random.defa
 
 def laid(state: State, T_map: Array) -> Keyframe:
     """A keyframe there, on a submap of its own."""
-    frame = keep(state.next_key, T_map, T_map, SCAN, 0.0)
-    state.keyframes[frame.key] = frame
-    state.next_key += 1
-    retire(state, frame)
+    frame = keep(state.map.next_key, T_map, T_map, SCAN, 0.0)
+    state.map.keyframes[frame.key] = frame
+    state.map.next_key += 1
+    retire(state.map, frame)
     return frame
 
 
@@ -32,12 +32,12 @@ def test_laps_beside_each_other_leave_no_more_than_the_first_ones() -> None:
     for _ in range(120):
         for x in np.arange(rng.uniform(0.0, 0.25), 20.0, 0.25):
             laid(state, np.array((x, 0.3 + 0.08 * rng.standard_normal(), 0.1 * rng.standard_normal())))
-        kept.append(len(state.keyframes))
+        kept.append(len(state.map.keyframes))
     assert kept[0] >= 70
     assert max(kept[60:]) <= 1.05 * max(kept[:6])
-    listed = sorted(key for keys in state.places.values() for key in keys if key in state.keyframes)
-    assert listed == sorted(state.keyframes)
-    assert sum(map(len, state.places.values())) <= 2 * len(state.keyframes)
+    listed = sorted(key for keys in state.map.places.values() for key in keys if key in state.map.keyframes)
+    assert listed == sorted(state.map.keyframes)
+    assert sum(map(len, state.map.places.values())) <= 2 * len(state.map.keyframes)
 
 
 def swaying(x: float) -> Array:
@@ -58,11 +58,11 @@ def test_what_is_seen_once_is_kept_however_close_together(way: list[Array]) -> N
     state = new_state()
     for T in way:
         laid(state, T)
-    assert len(state.keyframes) >= 0.95 * len(way)  # the end of a circle has come by its begin
+    assert len(state.map.keyframes) >= 0.95 * len(way)  # the end of a circle has come by its begin
     for _ in range(6):
         for T in way:
             laid(state, T)
-    assert len(state.keyframes) <= 2 * len(way)
+    assert len(state.map.keyframes) <= 2 * len(way)
 
 
 def test_of_earlier_passes_the_newest_stay() -> None:
@@ -73,9 +73,9 @@ def test_of_earlier_passes_the_newest_stay() -> None:
             laid(state, np.array((3.0 + x, 0.0, 0.0)))
     other = laid(state, np.array((0.5, 0.0, 0.0)))
     near_it = laid(state, np.array((0.5, 0.0, np.pi)))
-    left = [frame.key for frame in state.keyframes.values() if near(frame.T_map_keyframe, near_it.T_map_keyframe)]
+    left = [frame.key for frame in state.map.keyframes.values() if near(frame.T_map_keyframe, near_it.T_map_keyframe)]
     assert left == [*here[1 - state.settings.keep :], near_it.key]
-    assert other.key in state.keyframes
+    assert other.key in state.map.keyframes
 
 
 def test_a_keyframe_that_has_moved_with_the_map_is_found_where_it_lies_now() -> None:
@@ -86,7 +86,7 @@ def test_a_keyframe_that_has_moved_with_the_map_is_found_where_it_lies_now() -> 
         laid(state, np.array((0.3 * step, 0.6, 0.0)))
     for _ in range(PASS + state.settings.keep):
         laid(state, np.array((1.8, 0.0, 0.0)))
-    assert first.key not in state.keyframes
+    assert first.key not in state.map.keyframes
 
 
 def test_the_far_end_of_a_map_that_has_turned_is_not_missed_on_the_next_pass() -> None:
@@ -98,4 +98,4 @@ def test_the_far_end_of_a_map_that_has_turned_is_not_missed_on_the_next_pass() -
         laid(state, np.array((0.5 * k, 0.0, 0.0)))
     for k in range(8):
         laid(state, np.array((40.0 + 0.25 * k, 1.3, 0.03)))
-    assert sum(frame.key in state.keyframes for frame in far) <= 4
+    assert sum(frame.key in state.map.keyframes for frame in far) <= 4

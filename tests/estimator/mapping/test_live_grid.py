@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.commands import forget
 from estimator.mapping.grid_patches import SIDE, UNIT, render
 from estimator.mapping.keyframe import Keyframe, Submap, keep
 from estimator.mapping.live_grid import LiveMap, advance, at_once
@@ -15,6 +14,7 @@ from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import UNLIMITED, Answer, Array, Beam, Job, Odometry, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state, render_map, step
+from estimator.relocalisation.map_reset import forget_map
 from estimator.state import State
 from tests.estimator.circuit import circuit, drifted, lay, run_jobs
 from tests.estimator.world import scan_in
@@ -183,14 +183,16 @@ def test_live_and_final_are_the_same_map_and_a_loop_redraws_without_rendering() 
     """A circuit with drift; the loop moves submaps, the tiles follow, and no patch is rendered twice for it."""
     state, truth = new_state(Settings(live_m=CELL)), circuit(laps=1.3)
     rng = np.random.default_rng(2)
-    state.fused.T_odom_base = state.T_map_start = truth[0]
+    state.motion.T_odom_base = state.map.T_map_start = truth[0]
     for key, (T_odom, T_true) in enumerate(zip(drifted(truth, 1.004, 0.0008), truth, strict=True), 1):
         lay(state, T_odom, T_true, rng, key)
         run_jobs(state)
-    live = state.live
+    live = state.map.live
     assert live is not None
-    assert state.atlas.closures >= 3
-    assert live.rendered <= 4 * len(state.atlas.submaps)  # once at each fourth keyframe of it, and when it is finished
+    assert state.map.graph.closures >= 3
+    assert live.rendered <= 4 * len(
+        state.map.graph.submaps
+    )  # once at each fourth keyframe of it, and when it is finished
     assert not live.busy()
     shown, final = live.grid(), render_map(state, CELL)
     xy = walls(final)
@@ -199,7 +201,7 @@ def test_live_and_final_are_the_same_map_and_a_loop_redraws_without_rendering() 
     assert agreement(shown, final) > 0.97
     packed = sum(len(one.patch.packed) for one in live.drawn.values())
     assert packed < 20_000 * len(live.drawn)
-    forget(state)
+    forget_map(state)
     assert live.tiles
     assert live.grid().log_odds.size == 0
 
@@ -240,7 +242,7 @@ def lap(state: State, begin: int, jobs: tuple[Job, ...], rng: np.random.Generato
         x, y = (WAS + done * (IS_NOW - WAS)).tolist()
         scene = furnished((x, y), done)
         if begin + k == 0:
-            state.fused.T_odom_base = state.T_map_start = T
+            state.motion.T_odom_base = state.map.T_map_start = T
         records: list[Record] = [Answer(t, job.job_id, job.run()) for job in jobs]
         if begin + k:
             records.append(Odometry(t - 0.1, t, se2.between(truth[k - 1], T)))
@@ -270,12 +272,12 @@ def test_moved_furniture_is_forgotten_in_one_pass() -> None:
     jobs: tuple[Job, ...] = ()
     for number in range(3):
         jobs = lap(state, 150 * number, jobs, rng)
-        live, local = state.live, state.local
+        live, local = state.map.live, state.matching.local_map
         assert live is not None
         assert local is not None
         if number == 1:
             assert stands(WAS + TABLE, live.grid()) > 0.9
-    xy = se2.apply(state.T_map_odom, local.elements[:, :2])
+    xy = se2.apply(state.pose.T_map_odom, local.elements[:, :2])
     near = np.hypot(*(xy[:, None] - (WAS + TABLE)).transpose(2, 0, 1)).min(axis=1) < 0.1
     assert near.sum() == 0
     for grid in (live.grid(), render_map(state, CELL)):

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.commands import forget
-from estimator.fusion.map_odom_filter import Absolute
+from estimator.fusion.map_pose import SurveyAlignment
+from estimator.job_queue import LOST, SEARCH, SOLVE
 from estimator.mapping.constraints import MANY, Constraints
-from estimator.mapping.keyframe import Submap, keep
+from estimator.mapping.keyframe import SIZE, Submap, keep, settle
 from estimator.mapping.loop_closure import candidates, found_again, surer, take_answer
 from estimator.mapping.loop_verification import Candidate, Found, look, look_in
 from estimator.mapping.pose_graph import UPPER, Graph, optimise
-from estimator.mapping.submap import SIZE, settle
-from estimator.mapping.submap_graph import KEPT, LOOK, LOST, SOLVE, Atlas, alike
+from estimator.mapping.submap_graph import KEPT, SubmapGraph, alike
 from estimator.measurements import Answer, Array
 from estimator.numerics import se2
+from estimator.relocalisation.map_reset import forget_map
 from estimator.relocalisation.relocalisation import begin
 from estimator.result import Loop, LoopReason, Virtual
 from estimator.state import new_state
@@ -30,27 +30,27 @@ pytestmark = pytest.mark.jit  # whole maps; each kernel has tests of its own
 
 def test_a_loop_brings_the_map_together_and_the_odometry_never_hears_of_it() -> None:
     state, truth = driven()
-    end = se2.compose(state.T_map_odom, state.fused.T_odom_base)
-    off, drift = se2.between(truth[-1], end), se2.between(truth[-1], state.fused.T_odom_base)
+    end = se2.compose(state.pose.T_map_odom, state.motion.T_odom_base)
+    off, drift = se2.between(truth[-1], end), se2.between(truth[-1], state.motion.T_odom_base)
     assert np.hypot(*drift[:2]) > 0.25
     assert np.hypot(*off[:2]) < 0.05
     assert abs(off[2]) < np.radians(0.7)
-    np.testing.assert_array_equal(state.fused.T_odom_base, drifted(truth, 1.004, 0.0008)[-1])
-    places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
+    np.testing.assert_array_equal(state.motion.T_odom_base, drifted(truth, 1.004, 0.0008)[-1])
+    places = np.array([frame.T_map_keyframe for frame in state.map.keyframes.values()])
     assert np.hypot(*(places - truth)[:, :2].T).max() < 0.12  # the far side of the room as well
-    assert state.atlas.closures >= 3
-    assert state.jumps >= 1
-    np.testing.assert_array_equal(state.T_map_start, truth[0])
-    news = state.atlas.take_news()
+    assert state.map.graph.closures >= 3
+    assert state.pose.jumps >= 1
+    np.testing.assert_array_equal(state.map.T_map_start, truth[0])
+    news = state.map.graph.take_news()
     assert news is not None
-    assert news.counter == state.atlas.closures
+    assert news.counter == state.map.graph.closures
     assert news.keyframe_old < news.keyframe_new
-    assert state.atlas.take_news() is None
+    assert state.map.graph.take_news() is None
 
 
 def test_the_pose_is_surer_after_the_loop_than_before() -> None:
     states = [state for state, _ in (driven(laps=0.9), driven())]
-    before, after = (np.trace(state.atlas.spread(state.fused.T_odom_base)[:2, :2]) for state in states)
+    before, after = (np.trace(state.map.graph.spread(state.motion.T_odom_base)[:2, :2]) for state in states)
     assert after < 0.8 * before
 
 
@@ -58,36 +58,36 @@ def test_a_correction_of_the_map_takes_nothing_from_what_is_known_of_the_pose() 
     """Unless it moves the pose by more than that allows: then the pose is as uncertain as the graph has it."""
     state, vague = new_state(), np.diag((0.05**2, 0.05**2, 0.02**2))
     sharp = vague / 25.0
-    state.T_odom_anchor, state.P_anchor = np.array((3.0, 2.0, 1.0)), sharp
-    state.T_map_odom = np.array((1.0, -2.0, 0.5))
+    state.pose.T_odom_anchor, state.pose.P_anchor = np.array((3.0, 2.0, 1.0)), sharp
+    state.pose.T_map_odom = np.array((1.0, -2.0, 0.5))
     for far, expected in ((0.01, sharp), (0.1, vague)):
-        before = state.T_map_odom - (far, 0.0, 0.0)
-        np.testing.assert_array_equal(surer(state, vague, before), expected)
-    state.P_anchor = 4.0 * vague
-    np.testing.assert_array_equal(surer(state, vague, state.T_map_odom), vague)
+        before = state.pose.T_map_odom - (far, 0.0, 0.0)
+        np.testing.assert_array_equal(surer(state.pose, vague, before), expected)
+    state.pose.P_anchor = 4.0 * vague
+    np.testing.assert_array_equal(surer(state.pose, vague, state.pose.T_map_odom), vague)
 
 
 def test_without_settings_nothing_is_looked_for() -> None:
     state, _ = driven(settings=None)
-    assert state.atlas.closures == 0
-    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
+    assert state.map.graph.closures == 0
+    np.testing.assert_array_equal(state.pose.T_map_odom, np.zeros(3))
 
 
 def test_a_large_loop_waits_for_a_second_that_agrees() -> None:
     state, _ = driven(settings=replace(TOLD, supported_m=0.0, supported_rad=0.0))
-    assert state.atlas.closures == 0  # no two agree better than by nothing
-    assert len(state.atlas.waiting) > 3
+    assert state.map.graph.closures == 0  # no two agree better than by nothing
+    assert len(state.map.graph.waiting) > 3
     news: list[Loop | None] = []
     state, _ = driven(settings=replace(TOLD, supported_m=0.2), news=news)
-    assert state.atlas.closures >= 2
+    assert state.map.graph.closures >= 2
     reasons = [loop.reason for loop in news if loop is not None]
     assert reasons[0] is LoopReason.SUPPORTED
     assert reasons[-1] is LoopReason.NEAR
 
 
-def corridor(shifts: list[float], turn: float = 0.0) -> Atlas:
+def corridor(shifts: list[float], turn: float = 0.0) -> SubmapGraph:
     """Keyframes straight on, 0.25 m and a turn apart, each found so much further on than it is expected."""
-    atlas, origin = Atlas(), se2.identity()
+    atlas, origin = SubmapGraph(), se2.identity()
     atlas.submaps = {key: Submap(key, key, origin, origin) for key in (1, 2)}
     for k, shift in enumerate(shifts):
         T = np.array((0.25 * k, 0.0, turn * k))
@@ -138,61 +138,64 @@ def test_an_answer_to_a_map_that_was_forgotten_is_dropped() -> None:
     state, truth = driven(laps=1.02)
     rng = np.random.default_rng(9)
     for key in range(1000, 1000 + 2 * SIZE):
-        lay(state, state.fused.T_odom_base + np.array((0.05, 0.0, 0.0)), truth[-1], rng, key)
-    late = [Answer(0.0, job.job_id, job.run()) for job in state.atlas.take_jobs()]
+        lay(state, state.motion.T_odom_base + np.array((0.05, 0.0, 0.0)), truth[-1], rng, key)
+    late = [Answer(0.0, job.job_id, job.run()) for job in state.jobs.take()]
     assert late
-    forget(state)
+    forget_map(state)
     for answer in late:
-        take_answer(state, answer)
-    assert not state.atlas.submaps
-    assert state.atlas.next_job > late[-1].job_id
+        take_answer(state.map, state.pose, state.motion, answer)
+    assert not state.map.graph.submaps
+    assert state.jobs.next_id > late[-1].job_id
 
 
 def test_a_graph_of_which_a_part_was_forgotten_meanwhile_moves_nothing() -> None:
     """As after RELOCALISE: the newest submap then may be of an earlier run, with another odom frame."""
     state, truth = driven(laps=0.6)
-    for submap in state.atlas.submaps.values():
+    for submap in state.map.graph.submaps.values():
         submap.T_odom_submap = submap.T_odom_submap + np.array((50.0, 20.0, 1.0))
-    state.next_key = 1000
+    state.map.next_key = 1000
     begin(state)
     lay(state, truth[0], truth[0], np.random.default_rng(3), 1000)
-    state.atlas.stale = True
-    take_answer(state, Answer(0.0, -1, None))
-    job = next(job for job in state.atlas.take_jobs() if job.priority == SOLVE)
-    T_map_odom, places = state.T_map_odom, {k: one.T_map_submap for k, one in state.atlas.submaps.items() if k != 1000}
-    state.next_key = 1001
+    state.map.graph.stale = True
+    take_answer(state.map, state.pose, state.motion, Answer(0.0, -1, None))
+    job = next(job for job in state.jobs.take() if job.priority == SOLVE)
+    T_map_odom, places = (
+        state.pose.T_map_odom,
+        {k: one.T_map_submap for k, one in state.map.graph.submaps.items() if k != 1000},
+    )
+    state.map.next_key = 1001
     begin(state)
-    take_answer(state, Answer(0.0, job.job_id, job.run()))
-    assert state.T_map_odom is T_map_odom
-    assert all(places[key] is submap.T_map_submap for key, submap in state.atlas.submaps.items())
-    assert 1000 not in {key for keys in state.places.values() for key in keys}
+    take_answer(state.map, state.pose, state.motion, Answer(0.0, job.job_id, job.run()))
+    assert state.pose.T_map_odom is T_map_odom
+    assert all(places[key] is submap.T_map_submap for key, submap in state.map.graph.submaps.items())
+    assert 1000 not in {key for keys in state.map.places.values() for key in keys}
 
 
 def test_a_loop_of_a_forgotten_submap_whose_key_was_given_again_is_none() -> None:
     state, truth = driven(laps=0.6)
-    rng, before = np.random.default_rng(3), len(state.atlas.constraints.T)
+    rng, before = np.random.default_rng(3), len(state.map.graph.constraints.T)
     begin(state)
     lay(state, truth[0], truth[0], rng, 1000)
-    frame = state.keyframes[1000]
-    state.atlas.since = 1000
+    frame = state.map.keyframes[1000]
+    state.map.parts.detached_since = 1000
     begin(state)
     lay(state, truth[0], truth[0], rng, 1001)
-    assert state.atlas.submaps[frame.submap.key] is not frame.submap
+    assert state.map.graph.submaps[frame.submap.key] is not frame.submap
     found = Found(1, np.zeros(3), SMALL, 1.0, 0.0, 0.01, np.zeros(3))
-    found_again(state.atlas, TOLD, frame, found)
-    assert len(state.atlas.constraints.T) == before
+    found_again(state.map.graph, TOLD, frame, found)
+    assert len(state.map.graph.constraints.T) == before
 
 
 @pytest.mark.jit
 def test_what_is_kept_is_bounded_by_the_area_and_stays_in_place() -> None:
     state, truth = driven(laps=4.0)
-    submaps = list(state.atlas.submaps.values())
+    submaps = list(state.map.graph.submaps.values())
     *_, latest, _ = submaps  # the newest is still being driven through
     assert sum(alike(submap, latest) for submap in submaps[:-1]) <= KEPT
     assert len(submaps) < 0.8 * len(truth) / SIZE
     more, _ = driven(laps=8.0)
-    assert len(more.atlas.submaps) <= 1.2 * len(submaps)
-    places = np.array([frame.T_map_keyframe for frame in state.keyframes.values()])
+    assert len(more.map.graph.submaps) <= 1.2 * len(submaps)
+    places = np.array([frame.T_map_keyframe for frame in state.map.keyframes.values()])
     assert np.hypot(*(places - truth)[:, :2].T).max() < 0.15  # those of submaps let go included
 
 
@@ -200,12 +203,12 @@ def test_what_is_kept_is_bounded_by_the_area_and_stays_in_place() -> None:
 def test_what_joins_the_submaps_is_bounded_however_many_laps_are_driven() -> None:
     """The same way lap after lap: none of it may leave more behind than the lap before."""
     state, _ = driven(laps=12.0, turn=0.0)
-    joined = state.atlas.constraints
+    joined = state.map.graph.constraints
     pairs = [tuple(sorted(pair)) for pair in joined.between[~joined.loop].tolist()]
     assert len(set(pairs)) == len(pairs)
     pairs = [tuple(sorted(pair)) for pair in joined.between[joined.loop].tolist()]
     assert max(pairs.count(pair) for pair in pairs) <= MANY
-    gone = [frame.submap for frame in state.keyframes.values() if frame.submap.into is not None]
+    gone = [frame.submap for frame in state.map.keyframes.values() if frame.submap.into is not None]
     assert len(gone) > 100
     assert all(submap.into is not None and submap.into[0].into is None for submap in gone)
 
@@ -213,17 +216,19 @@ def test_what_joins_the_submaps_is_bounded_however_many_laps_are_driven() -> Non
 def test_a_job_that_fails_does_not_end_the_search_for_loops() -> None:
     state, truth = driven(laps=1.02)
     rng, handed = np.random.default_rng(9), []
-    state.atlas.stale = True
-    take_answer(state, Answer(0.0, -1, None))  # nobody asked: only makes the graph be handed out
+    state.map.graph.stale = True
+    take_answer(
+        state.map, state.pose, state.motion, Answer(0.0, -1, None)
+    )  # nobody asked: only makes the graph be handed out
     for key in range(1000, 1010 + LOST):
-        lay(state, state.fused.T_odom_base, truth[-1], rng, key)
-        handed.append([job.priority for job in state.atlas.take_jobs()])  # and none of them answers
+        lay(state, state.motion.T_odom_base, truth[-1], rng, key)
+        handed.append([job.priority for job in state.jobs.take()])  # and none of them answers
     kinds = [kind for kinds in handed for kind in kinds]
-    assert kinds.count(LOOK) == 2
+    assert kinds.count(SEARCH) == 2
     assert kinds.count(SOLVE) == 1
-    take_answer(state, Answer(0.0, -1, None))
-    assert [job.priority for job in state.atlas.take_jobs()] == [SOLVE]
-    assert len(state.atlas.asked) < 2 + LOST / SIZE + 1
+    take_answer(state.map, state.pose, state.motion, Answer(0.0, -1, None))
+    assert [job.priority for job in state.jobs.take()] == [SOLVE]
+    assert len(state.jobs.pending) < 2 + LOST / SIZE + 1
 
 
 def frame_at(scene: Scene, T: Array, seed: int = 0, wide: bool = False) -> tuple[Candidate, Array]:
@@ -281,21 +286,21 @@ def test_two_places_that_fit_close_nothing() -> None:
 def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:
     state, truth = driven(settings=None)
     state.settings = replace(state.settings, loops=TOLD)
-    state.absolute = Absolute(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
-    for submap in state.atlas.submaps.values():
-        first = state.keyframes[submap.first]
+    state.pose.alignment = SurveyAlignment(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
+    for submap in state.map.graph.submaps.values():
+        first = state.map.keyframes[submap.first]
         told = truth[submap.first - 1]
         first.virtual = Virtual(told, np.diag((0.04**2, 0.04**2, 0.02**2)), frozenset((1, 2, 3)))
         submap.light = told, first.virtual.covariance
-    newest = state.atlas.newest
+    newest = state.map.graph.newest
     assert newest is not None
     held = newest.T_map_submap
-    state.atlas.stale = True
-    take_answer(state, Answer(0.0, -1, None))
+    state.map.graph.stale = True
+    take_answer(state.map, state.pose, state.motion, Answer(0.0, -1, None))
     run_jobs(state)
     np.testing.assert_array_equal(newest.T_map_submap, held)
-    np.testing.assert_array_equal(state.T_map_odom, np.zeros(3))
-    firsts = [submap for submap in state.atlas.submaps.values() if submap is not newest]
+    np.testing.assert_array_equal(state.pose.T_map_odom, np.zeros(3))
+    firsts = [submap for submap in state.map.graph.submaps.values() if submap is not newest]
     off = np.array([se2.between(truth[submap.first - 1], submap.T_map_submap) for submap in firsts])
     drift = np.array([se2.between(truth[submap.first - 1], submap.T_odom_submap) for submap in firsts])
     assert np.hypot(*off[:-2, :2].T).mean() < 0.6 * np.hypot(*drift[:-2, :2].T).mean()
@@ -304,23 +309,23 @@ def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:
 def test_light_tells_where_to_look_and_how_far() -> None:
     """The odom frame's own covariance grows with the way; a pose that light holds is looked for where light has it."""
     state, _ = driven(laps=1.02, settings=None)
-    frame = next(reversed(state.keyframes.values()))
-    state.atlas.strayed, state.atlas.ties = state.atlas.strayed + np.diag((9.0, 9.0, 1.0)), {}
-    state.absolute = Absolute(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
-    near = candidates(state, TOLD, frame)
+    frame = next(reversed(state.map.keyframes.values()))
+    state.map.graph.strayed, state.map.graph.ties = state.map.graph.strayed + np.diag((9.0, 9.0, 1.0)), {}
+    state.pose.alignment = SurveyAlignment(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
+    near = candidates(state.map.graph, state.pose, TOLD, frame)
     assert near
     assert all(np.trace(candidate.P) < 0.01 for candidate in near)
-    state.absolute.placed = False
-    assert all(np.trace(candidate.P) > 10.0 for candidate in candidates(state, TOLD, frame))
+    state.pose.alignment.placed = False
+    assert all(np.trace(candidate.P) > 10.0 for candidate in candidates(state.map.graph, state.pose, TOLD, frame))
 
 
 def test_a_map_begun_anew_begins_a_submap() -> None:
     """What was laid before and after the laser lost its map must not be merged into one shape."""
     state, truth = driven(laps=0.1)
-    before = state.atlas.newest
-    lay(state, state.fused.T_odom_base, truth[-1], np.random.default_rng(1), 500, anew=True)
-    assert state.atlas.newest is not before
-    assert [frame.key for frame in state.atlas.frames] == [500]
+    before = state.map.graph.newest
+    lay(state, state.motion.T_odom_base, truth[-1], np.random.default_rng(1), 500, anew=True)
+    assert state.map.graph.newest is not before
+    assert [frame.key for frame in state.map.graph.frames] == [500]
 
 
 def random_graph(rng: np.random.Generator, n: int = 7) -> tuple[Constraints, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimator.mapping.keyframe import Submap, keep
-from estimator.mapping.loop_closure import candidates, found_again, keyframe_laid
+from estimator.mapping.loop_closure import add_keyframe, candidates, found_again
 from estimator.mapping.loop_verification import BLURRED, Condition, Found, Told, look_in, passed, told_by_light
 from estimator.numerics import se2
 from estimator.result import LoopReason, Virtual
@@ -102,39 +102,42 @@ def test_light_tells_a_room_from_its_mirror_image() -> None:
 
 def test_with_light_a_loop_that_moves_the_pose_far_needs_no_second_one() -> None:
     state, _ = driven(laps=0.9)
-    key = next(iter(state.atlas.submaps))
-    frame = next(reversed(state.keyframes.values()))
+    key = next(iter(state.map.graph.submaps))
+    frame = next(reversed(state.map.keyframes.values()))
     far = found_with(key=key, moved=np.array((0.5, 0.0, 0.0)))
-    before = state.atlas.closures
-    found_again(state.atlas, TOLD, frame, far)
-    assert state.atlas.closures == before
-    found_again(state.atlas, TOLD, frame, replace(far, reason=LoopReason.LIT))
-    assert state.atlas.closures == before + 1
+    before = state.map.graph.closures
+    found_again(state.map.graph, TOLD, frame, far)
+    assert state.map.graph.closures == before
+    found_again(state.map.graph, TOLD, frame, replace(far, reason=LoopReason.LIT))
+    assert state.map.graph.closures == before + 1
 
 
 def test_a_submap_knows_the_lamps_of_all_its_keyframes() -> None:
     state, truth = driven(laps=0.05)
-    newest = state.atlas.newest
+    newest = state.map.graph.newest
     assert newest is not None
     scan = scan_in(paper_room(), truth[-1], HALF, np.random.default_rng(1))
     for key, lamps in ((700, (1, 2)), (701, (2, 3))):
-        frame = keep(key, truth[-1], state.fused.T_odom_base, scan, 0.0)
+        frame = keep(key, truth[-1], state.motion.T_odom_base, scan, 0.0)
         frame.virtual = Virtual(truth[-1], SMALL, frozenset(lamps))
-        keyframe_laid(state, frame, SMALL, 0.01, False)
+        add_keyframe(state.map, state.pose, frame, (SMALL, 0.01, False))
     assert newest.lamps == {1, 2, 3}
 
 
 def test_of_submaps_at_one_place_those_that_look_the_same_way_come_first() -> None:
     """A lidar of 180 deg sees little of what one saw that came the other way."""
     state, _ = driven(laps=1.02, settings=None)
-    frame = next(reversed(state.keyframes.values()))
-    (nearest, *_) = candidates(state, replace(TOLD, turned_m=2.0), frame)
-    back = next(s for s in state.atlas.submaps.values() if s.key == nearest.key)
+    frame = next(reversed(state.map.keyframes.values()))
+    (nearest, *_) = candidates(state.map.graph, state.pose, replace(TOLD, turned_m=2.0), frame)
+    back = next(s for s in state.map.graph.submaps.values() if s.key == nearest.key)
     assert back.settled is not None
     turn = np.array((0.0, 0.0, np.pi))
     twin = Submap(99, back.first, back.T_map_submap, back.T_odom_submap)
     placed = se2.compose(back.settled.witness.T_odom_keyframe, turn)
     twin.settled = replace(back.settled, witness=replace(back.settled.witness, T_odom_keyframe=placed))
-    state.atlas.submaps = {99: twin} | state.atlas.submaps
-    found = [candidate.key for candidate in candidates(state, replace(TOLD, candidates=9, turned_m=2.0), frame)]
+    state.map.graph.submaps = {99: twin} | state.map.graph.submaps
+    found = [
+        candidate.key
+        for candidate in candidates(state.map.graph, state.pose, replace(TOLD, candidates=9, turned_m=2.0), frame)
+    ]
     assert found.index(back.key) < found.index(99)

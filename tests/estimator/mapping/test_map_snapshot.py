@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.fusion.map_odom_filter import Absolute
+from estimator.fusion.map_pose import SurveyAlignment
 from estimator.light_filter import state_vector
 from estimator.light_filter.gain_memory import gains_known, recall, sensors_known
 from estimator.light_filter.light_channel import LightsSetup
 from estimator.light_filter.light_filter import new_lights, place, predict, update
 from estimator.light_filter.survey import Survey
 from estimator.mapping.keyframe_selection import square_of
-from estimator.mapping.map_snapshot import Identity, MapImage, finished, image_of, restored
+from estimator.mapping.map_snapshot import Identity, MapImage, finished
 from estimator.measurements import Odometry
 from estimator.numerics import se2
 from estimator.state import State
+from estimator.stored_map import image_of, restored
 from tests.estimator.circuit import driven
 from tests.estimator.light_room import LAMPS, RECEIVER, Room, circle
 
@@ -33,10 +34,10 @@ def mapped() -> State:
 
 def test_every_submap_is_in_the_image_and_all_are_settled(mapped: State) -> None:
     image = finished(image_of(mapped, WHO))
-    assert [piece.key for piece in image.submaps] == list(mapped.atlas.submaps)
+    assert [piece.key for piece in image.submaps] == list(mapped.map.graph.submaps)
     assert all(piece.settled is not None and len(piece.settled.elements) for piece in image.submaps)
     assert image.identity == WHO
-    assert len(image.constraints.loop) == len(mapped.atlas.constraints.loop)
+    assert len(image.constraints.loop) == len(mapped.map.graph.constraints.loop)
     assert image.constraints.loop.any()
 
 
@@ -44,30 +45,30 @@ def test_keyframes_lie_in_the_image_where_they_lie_in_the_map(mapped: State) -> 
     image = finished(image_of(mapped))
     places = {piece.key: piece.T_map_submap for piece in image.submaps}
     found = {hung.frame.key: se2.compose(places[hung.submap], hung.T_submap_keyframe) for hung in image.keyframes()}
-    assert found.keys() == mapped.keyframes.keys()
+    assert found.keys() == mapped.map.keyframes.keys()
     for key, T in found.items():
-        np.testing.assert_allclose(T, mapped.keyframes[key].T_map_keyframe, atol=1e-9)
+        np.testing.assert_allclose(T, mapped.map.keyframes[key].T_map_keyframe, atol=1e-9)
 
 
 def test_a_restored_state_has_the_same_map_and_is_adrift(mapped: State) -> None:
     state = restored(image_of(mapped))
-    assert state.atlas.adrift == 1 + max(mapped.atlas.submaps)
-    assert state.next_key > max(mapped.keyframes)
-    assert state.keyframes.keys() == mapped.keyframes.keys()
-    for key, frame in mapped.keyframes.items():
-        np.testing.assert_allclose(state.keyframes[key].T_map_keyframe, frame.T_map_keyframe, atol=1e-9)
-        assert key in state.places[square_of(state.keyframes[key].T_map_keyframe)]
-    pose = se2.compose(mapped.T_map_odom, mapped.fused.T_odom_base)
-    np.testing.assert_allclose(se2.compose(state.T_map_odom, state.fused.T_odom_base), pose, atol=1e-9)
+    assert state.map.parts.detached == 1 + max(mapped.map.graph.submaps)
+    assert state.map.next_key > max(mapped.map.keyframes)
+    assert state.map.keyframes.keys() == mapped.map.keyframes.keys()
+    for key, frame in mapped.map.keyframes.items():
+        np.testing.assert_allclose(state.map.keyframes[key].T_map_keyframe, frame.T_map_keyframe, atol=1e-9)
+        assert key in state.map.places[square_of(state.map.keyframes[key].T_map_keyframe)]
+    pose = se2.compose(mapped.pose.T_map_odom, mapped.motion.T_odom_base)
+    np.testing.assert_allclose(se2.compose(state.pose.T_map_odom, state.motion.T_odom_base), pose, atol=1e-9)
     again = finished(image_of(state))
-    assert [piece.key for piece in again.submaps] == list(mapped.atlas.submaps)
+    assert [piece.key for piece in again.submaps] == list(mapped.map.graph.submaps)
 
 
 def test_a_scan_that_only_a_submap_holds_keeps_its_number(mapped: State) -> None:
     image = image_of(mapped)
     last = max(one.settled.witness.key for one in image.submaps if one.settled is not None)
     frames = tuple(frame for frame in image.frames if frame.key < last)
-    assert restored(replace(image, frames=frames)).next_key > last
+    assert restored(replace(image, frames=frames)).map.next_key > last
 
 
 def test_nothing_that_happens_later_changes_an_image(mapped: State) -> None:
@@ -75,9 +76,9 @@ def test_nothing_that_happens_later_changes_an_image(mapped: State) -> None:
     image = image_of(state)
     before = {hung.frame.key: (hung.submap, hung.T_submap_keyframe.copy()) for hung in image.keyframes()}
     places = [piece.T_map_submap.copy() for piece in image.submaps]
-    for submap in list(state.atlas.submaps.values())[:5]:
+    for submap in list(state.map.graph.submaps.values())[:5]:
         submap.T_map_submap = submap.T_map_submap + 1.0
-        state.atlas.let_go(submap)
+        state.map.graph.drop(submap)
     after = {hung.frame.key: (hung.submap, hung.T_submap_keyframe) for hung in image.keyframes()}
     assert after.keys() == before.keys()
     for key, (submap, T) in before.items():
@@ -85,14 +86,14 @@ def test_nothing_that_happens_later_changes_an_image(mapped: State) -> None:
         np.testing.assert_array_equal(after[key][1], T)
     for piece, T in zip(image.submaps, places, strict=True):
         np.testing.assert_array_equal(piece.T_map_submap, T)
-    assert len(image.constraints.loop) == len(mapped.atlas.constraints.loop)
+    assert len(image.constraints.loop) == len(mapped.map.graph.constraints.loop)
 
 
 def test_keyframes_of_a_submap_that_was_let_go_lie_in_the_one_that_took_its_place(mapped: State) -> None:
     state = restored(image_of(mapped))
-    gone = list(state.atlas.submaps.values())[3]
-    theirs = [frame for frame in state.keyframes.values() if frame.submap is gone]
-    state.atlas.let_go(gone)
+    gone = list(state.map.graph.submaps.values())[3]
+    theirs = [frame for frame in state.map.keyframes.values() if frame.submap is gone]
+    state.map.graph.drop(gone)
     image = image_of(state)
     places = {piece.key: piece.T_map_submap for piece in image.submaps}
     assert gone.key not in places
@@ -104,8 +105,8 @@ def test_keyframes_of_a_submap_that_was_let_go_lie_in_the_one_that_took_its_plac
 
 def test_what_is_adrift_is_not_in_the_image(mapped: State) -> None:
     state = restored(image_of(mapped))
-    last = max(state.atlas.submaps)
-    state.atlas.adrift = last
+    last = max(state.map.graph.submaps)
+    state.map.parts.detached = last
     image = finished(image_of(state))
     assert last not in {piece.key for piece in image.submaps}
     assert last not in {hung.submap for hung in image.keyframes()}
@@ -114,16 +115,16 @@ def test_what_is_adrift_is_not_in_the_image(mapped: State) -> None:
 
 def test_a_map_with_nothing_in_it_is_restored_as_a_new_start() -> None:
     state = restored(MapImage(WHO))
-    assert state.atlas.adrift is None
-    assert not state.keyframes
-    assert state.next_key == 1
+    assert state.map.parts.detached is None
+    assert not state.map.keyframes
+    assert state.map.next_key == 1
 
 
 def test_an_image_is_of_the_survey_once_light_has_placed_the_map(mapped: State) -> None:
     state = restored(image_of(mapped))
-    state.absolute, state.atlas.adrift = Absolute(placed=True), None
+    state.pose.alignment, state.map.parts.detached = SurveyAlignment(placed=True), None
     assert image_of(state, WHO).identity.surveyed
-    state.atlas.adrift = 3
+    state.map.parts.detached = 3
     assert not image_of(state, WHO).identity.surveyed
     assert image_of(state, replace(WHO, surveyed=True)).identity.surveyed
 
@@ -170,8 +171,8 @@ def test_a_lit_state_is_restored_with_its_gains(mapped: State) -> None:
     image = replace(image_of(mapped), gains=gains)
     state = restored(image, lights=LightsSetup(Survey(LAMPS, RECEIVER)))
     assert state.light is not None
-    assert state.absolute is not None
+    assert state.pose.alignment is not None
     assert state.light.filter.gains[LAMPS[0].lamp_id][0][0] == 0.2
-    assert state.absolute.since == state.next_key
-    np.testing.assert_array_equal(state.atlas.askew, image.P)
+    assert state.pose.alignment.since == state.map.next_key
+    np.testing.assert_array_equal(state.relocalisation.P_left, image.P)
     assert image.P.any()

@@ -10,7 +10,7 @@ import pytest
 from estimator.mapping.keyframe import ANYWHERE, Keyframe, Submap
 from estimator.mapping.pose_graph import UPPER, Graph
 from estimator.mapping.relative_covariance import UNTIED, tied
-from estimator.mapping.submap_graph import Atlas
+from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import Array
 from estimator.numerics import se2
 
@@ -82,7 +82,7 @@ def frame(key: int, T: Array) -> Keyframe:
 
 
 def test_the_way_since_a_submap_strays_as_the_place_in_it_does() -> None:
-    atlas, rng = Atlas(), np.random.default_rng(5)
+    atlas, rng = SubmapGraph(), np.random.default_rng(5)
     T = np.array((40.0, -20.0, 0.4))
     P = np.diag((1e-4, 2e-4, 1e-5))
     for key in range(1, 60):
@@ -97,7 +97,7 @@ def test_the_way_since_a_submap_strays_as_the_place_in_it_does() -> None:
 
 
 def test_no_way_leads_across_a_break_nor_into_a_stored_map() -> None:
-    atlas, T = Atlas(), np.array((5.0, 2.0, 0.4))
+    atlas, T = SubmapGraph(), np.array((5.0, 2.0, 0.4))
     atlas.add(frame(1, T), 1e-4 * np.eye(3), 0.01, anew=False)
     atlas.add(frame(2, T), 1e-4 * np.eye(3), 0.01, anew=True)
     assert np.trace(atlas.apart(atlas.submaps[1], T)) > 0.9 * np.trace(ANYWHERE)
@@ -107,7 +107,7 @@ def test_no_way_leads_across_a_break_nor_into_a_stored_map() -> None:
 
 
 def test_a_loop_ties_the_place_to_what_lies_about_it() -> None:
-    atlas, T = Atlas(), np.zeros(3)
+    atlas, T = SubmapGraph(), np.zeros(3)
     for key in range(1, 40):
         atlas.add(frame(key, T), 0.01 * np.eye(3), 0.01, anew=False)
         T = se2.compose(T, np.array((0.25, 0.0, 0.0)))

@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimator.fusion import map_odom_filter
-from estimator.fusion.map_odom_filter import Absolute
+from estimator.fusion.map_pose import SurveyAlignment
 from estimator.measurements import Array
 from estimator.numerics import se2
 from estimator.paper import point_to_point_sums, pose_weighting
 from estimator.pipeline import new_state
 from estimator.result import Fix, LightsResult
 from estimator.scan_matching.scan_matcher import MatchSettings, Prior, attempt
+from estimator.state import State
 from tests.estimator.scan_matching.test_icp import WIDE, pair_of
 from tests.estimator.world import prior_at
 from tools.bench.support.scenes import paper_room
@@ -132,21 +133,26 @@ def test_the_default_matcher_weighs_as_the_matrix_does() -> None:
     assert np.mean(apart) < 0.12
 
 
+def gain(state: State, told: LightsResult) -> None:
+    """Take in an epoch that has the robot where it is, without wheels."""
+    map_odom_filter.gain(state.pose, state.motion, False, (told, np.zeros(3), np.zeros(3)), state.map.next_key)
+
+
 def test_the_same_light_taken_twice_is_news_once() -> None:
-    """`fused` takes what links have added, through T_map_odom, within one filter's worth for each stretch of way."""
+    """The pose takes what links have added, through T_map_odom, within one filter's worth for each stretch of way."""
     state = new_state()
-    tie = state.absolute = Absolute(placed=True, proved=True, fresh=1.0)
+    tie = state.pose.alignment = SurveyAlignment(placed=True, proved=True, fresh=1.0)
     tie.P, tie.X = np.diag((0.04, 0.04, 0.01)), np.zeros((3, 3))
     P = np.diag((0.02, 0.02, 0.005))
     told = LightsResult(0.0, Fix.GOOD, np.zeros(3), P, (), frozenset(), np.linalg.inv(P), np.zeros(3))
     once = copy.deepcopy(state)
-    map_odom_filter.gain(once, told, np.zeros(3), np.zeros(3))
+    gain(once, told)
     twice = copy.deepcopy(once)
-    map_odom_filter.gain(twice, told, np.zeros(3), np.zeros(3))
-    assert once.absolute is not None
-    assert twice.absolute is not None
-    np.testing.assert_allclose(once.absolute.P, np.linalg.inv(np.linalg.inv(tie.P) + np.linalg.inv(P)), rtol=1e-6)
-    np.testing.assert_allclose(twice.absolute.P, once.absolute.P, rtol=1e-6)
-    tie.P = once.absolute.P.copy()
-    map_odom_filter.gain(state, replace(told, gained=np.zeros((3, 3))), np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(tie.P, once.absolute.P, rtol=1e-6)
+    gain(twice, told)
+    assert once.pose.alignment is not None
+    assert twice.pose.alignment is not None
+    np.testing.assert_allclose(once.pose.alignment.P, np.linalg.inv(np.linalg.inv(tie.P) + np.linalg.inv(P)), rtol=1e-6)
+    np.testing.assert_allclose(twice.pose.alignment.P, once.pose.alignment.P, rtol=1e-6)
+    tie.P = once.pose.alignment.P.copy()
+    gain(state, replace(told, gained=np.zeros((3, 3))))
+    np.testing.assert_allclose(tie.P, once.pose.alignment.P, rtol=1e-6)

@@ -74,7 +74,7 @@ def test_people_who_step_up_to_a_robot_that_stands_and_leave_are_nothing_strange
             about = [crowd(here, min(10, k // 5), rng)] if 0 < k < 60 else []
             robot.scene = Scene(np.vstack((empty.walls, *about)), empty.low, empty.high)
         robot.at(here, carried=True)
-        assert robot.state.suspicion.strange_s == 0.0
+        assert robot.state.relocalisation.suspicion.strange_s == 0.0
     assert len(told) == 80
     assert not any(told)
 
@@ -84,7 +84,7 @@ class Looker:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, period: float = 0.1) -> None:
         self.state, self.t, self.period, self.against, self.usual = new_state(), 0.0, period, False, 0.0
-        self.state.suspicion.period_s = period
+        self.state.relocalisation.suspicion.period_s = period
         self.share = 0.25
         monkeypatch.setattr(kidnap_detection, "looked_through", lambda *_: self.share if self.against else self.usual)
 
@@ -96,9 +96,9 @@ class Looker:
         for _ in range(count):
             begin, self.t = self.t, self.t + self.period
             if way is not None:
-                self.state.fused.t_odometry = self.t
+                self.state.motion.t_odometry = self.t
                 kidnap_detection.on_odometry(self.state, Odometry(begin, self.t, np.array((way, 0.0, yaw))))
-            self.state.fused.t_mono, self.state.t_scan = self.t, begin
+            self.state.motion.t_mono, self.state.matching.t_scan = self.t, begin
             scan = scan_in(IMAGE, se2.identity(), BEAMS, np.random.default_rng(0), t=self.t)
             points = points_of(scan, se2.identity(), 80.0, 0.0)
             match = no_match(se2.identity(), 1, Reason.CONVERGED if ok else Reason.REJECTED)
@@ -135,7 +135,7 @@ def test_what_has_just_stopped_still_rolls(monkeypatch: pytest.MonkeyPatch) -> N
     for strange in (2, 5):
         looker.scans(10, False, way=0.1)
         assert not any(looker.scans(strange, True) + looker.scans(10, False))
-        assert looker.state.suspicion.t_strange == -np.inf
+        assert looker.state.relocalisation.suspicion.t_strange == -np.inf
     looker.scans(10, False, way=0.1)
     looker.scans(4, False)
     looker.scans(6, True)
@@ -223,12 +223,12 @@ def test_a_gap_between_scans_does_not_count_as_strange(monkeypatch: pytest.Monke
         looker.period = 0.4
         looker.scans(1, True)
         looker.period = 0.1
-    assert looker.state.suspicion.strange_s == pytest.approx(0.6)  # six scans
-    looker.state.suspicion.strange_s = 0.0
+    assert looker.state.relocalisation.suspicion.strange_s == pytest.approx(0.6)  # six scans
+    looker.state.relocalisation.suspicion.strange_s = 0.0
     late = looker.t
     looker.scans(1, True)
-    looker.state.t_scan = looker.t = late  # a scan that is no later than the one before
-    assert looker.state.suspicion.strange_s == pytest.approx(0.1)
+    looker.state.matching.t_scan = looker.t = late  # a scan that is no later than the one before
+    assert looker.state.relocalisation.suspicion.strange_s == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(("between", "told"), [(8, True), (12, False)])
@@ -264,6 +264,6 @@ def test_one_blurred_scan_when_the_wheels_stop_is_not_what_is_usual(monkeypatch:
 def test_stamps_of_the_wheels_that_go_back_begin_the_rest_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     looker = Looker(monkeypatch)
     looker.scans(5, False, way=0.1)
-    assert looker.state.suspicion.t_rest == 0.5
+    assert looker.state.relocalisation.suspicion.t_rest == 0.5
     kidnap_detection.on_odometry(looker.state, Odometry(0.2, 0.3, np.zeros(3)))
-    assert looker.state.suspicion.t_rest == 0.3
+    assert looker.state.relocalisation.suspicion.t_rest == 0.3

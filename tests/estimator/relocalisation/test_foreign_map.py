@@ -13,10 +13,11 @@ import pytest
 from daemon.integrity.observer import Observer
 from daemon.snapshot import State as Said
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.map_snapshot import MapImage, image_of, restored
+from estimator.mapping.map_snapshot import MapImage
 from estimator.measurements import Command, Order, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state
+from estimator.stored_map import image_of, restored
 from tools.experiments.relocation.trial import Robot
 from tools.experiments.relocation.worlds import Site, Stroll, lit_house, odometry
 from tools.sim.building.people import Crowd
@@ -59,7 +60,7 @@ def test_a_map_of_another_frame_comes_to_where_light_has_the_robot_and_is_the_su
     image = made()
     before = {piece.key: piece.T_map_submap for piece in image.submaps}
     state = restored(image, Settings(), LightsSetup(SITE.survey, clock_ppm=0.0))
-    assert state.atlas.foreign
+    assert state.relocalisation.unaligned
     robot = Robot(state, Observer(0.0, odometry=True, lidar=True, lights=True))
     off, said = [], []
     for arrived in records(50.0, lit=True):
@@ -67,20 +68,20 @@ def test_a_map_of_another_frame_comes_to_where_light_has_the_robot_and_is_the_su
         robot.take(t, arrived)
         off.append(robot.moment(t, WAY.at(np.array([robot.t_mono]))[0]).off_m)
         said.append(robot.memory.state)
-        if said[-1] is Said.TRACKING and state.atlas.watch is not None:
+        if said[-1] is Said.TRACKING and state.map.parts.trial is not None:
             assert not image_of(state).identity.surveyed
-        if len(said) > 140 and state.atlas.watch is None:
+        if len(said) > 140 and state.map.parts.trial is None:
             break
-    assert state.atlas.adrift is None
-    assert not state.atlas.foreign
+    assert state.map.parts.detached is None
+    assert not state.relocalisation.unaligned
     assert max(off[-20:]) < 0.15
     wrong = [m for m, state_said in zip(off, said, strict=True) if state_said is Said.TRACKING and m > 0.5]
     assert not wrong
     for key, T_own in before.items():
         true = se2.between(FRAME, T_own)
-        x, y, yaw = se2.between(true, state.atlas.submaps[key].T_map_submap).tolist()
+        x, y, yaw = se2.between(true, state.map.graph.submaps[key].T_map_submap).tolist()
         assert np.hypot(x, y) < 0.2
         assert abs(yaw) < 0.06
     assert image_of(state).identity.surveyed
-    listed = {key for keys in state.places.values() for key in keys}
-    assert set(state.keyframes) <= listed
+    listed = {key for keys in state.map.places.values() for key in keys}
+    assert set(state.map.keyframes) <= listed

@@ -7,12 +7,12 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from estimator.fusion import map_odom_filter
+from estimator.fusion import light_witness
 from estimator.light_filter.light_channel import LightsSetup
 from estimator.measurements import Array, Command, Order
 from estimator.numerics import se2
 from estimator.pipeline import new_state
-from estimator.relocalisation import global_scan_match, kidnap_detection
+from estimator.relocalisation import global_scan_match, kidnap_detection, relocalisation, unaligned_map
 from estimator.relocalisation.global_scan_match import Fit, Looked, Verdict
 from estimator.relocalisation.hypothesis_tracking import Question
 from tests.estimator.adrift import Robot, furnished, way
@@ -43,12 +43,12 @@ def driven(
     """
     poses = way(tuple(corners), step_m)
     state = new_state(lights=lights)
-    state.T_map_odom = poses[0].copy()  # the map's frame is the building's
+    state.pose.T_map_odom = poses[0].copy()  # the map's frame is the building's
     robot = Robot(state, scene)
     said = [robot.at(T).places for T in poses]
     assert set(said) == {None}
     assert robot.off()[0] < 0.1
-    assert bool(state.atlas.settled()) is not young
+    assert bool(state.map.graph.settled()) is not young
     return robot
 
 
@@ -96,10 +96,10 @@ def test_a_cupboard_that_is_carried_away_takes_nothing_from_a_place_that_is_like
     chest = Scene(np.vstack((plain.walls, np.array(box(6.6, 6.15, 7.4, 6.9)))), plain.low, plain.high)
     robot = driven(chest, TOUR)
     assert robot.T is not None
-    asked = robot.state.suspicion.t_asked
+    asked = robot.state.relocalisation.suspicion.t_asked
     robot.scene = plain
     assert set(stand(robot, robot.T, 20)) == {None}
-    assert robot.state.suspicion.t_asked > asked, "it has looked for itself"
+    assert robot.state.relocalisation.suspicion.t_asked > asked, "it has looked for itself"
 
 
 def test_in_a_map_of_which_nothing_is_finished_a_jump_is_enough_and_a_covered_lidar_is_not() -> None:
@@ -120,11 +120,11 @@ def test_a_covered_lidar_takes_nothing_from_a_place_that_is_like_no_other(scans:
     here = robot.T
     stand(robot, here, scans, covered=True)
     assert set(stand(robot, here, 20)) == {None}
-    assert robot.state.suspicion.t_asked < 0.0, "it sees what it saw"
-    laid = robot.state.next_key
+    assert robot.state.relocalisation.suspicion.t_asked < 0.0, "it sees what it saw"
+    laid = robot.state.map.next_key
     for T in way(((5.85, 6.0), (5.85, 1.5)), 0.08):
         assert robot.at(T).places is None
-    assert robot.state.next_key > laid, "and the map goes on"
+    assert robot.state.map.next_key > laid, "and the map goes on"
     assert robot.off()[0] < 0.1
 
 
@@ -139,7 +139,7 @@ def test_wheels_that_turn_while_the_lidar_is_covered_say_that_nobody_carries_the
         robot.at(T, covered=True)
     for T in poses[25:]:
         assert robot.at(T).places is None
-        assert robot.state.suspicion.fitted == 0, "it was seen to drive"
+        assert robot.state.relocalisation.suspicion.fitted == 0, "it was seen to drive"
 
 
 def test_wheels_that_tell_nothing_do_not_say_that_the_robot_was_not_carried() -> None:
@@ -163,26 +163,26 @@ def test_people_who_stand_about_and_leave_are_no_reason() -> None:
         legs = np.array(box(x, y, x + 0.12, y + 0.12) + box(x + 0.3, y - 0.2, x + 0.42, y - 0.08), dtype=np.float64)
         robot.scene = Scene(np.vstack((plain.walls, legs)), plain.low, plain.high) if 20 < k < 100 else plain
         assert robot.at(robot.T).places is None
-    assert robot.state.suspicion.t_asked < 0.0
+    assert robot.state.relocalisation.suspicion.t_asked < 0.0
 
 
 def test_a_lidar_that_turns_once_a_second_is_no_covered_one() -> None:
     robot = driven(IMAGE, ABOUT)
     assert robot.T is not None
-    state, here, asked = robot.state, robot.T, robot.state.suspicion.t_asked
+    state, here, asked = robot.state, robot.T, robot.state.relocalisation.suspicion.t_asked
     for _ in range(30):
         robot.t += 0.9
         robot.at(here)
     for _ in range(30):
         robot.t += 0.9
         assert robot.at(here).places is None
-        assert state.suspicion.fitted == 0
-    assert state.suspicion.t_asked == asked
+        assert state.relocalisation.suspicion.fitted == 0
+    assert state.relocalisation.suspicion.t_asked == asked
 
 
 def test_light_that_has_told_the_place_once_says_nothing_of_a_robot_that_is_carried_in_the_dark() -> None:
     robot = driven(IMAGE, ABOUT, lights=LightsSetup())
-    tie = robot.state.absolute
+    tie = robot.state.pose.alignment
     assert tie is not None
     assert robot.T is not None
     tie.placed, tie.gap = True, 0.0  # the lamps went out then
@@ -196,12 +196,12 @@ def test_a_reset_ends_every_suspicion() -> None:
     assert robot.T is not None
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
     robot.at(there, carried=True)
-    assert robot.state.suspicion.jumped
+    assert robot.state.relocalisation.suspicion.jumped
     robot.at(there, Command(robot.t, Order.RESET))
-    doubt = robot.state.suspicion
-    assert (doubt.fitted, doubt.jumped, doubt.share, doubt.job) == (0, False, 0.0, 0)
+    doubt = robot.state.relocalisation.suspicion
+    assert (doubt.fitted, doubt.jumped, doubt.share, doubt.question) == (0, False, 0.0, None)
     assert set(stand(robot, there, 10)) == {None}
-    assert robot.state.anew == 0
+    assert robot.state.matching.restarts == 0
 
 
 def test_a_map_of_one_scan_is_begun_anew_where_the_robot_was_put_down() -> None:
@@ -209,15 +209,15 @@ def test_a_map_of_one_scan_is_begun_anew_where_the_robot_was_put_down() -> None:
     robot = Robot(new_state(), IMAGE)
     here = np.array((-1.5, -1.0, 0.0))
     stand(robot, here, 10)
-    assert list(robot.state.keyframes) == [1]
+    assert list(robot.state.map.keyframes) == [1]
     there = se2.compose(OTHER_END, se2.compose(here, np.array((0.6, 0.1, 0.2))))
     assert set(stand(robot, there, 10)) == {None}
     state = robot.state
-    assert list(state.keyframes) == [2]
-    assert [submap.first for submap in state.atlas.submaps.values()] == [2]
-    off = se2.between(state.T_map_start, se2.compose(state.T_map_odom, state.fused.T_odom_base))
+    assert list(state.map.keyframes) == [2]
+    assert [submap.first for submap in state.map.graph.submaps.values()] == [2]
+    off = se2.between(state.map.T_map_start, se2.compose(state.pose.T_map_odom, state.motion.T_odom_base))
     assert np.abs(off).max() < 0.03, "it starts here"
-    assert state.anew == 1
+    assert state.matching.restarts == 1
 
 
 @pytest.mark.parametrize("covered", [False, True])
@@ -234,10 +234,10 @@ def test_a_search_that_had_to_be_ended_does_not_say_that_there_is_no_other_place
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array(moved)))
     if covered:
         stand(robot, there, 15, covered=True)
-    asked = robot.state.atlas.next_job
+    asked = robot.state.jobs.next_id
     said = stand(robot, there, 15)
     assert said[-1] is not None
-    assert robot.state.atlas.next_job - asked < 8, "it is not looked for again and again"
+    assert robot.state.jobs.next_id - asked < 8, "it is not looked for again and again"
 
 
 def test_nothing_is_laid_into_the_map_until_the_answer_has_come() -> None:
@@ -246,11 +246,15 @@ def test_nothing_is_laid_into_the_map_until_the_answer_has_come() -> None:
     state, robot.late = robot.state, 8
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((0.2, 0.1, 0.1))))
     stand(robot, there, 15, covered=True)
-    laid, places = state.next_key, None
+    laid, places = state.map.next_key, None
     for k in range(1, 13):
         places = places or robot.at(se2.compose(there, np.array((-0.12 * k, 0.0, 0.0)))).places
-        assert state.next_key == laid or places is not None
-        assert state.suspicion.fitted > 0 or state.suspicion.question is not None or places is not None
+        assert state.map.next_key == laid or places is not None
+        assert (
+            state.relocalisation.suspicion.fitted > 0
+            or state.relocalisation.suspicion.question is not None
+            or places is not None
+        )
     assert places is not None
 
 
@@ -262,7 +266,7 @@ def test_an_answer_that_comes_late_counts_and_takes_what_was_laid_meanwhile_with
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
     x, y, yaw = there.tolist()
     ahead = (x + np.cos(yaw), y + np.sin(yaw))
-    before, most, begun = state.next_key, 0, [0]
+    before, most, begun = state.map.next_key, 0, [0]
     poses = way(((x, y), ahead, (0.0, 0.0), (1.0, 0.0), (-1.0, 0.5), (1.0, 0.5)), 0.08)
     robot.at(poses[0], carried=True)
     said = []
@@ -270,13 +274,13 @@ def test_an_answer_that_comes_late_counts_and_takes_what_was_laid_meanwhile_with
         said.append(robot.at(T).places)
         robot.late = 3 if said[-1] is not None else robot.late
         if said[-1] is None:
-            most, begun = state.next_key, [submap.first for submap in state.atlas.submaps.values()]
+            most, begun = state.map.next_key, [submap.first for submap in state.map.graph.submaps.values()]
     assert most > before, "the map has gone on"
     assert before in begun, "in a submap of its own, or a part of it would stay in an older one"
     assert said[-1] is not None
-    assert state.atlas.since >= most
-    assert not [key for key in state.keyframes if before <= key < most], "or it would be found there again"
-    assert all(submap.first < before or submap.first >= most for submap in state.atlas.submaps.values())
+    assert state.map.parts.detached_since >= most
+    assert not [key for key in state.map.keyframes if before <= key < most], "or it would be found there again"
+    assert all(submap.first < before or submap.first >= most for submap in state.map.graph.submaps.values())
 
 
 def test_a_look_that_never_answers_is_made_again() -> None:
@@ -284,7 +288,7 @@ def test_a_look_that_never_answers_is_made_again() -> None:
     assert robot.T is not None
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
     assert set(stand(robot, there, 5)) == {None}
-    assert robot.state.suspicion.question is not None
+    assert robot.state.relocalisation.suspicion.question is not None
     robot.due = []
     assert set(stand(robot, there, 90)) == {None}
     assert stand(robot, there, 25)[-1] is not None
@@ -293,7 +297,7 @@ def test_a_look_that_never_answers_is_made_again() -> None:
 def test_a_jump_while_a_look_is_under_way_is_not_forgotten() -> None:
     robot = driven(IMAGE, ABOUT)
     assert robot.T is not None
-    doubt, asked = robot.state.suspicion, Question(False, True, False)
+    doubt, asked = robot.state.relocalisation.suspicion, Question(False, True, False)
     doubt.question, doubt.t_asked = asked, robot.t
     there = se2.compose(OTHER_END, se2.compose(robot.T, np.array((-0.7, 0.2, 0.3))))
     assert set(stand(robot, there, 6)) == {None}
@@ -328,15 +332,15 @@ def test_after_a_leap_it_is_adrift_where_another_place_fits(
         complete,
         0,
     )
-    state.suspicion.question = asked = Question(False, True, False, True)
+    state.relocalisation.suspicion.question = asked = Question(False, True, False, True)
     kidnap_detection.answered(state, asked, said)
-    assert (state.atlas.adrift is not None) is bool(carried)
+    assert (state.map.parts.detached is not None) is bool(carried)
     if carried is None:
-        assert state.suspicion.fitted > 0
-        assert state.suspicion.leapt
-        state.suspicion.question = again = Question(False, True, True, True)
+        assert state.relocalisation.suspicion.fitted > 0
+        assert state.relocalisation.suspicion.leapt
+        state.relocalisation.suspicion.question = again = Question(False, True, True, True)
         kidnap_detection.answered(state, again, said)
-        assert state.atlas.adrift is not None
+        assert state.map.parts.detached is not None
 
 
 def test_a_leap_in_a_map_of_which_nothing_is_finished_is_let_go() -> None:
@@ -345,8 +349,8 @@ def test_a_leap_in_a_map_of_which_nothing_is_finished_is_let_go() -> None:
     assert robot.T is not None
     robot.scene = IMAGE
     assert set(stand(robot, robot.T, 20)) == {None}
-    assert robot.state.suspicion.question is None
-    assert not robot.state.suspicion.leapt
+    assert robot.state.relocalisation.suspicion.question is None
+    assert not robot.state.relocalisation.suspicion.leapt
 
 
 @pytest.mark.parametrize("since", [True, False])
@@ -357,8 +361,9 @@ def test_a_leap_while_light_told_the_place_is_judged_when_it_tells_no_more(
     robot = driven(CUPBOARD, ABOUT)
     assert robot.T is not None
     here, lit, last = robot.T, [True], [robot.t]
-    monkeypatch.setattr(map_odom_filter, "tells", lambda _: lit[0])
-    monkeypatch.setattr(map_odom_filter, "told_last", lambda _: last[0])
+    for user in (kidnap_detection, relocalisation, unaligned_map):
+        monkeypatch.setattr(user, "light_holds", lambda *_: lit[0])
+    monkeypatch.setattr(light_witness, "last_used", lambda _: last[0])
     there = se2.compose(OTHER_END, here)
     assert set(stand(robot, there, 10)) == {None}
     lit[0], last[0] = False, robot.t if since else last[0]

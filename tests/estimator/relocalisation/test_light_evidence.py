@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimator.light_filter.initialisation import rule_out
-from estimator.light_filter.light_channel import LightsSetup
+from estimator.light_filter.light_channel import LightsSetup, too_strong_at
 from estimator.mapping.keyframe import Settled, Submap
 from estimator.measurements import UNLIMITED, Array, LightEpoch, Odometry
 from estimator.numerics import se2
@@ -29,7 +29,6 @@ from estimator.relocalisation.light_evidence import (
     in_place,
     misplaced,
     out_of_place,
-    received,
     told,
     windows,
     witness,
@@ -69,8 +68,8 @@ def robot(reused: bool = False, surveyed: bool = True, walls: bool = False) -> S
     state = new_state(lights=LightsSetup((walled() if walls else site(reused)).survey, clock_ppm=0.0))
     settled = Settled(np.zeros((0, 8), np.float32), None, 0.01)  # type: ignore[arg-type]  # nobody looks at it here
     placed = (np.zeros(3), np.eye(3)) if surveyed else None
-    state.atlas.submaps[1] = Submap(1, 1, np.zeros(3), np.zeros(3), settled=settled, light=placed)
-    state.atlas.adrift, state.atlas.since = 2, 2
+    state.map.graph.submaps[1] = Submap(1, 1, np.zeros(3), np.zeros(3), settled=settled, light=placed)
+    state.map.parts.detached, state.map.parts.detached_since = 2, 2
     return state
 
 
@@ -88,7 +87,7 @@ def inside(window: Window, at: Array) -> bool:
 
 def test_light_gives_one_small_window_that_holds_the_place_at_any_heading() -> None:
     state = shown(robot())
-    (window,) = windows(state)
+    (window,) = windows(state.light, state.map.graph)
     assert inside(window, HERE)
     assert window.reach_m < 1.0
     assert window.chance == pytest.approx(1.0, abs=1e-3)
@@ -97,10 +96,10 @@ def test_light_gives_one_small_window_that_holds_the_place_at_any_heading() -> N
 def test_what_fits_is_compatible_and_what_lies_elsewhere_is_not() -> None:
     state = shown(robot())
     for turn in (0.0, 1.5, 3.0):
-        assert compatible(state, HERE + np.array((0.05, -0.05, turn))) is True
-    assert compatible(state, HERE + np.array((3.0, 0.0, 0.0))) is False
-    assert witness(state, HERE)
-    assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
+        assert compatible(state.light, state.map.graph, HERE + np.array((0.05, -0.05, turn))) is True
+    assert compatible(state.light, state.map.graph, HERE + np.array((3.0, 0.0, 0.0))) is False
+    assert witness(state.light, state.map.graph, HERE)
+    assert not witness(state.light, state.map.graph, HERE + np.array((3.0, 0.0, 0.0)))
 
 
 def test_a_heading_from_light_rules_a_place_out_only_after_some_way() -> None:
@@ -112,31 +111,31 @@ def test_a_heading_from_light_rules_a_place_out_only_after_some_way() -> None:
     lights.tracks[0].P[:3, :3] = np.diag((0.01, 0.01, 0.001))
     for way, told_apart in ((0.5, False), (HEADED_M + 0.5, True)):
         lights.course.way = lights.way_start + way
-        assert compatible(state, HERE) is True
-        assert compatible(state, HERE + np.array((0.0, 0.0, 1.5))) is not told_apart
-        assert compatible(state, HERE + np.array((3.0, 0.0, 0.0))) is False
+        assert compatible(state.light, state.map.graph, HERE) is True
+        assert compatible(state.light, state.map.graph, HERE + np.array((0.0, 0.0, 1.5))) is not told_apart
+        assert compatible(state.light, state.map.graph, HERE + np.array((3.0, 0.0, 0.0))) is False
 
 
 def test_before_the_first_epoch_and_in_another_frame_light_says_nothing() -> None:
     dark, foreign = robot(), shown(robot(surveyed=False))
     for state in (dark, foreign):
-        assert windows(state) == ()
-        assert compatible(state, HERE) is None
-        assert not witness(state, HERE)
-    assert not told(foreign)
-    assert not told(new_state())
+        assert windows(state.light, state.map.graph) == ()
+        assert compatible(state.light, state.map.graph, HERE) is None
+        assert not witness(state.light, state.map.graph, HERE)
+    assert not told(foreign.light, foreign.map.graph)
+    assert not told(None, new_state().map.graph)
 
 
 def test_codes_that_repeat_give_a_window_for_each_place_and_no_witness() -> None:
     """Rooms 0 and 2 to the south send the same codes in the same pattern."""
     at, twin = np.array((2.2, 3.0, 0.4)), np.array((14.2, 3.0, 0.4))
     state = shown(robot(reused=True), at, reused=True)
-    found = windows(state)
+    found = windows(state.light, state.map.graph)
     assert len(found) == 2
     assert {inside(found[0], at), inside(found[1], at)} == {True, False}
     assert all(inside(window, at) or inside(window, twin) for window in found)
-    assert compatible(state, at) is True
-    assert not witness(state, at)
+    assert compatible(state.light, state.map.graph, at) is True
+    assert not witness(state.light, state.map.graph, at)
 
 
 def test_a_robot_carried_off_is_looked_for_where_the_latest_light_came_from() -> None:
@@ -144,11 +143,11 @@ def test_a_robot_carried_off_is_looked_for_where_the_latest_light_came_from() ->
     state = shown(robot())
     state.light.filter.tracks = state.light.filter.tracks[:1]  # type: ignore[union-attr]  # as after some way
     state.light.filter.t_odd = 0.5  # type: ignore[union-attr]
-    (window,) = windows(state)
+    (window,) = windows(state.light, state.map.graph)
     assert inside(window, HERE)
-    assert compatible(state, HERE) is True
-    assert witness(state, HERE)
-    assert not witness(state, HERE + np.array((3.0, 0.0, 0.0)))
+    assert compatible(state.light, state.map.graph, HERE) is True
+    assert witness(state.light, state.map.graph, HERE)
+    assert not witness(state.light, state.map.graph, HERE + np.array((3.0, 0.0, 0.0)))
 
 
 def test_on_which_side_of_a_row_of_lamps_a_robot_stands_is_left_to_the_laser() -> None:
@@ -156,10 +155,10 @@ def test_on_which_side_of_a_row_of_lamps_a_robot_stands_is_left_to_the_laser() -
     state, at = shown(robot(walls=True), HERE, walls=True), np.array((5.96, 7.25, 0.3))
     state.light.filter.tracks = state.light.filter.tracks[:1]  # type: ignore[union-attr]  # as after some way
     shown(state, at, walls=True, begin=0.6)
-    assert len(windows(state)) > 1
-    assert any(inside(window, at) for window in windows(state))
-    assert witness(state, at)
-    assert not witness(state, at + np.array((3.0, 0.0, 0.0)))
+    assert len(windows(state.light, state.map.graph)) > 1
+    assert any(inside(window, at) for window in windows(state.light, state.map.graph))
+    assert witness(state.light, state.map.graph, at)
+    assert not witness(state.light, state.map.graph, at + np.array((3.0, 0.0, 0.0)))
 
 
 @pytest.mark.parametrize(("rims", "kept"), [(0.7, True), (4.8, False)])
@@ -195,7 +194,7 @@ def test_one_epoch_by_itself_rules_no_place_out_for_good() -> None:
         lights = state.light.filter  # type: ignore[union-attr]
         lights.tracks, lights.t_odd = lights.tracks[:1], contradiction
         there = Hypothesis(HERE + np.array((5.0, 0.0, 0.0)))
-        assert compatible(state, there.T_map_odom) is False
+        assert compatible(state.light, state.map.graph, there.T_map_odom) is False
         assert relocalisation.ruled_out(state, there) == math.isinf(contradiction)
         assert not relocalisation.ruled_out(state, Hypothesis(HERE))
 
@@ -206,23 +205,27 @@ def test_lamps_behind_walls_are_no_witness_against_a_place() -> None:
     links = state.light.result.links  # type: ignore[union-attr]
     used, against = sum(link.state is LinkState.ACCEPTED for link in links), sum(link.against for link in links)
     assert against > AGAINST * (used + against)
-    assert witness(state, at)
+    assert witness(state.light, state.map.graph, at)
 
 
 def test_a_robot_found_in_somebody_s_hands_is_looked_for_again_when_it_is_put_down() -> None:
     """It was carried on for a moment, by less than a lamp's light would tell; the filter is still at its old place."""
     for unheard in (True, False):
         state = shown(robot())
-        state.atlas.adrift, state.atlas.since, state.failures = None, 0, relocalisation.UNFIT
-        state.T_map_odom = se2.compose(HERE + np.array((0.2, 0.0, 0.0)), se2.inverse(state.fused.T_odom_base))
-        tie, lights = state.absolute, state.light.filter  # type: ignore[union-attr]
+        state.map.parts.detached, state.map.parts.detached_since, state.matching.failures = (
+            None,
+            0,
+            relocalisation.UNFIT,
+        )
+        state.pose.T_map_odom = se2.compose(HERE + np.array((0.2, 0.0, 0.0)), se2.inverse(state.motion.T_odom_base))
+        tie, lights = state.pose.alignment, state.light.filter  # type: ignore[union-attr]
         tie.placed, tie.proved, tie.unheard, lights.lost = True, True, unheard, True  # type: ignore[union-attr]
         tie.gap = None  # type: ignore[union-attr]
         relocalisation.doubt(state)
-        assert (state.atlas.adrift is not None) == unheard
-    state.atlas.adrift = None
+        assert (state.map.parts.detached is not None) == unheard
+    state.map.parts.detached = None
     for lost, gap, agree in ((False, None, True), (True, 1.0, True), (True, 1e3, False), (True, None, False)):
-        lights.lost, tie.gap, tie.unheard, state.failures = lost, gap, True, 0  # type: ignore[union-attr]
+        lights.lost, tie.gap, tie.unheard, state.matching.failures = lost, gap, True, 0  # type: ignore[union-attr]
         relocalisation.doubt(state)
         assert tie.unheard != agree  # type: ignore[union-attr]
 
@@ -231,11 +234,11 @@ def test_a_robot_found_in_somebody_s_hands_is_looked_for_again_when_it_is_put_do
 def test_light_alone_knows_the_place_only_while_it_tells(since_s: float, lost: bool, known: bool) -> None:
     """A robot that was just put down is where the filter last had it for nobody but the filter."""
     state = shown(robot())
-    assert state.absolute is not None
+    assert state.pose.alignment is not None
     assert state.light is not None
-    state.absolute.placed, state.light.filter.lost = True, lost
-    state.absolute.t_match = state.fused.t_mono - 5.0
-    state.light.filter.t_used = state.fused.t_mono - since_s
+    state.pose.alignment.placed, state.light.filter.lost = True, lost
+    state.pose.alignment.t_match = state.motion.t_mono - 5.0
+    state.light.filter.t_used = state.motion.t_mono - since_s
     assert (relocalisation.places(state) is None) == known
 
 
@@ -244,35 +247,35 @@ def test_a_robot_that_light_has_elsewhere_is_adrift_after_a_while_and_at_once_wh
     for failures, patience in ((0, True), (2, False)):
         state = shown(robot())
         state.light.filter.lost = True  # type: ignore[union-attr]  # it has had to look for a new place
-        state.T_map_odom, state.failures = HERE + np.array((5.0, 0.0, 0.0)), failures
-        state.atlas.adrift, state.atlas.since = None, 0
-        assert disputed(state)
-        assert elsewhere(state, state.T_map_odom)
-        assert not elsewhere(state, HERE)
+        state.pose.T_map_odom, state.matching.failures = HERE + np.array((5.0, 0.0, 0.0)), failures
+        state.map.parts.detached, state.map.parts.detached_since = None, 0
+        assert disputed(state.light, state.map.graph)
+        assert elsewhere(state.light, state.map.graph, state.pose.T_map_odom)
+        assert not elsewhere(state.light, state.map.graph, HERE)
         relocalisation.step_done(state)
-        assert (state.atlas.adrift is None) == patience
+        assert (state.map.parts.detached is None) == patience
         if patience:
-            state.absolute.elsewhere_since -= 3.1  # type: ignore[union-attr, operator]  # a while later
+            state.pose.alignment.elsewhere_since -= 3.1  # type: ignore[union-attr, operator]  # a while later
         relocalisation.step_done(state)
-        assert state.atlas.adrift == 2
+        assert state.map.parts.detached == 2
 
 
 def test_light_that_has_gone_says_nothing() -> None:
     state = shown(robot())
     step(state, [Odometry(0.6, 1.5, np.zeros(3))], UNLIMITED)
-    assert windows(state) == ()
+    assert windows(state.light, state.map.graph) == ()
 
 
 def test_a_lamp_that_says_which_one_it_is_rules_out_the_other_room_at_rest() -> None:
     at = np.array((2.2, 3.0, 0.4))
     state = shown(robot(reused=True), at, reused=True)
-    assert len(windows(state)) == 2
+    assert len(windows(state.light, state.map.graph)) == 2
     way = Stroll(at, 0.0, 0.0)
     told_by_itself = [one for one in site(True).light(way.at, (0.0, 3.6), 1) if any(one.lamps)]
     for epoch in told_by_itself[:3]:
         moved = [Odometry(0.6, epoch.t_end, np.zeros(3))] if epoch is told_by_itself[0] else []
         step(state, [*moved, epoch], UNLIMITED)
-    (window,) = windows(state)
+    (window,) = windows(state.light, state.map.graph)
     assert inside(window, at)
 
 
@@ -292,20 +295,20 @@ def test_lamps_that_say_which_they_are_end_a_start_in_the_wrong_room() -> None:
     rule_out(lights, epoch)
     assert not lights.tracks
     step(state, [Odometry(0.6, epoch.t_end, np.zeros(3)), epoch], UNLIMITED)
-    (window,) = windows(state)
+    (window,) = windows(state.light, state.map.graph)
     assert inside(window, at)
 
 
 def test_light_that_has_long_told_the_place_is_enough_where_the_map_knows_nothing() -> None:
     state = shown(robot())
-    state.atlas.seek.looks = 1
-    light, tie = state.light, state.absolute
+    state.relocalisation.search.looks = 1
+    light, tie = state.light, state.pose.alignment
     light.result = replace(light.result, fix=Fix.GOOD)  # type: ignore[union-attr]
     tie.gap, tie.way = 1.0, 0.0  # type: ignore[union-attr]
     for way, known in ((0.0, False), (4.0, False), (6.0, True)):
         tie.way = way  # type: ignore[union-attr]
         assert relocalisation.by_light_alone(state) == known
-    assert state.atlas.adrift is None
+    assert state.map.parts.detached is None
     assert relocalisation.places(state) is None
 
 
@@ -313,11 +316,11 @@ def test_light_that_has_long_told_the_place_is_enough_where_the_map_knows_nothin
 def test_lamps_that_cannot_be_received_here_say_that_the_robot_is_elsewhere(bearing: float) -> None:
     state, way = shown(robot()), np.array((math.cos(bearing), math.sin(bearing), 0.0))
     for yaw in (0.0, 1.6, 3.1):  # of which strengths say nothing
-        assert not out_of_place(state, np.array((*HERE[:2], yaw)))
-    assert not out_of_place(state, HERE + 0.8 * way)
-    assert out_of_place(state, HERE + 5.0 * way)
+        assert not out_of_place(state.light, np.array((*HERE[:2], yaw)))
+    assert not out_of_place(state.light, HERE + 0.8 * way)
+    assert out_of_place(state.light, HERE + 5.0 * way)
     state.light.filter.course.t_mono += 5.0  # type: ignore[union-attr]  # what was received then
-    assert not out_of_place(state, HERE + 5.0 * way)
+    assert not out_of_place(state.light, HERE + 5.0 * way)
 
 
 def unused(state: State) -> State:
@@ -333,7 +336,7 @@ def anew(state: State, T_map_base: Array) -> bool:
     """Whether an epoch that has not been asked yet says that it is misplaced."""
     assert state.light is not None
     state.light.asked = None
-    return misplaced(state, T_map_base)
+    return misplaced(state.light, state.pose.alignment, T_map_base)
 
 
 def test_an_epoch_is_asked_again_only_about_another_place() -> None:
@@ -341,30 +344,32 @@ def test_an_epoch_is_asked_again_only_about_another_place() -> None:
     beside = away + np.array((0.03, 0.0, 1.0))
     light = state.light
     assert light is not None
-    assert not misplaced(state, HERE)
-    assert misplaced(state, away), "a person has said where it is, or the laser has found it there"
+    assert not misplaced(state.light, state.pose.alignment, HERE)
+    assert misplaced(state.light, state.pose.alignment, away), (
+        "a person has said where it is, or the laser has found it there"
+    )
     strong, light.filter.catalogue.rims = light.filter.catalogue.rims, dict.fromkeys(light.filter.catalogue.rims, 1e9)
-    assert misplaced(state, beside)
+    assert misplaced(state.light, state.pose.alignment, beside)
     light.epoch = replace(light.epoch)
-    assert not misplaced(state, beside), "nothing is stronger than that"
+    assert not misplaced(state.light, state.pose.alignment, beside), "nothing is stronger than that"
     light.filter.catalogue.rims = strong
     light.epoch = replace(light.epoch)
-    assert misplaced(state, away)
-    light.result, state.absolute.gap = shown(robot()).light.result, 1.0  # type: ignore[union-attr]
+    assert misplaced(state.light, state.pose.alignment, away)
+    light.result, state.pose.alignment.gap = shown(robot()).light.result, 1.0  # type: ignore[union-attr]
     light.epoch = replace(light.epoch)
-    assert not misplaced(state, away), "what is used fits, and is held against the pose"
-    state.absolute.gap = None  # type: ignore[union-attr]
-    assert misplaced(state, away), "it is not any more"
+    assert not misplaced(state.light, state.pose.alignment, away), "what is used fits, and is held against the pose"
+    state.pose.alignment.gap = None  # type: ignore[union-attr]
+    assert misplaced(state.light, state.pose.alignment, away), "it is not any more"
     light.filter.course.t_mono += 10.0
-    assert not misplaced(state, away), "nothing is received any more"
+    assert not misplaced(state.light, state.pose.alignment, away), "nothing is received any more"
 
 
 def test_most_lamps_out_of_place_say_that_the_pose_is_wrong() -> None:
     state, away = shown(robot()), HERE + np.array((5.0, 0.0, 0.0))
-    assert sum(received(state, away)) >= MISPLACED
-    state.absolute.gap = None  # type: ignore[union-attr]
+    assert sum(too_strong_at(state.light, away)) >= MISPLACED
+    state.pose.alignment.gap = None  # type: ignore[union-attr]
     assert anew(state, away), "light has several places, and holds none of them against the pose"
-    state.absolute.gap = 1.0  # type: ignore[union-attr]
+    state.pose.alignment.gap = 1.0  # type: ignore[union-attr]
     assert not anew(state, away)  # the lamps in use fit where the filter is; the gap to the pose says the rest
     assert anew(unused(state), away)
     assert not anew(state, HERE)
@@ -375,12 +380,12 @@ def test_lamps_exchanged_or_moved_are_not_most_of_them() -> None:
     assert state.light is not None
     epoch = state.light.epoch
     assert epoch is not None
-    strong = received(state, HERE)
+    strong = too_strong_at(state.light, HERE)
     for count in range(1, len(strong)):
         amplitude = epoch.amplitude.copy()
         amplitude[np.argsort(-amplitude)[:count]] *= 100.0
         state.light.epoch = replace(epoch, amplitude=amplitude)
-        told = sum(received(state, HERE))
+        told = sum(too_strong_at(state.light, HERE))
         assert anew(state, HERE) == (told >= MISPLACED and 2 * told > len(strong))
 
 
@@ -390,53 +395,57 @@ def test_a_lamp_that_was_hidden_while_it_was_learned_may_be_received_clearly_her
     nearest = state.light.result.links[0].lamp_id
     assert nearest is not None
     state.light.filter.gains[nearest] = np.array((-3.4, 0.0, 0.0)), np.full(3, 0.01)
-    assert not out_of_place(state, HERE)
+    assert not out_of_place(state.light, HERE)
 
 
 @pytest.mark.parametrize("proved", [True, False])
 def test_a_filter_led_astray_sets_no_robot_adrift_that_receives_the_lamps_of_its_place(proved: bool) -> None:
     for at, carried in ((HERE, False), (HERE + np.array((5.0, 0.0, 0.0)), True)):
         state = shown(robot())
-        state.atlas.adrift, state.atlas.since, state.failures = None, 0, relocalisation.UNFIT
-        state.T_map_odom = se2.compose(at, se2.inverse(state.fused.T_odom_base))
-        tie, light = state.absolute, state.light
+        state.map.parts.detached, state.map.parts.detached_since, state.matching.failures = (
+            None,
+            0,
+            relocalisation.UNFIT,
+        )
+        state.pose.T_map_odom = se2.compose(at, se2.inverse(state.motion.T_odom_base))
+        tie, light = state.pose.alignment, state.light
         tie.placed, tie.proved = True, proved  # type: ignore[union-attr]
         light.filter.lost = True  # type: ignore[union-attr]
-        assert disputed(state)
+        assert disputed(state.light, state.map.graph)
         relocalisation.doubt(state)
-        assert (state.atlas.adrift is not None) == (carried or not proved)
+        assert (state.map.parts.detached is not None) == (carried or not proved)
 
 
 @pytest.mark.parametrize(("failures", "broken", "waits"), [(relocalisation.UNFIT, False, False), (0, True, True)])
 def test_a_robot_carried_a_little_way_is_adrift_when_the_laser_has_lost_it(
     failures: int, broken: bool, waits: bool
 ) -> None:
-    """Two metres beside its place the same lamps are received, no stronger than they may be."""
+    """Two metres beside its place the same lamps are no stronger than they may be."""
     state = shown(robot())
-    state.atlas.adrift, state.atlas.since, state.failures = None, 0, failures
+    state.map.parts.detached, state.map.parts.detached_since, state.matching.failures = None, 0, failures
     here = HERE + np.array((1.4, 1.2, 0.0))
-    state.T_map_odom = se2.compose(here, se2.inverse(state.fused.T_odom_base))
-    tie, light = state.absolute, state.light
+    state.pose.T_map_odom = se2.compose(here, se2.inverse(state.motion.T_odom_base))
+    tie, light = state.pose.alignment, state.light
     tie.placed, tie.proved, tie.broken = True, True, broken  # type: ignore[union-attr]
     light.filter.lost = True  # type: ignore[union-attr]
-    assert not out_of_place(state, here)
-    assert not in_place(state, here)
-    assert in_place(state, HERE)
+    assert not out_of_place(state.light, here)
+    assert not in_place(state.light, here)
+    assert in_place(state.light, HERE)
     relocalisation.doubt(state)
-    assert (state.atlas.adrift is None) == waits
+    assert (state.map.parts.detached is None) == waits
     if waits:
-        state.fused.t_mono += relocalisation.ASIDE_S + 0.01
+        state.motion.t_mono += relocalisation.ASIDE_S + 0.01
         relocalisation.doubt(state)
-        assert state.atlas.adrift is not None
+        assert state.map.parts.detached is not None
 
 
 def test_a_robot_that_the_laser_holds_is_not_set_adrift_by_single_epochs() -> None:
     state = shown(robot())
-    state.atlas.adrift, state.atlas.since = None, 0
-    state.T_map_odom = se2.compose(HERE + np.array((1.4, 1.2, 0.0)), se2.inverse(state.fused.T_odom_base))
-    state.absolute.placed = state.absolute.proved = True  # type: ignore[union-attr]
+    state.map.parts.detached, state.map.parts.detached_since = None, 0
+    state.pose.T_map_odom = se2.compose(HERE + np.array((1.4, 1.2, 0.0)), se2.inverse(state.motion.T_odom_base))
+    state.pose.alignment.placed = state.pose.alignment.proved = True  # type: ignore[union-attr]
     state.light.filter.lost = True  # type: ignore[union-attr]
     for _ in range(3):
-        state.fused.t_mono += 2.0
+        state.motion.t_mono += 2.0
         relocalisation.doubt(state)
-    assert state.atlas.adrift is None
+    assert state.map.parts.detached is None

@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.fusion.map_odom_filter import Absolute, blind, on_lights
+from estimator.fusion.light_witness import blind
+from estimator.fusion.map_pose import SurveyAlignment
+from estimator.job_queue import SETTLE
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.keyframe import Settled
-from estimator.mapping.submap import SIZE
-from estimator.mapping.submap_graph import OWN, SETTLE
+from estimator.mapping.keyframe import SIZE, Settled
+from estimator.mapping.submap_graph import OWN
 from estimator.measurements import UNLIMITED, Array, Command, Order
 from estimator.numerics import se2
-from estimator.pipeline import Settings, keyframe_poses, new_state, step
+from estimator.pipeline import Settings, fuse_light, keyframe_poses, new_state, step
 from estimator.relocalisation.relocalisation import begin, local_map_lost, resettle
 from tests.estimator.adrift import Corners, Robot, furnished, mapped, stored, way
 from tests.estimator.circuit import driven, lay, run_jobs
@@ -25,7 +26,7 @@ from tools.bench.support.scenes import Scene, box
 def test_without_a_map_there_is_nothing_to_look_in() -> None:
     state = new_state()
     result = step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED)
-    assert state.atlas.adrift is None
+    assert state.map.parts.detached is None
     assert result.places is None
 
 
@@ -34,18 +35,18 @@ def test_a_robot_is_looked_for_in_a_map_of_one_submap_that_is_not_finished() -> 
     state, rng = new_state(), np.random.default_rng(3)
     places = [np.array((0.3 * k, 0.0, 0.1 * k)) for k in range(5)]
     lay(state, places[0], places[0], rng, 1)
-    state.next_key = 2
+    state.map.next_key = 2
     assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places is None, "one scan is no map"
     for key, T in enumerate(places[1:], 2):
         lay(state, T, T, rng, key)
     run_jobs(state)
-    assert not state.atlas.settled()
-    state.next_key = 6
+    assert not state.map.graph.settled()
+    state.map.next_key = 6
     assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places == 0
     lay(state, places[4], places[2], rng, 6, anew=True)
     assert [job.priority for job in run_jobs(state)] == [SETTLE]
-    assert [submap.key for submap in state.atlas.settled()] == [1]
-    assert state.atlas.adrift == 2
+    assert [submap.key for submap in state.map.graph.settled()] == [1]
+    assert state.map.parts.detached == 2
 
 
 def test_a_map_whose_first_submap_is_just_being_finished_is_one_to_be_looked_for_in() -> None:
@@ -53,9 +54,9 @@ def test_a_map_whose_first_submap_is_just_being_finished_is_one_to_be_looked_for
     for key in range(1, SIZE + 2):
         T = np.array((0.3 * key, 0.0, 0.1 * key))
         lay(state, T, T, rng, key)
-    state.next_key = SIZE + 2
-    assert len(state.atlas.frames) == 1
-    assert not state.atlas.settled()
+    state.map.next_key = SIZE + 2
+    assert len(state.map.graph.frames) == 1
+    assert not state.map.graph.settled()
     assert step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED).places == 0
 
 
@@ -70,30 +71,30 @@ def test_light_holds_a_robot_that_lost_its_local_map_only_while_it_tells(
     assert state.light is not None
     for key in (1, 2):
         lay(state, np.array((0.3 * key, 0.0, 0.0)), np.array((0.3 * key, 0.0, 0.0)), rng, key)
-    tie = state.absolute = Absolute(placed=True)
+    tie = state.pose.alignment = SurveyAlignment(placed=True)
     for t in (100.0 - 2.0 * epoch_s, 100.0 - epoch_s, 100.0):
-        on_lights(state, replace(state.light.result, t_mono=t))
+        fuse_light(state, replace(state.light.result, t_mono=t))
     tie.gap = 0.0
-    state.fused.t_mono, state.light.filter.t_used = 100.0 + dark_s, 100.0
+    state.motion.t_mono, state.light.filter.t_used = 100.0 + dark_s, 100.0
     local_map_lost(state)
-    assert (state.atlas.adrift is None) is told
+    assert (state.map.parts.detached is None) is told
 
 
 def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_when_it_was_left() -> None:
     """Else a map that light had laid 5 deg askew, and had known it, comes to be believed."""
     state, _ = driven(laps=0.6)
-    state.next_key, yaw = 1000, 0.7
-    state.T_map_odom = np.array((1.0, 2.0, yaw))
+    state.map.next_key, yaw = 1000, 0.7
+    state.pose.T_map_odom = np.array((1.0, 2.0, yaw))
     left = np.array((9.0, 4.0, 1.0))
-    state.absolute = tie = Absolute(placed=True, P=np.eye(3), kept=(left, np.diag((0.04, 0.01, 0.02))))
+    state.pose.alignment = tie = SurveyAlignment(placed=True, P=np.eye(3), kept=(left, np.diag((0.04, 0.01, 0.02))))
     assert begin(state)
-    np.testing.assert_allclose(state.atlas.askew, tie.kept[1], err_msg="a blind way since is not the map's")
+    np.testing.assert_allclose(state.relocalisation.P_left, tie.kept[1], err_msg="a blind way since is not the map's")
     tie.kept = left, np.eye(3)
     assert begin(state), "carried on: of the place meanwhile nobody knew anything"
-    np.testing.assert_allclose(state.atlas.askew[2, 2], 0.02)
-    state.T_map_odom = np.array((0.0, 0.0, -0.4))
-    resettle(state, next(reversed(state.keyframes.values())), 1e-6 * np.eye(3), None)
-    way = math.hypot(*(se2.compose(state.T_map_odom, state.fused.T_odom_base) - left)[:2])
+    np.testing.assert_allclose(state.relocalisation.P_left[2, 2], 0.02)
+    state.pose.T_map_odom = np.array((0.0, 0.0, -0.4))
+    resettle(state, next(reversed(state.map.keyframes.values())), 1e-6 * np.eye(3), None)
+    way = math.hypot(*(se2.compose(state.pose.T_map_odom, state.motion.T_odom_base) - left)[:2])
     assert way > 3.0
     assert tie.P[2, 2] < 0.03
     assert np.trace(tie.P[:2, :2]) == pytest.approx(0.05 + way**2 * 0.02, rel=0.01), (
@@ -104,57 +105,57 @@ def test_a_place_found_in_the_map_is_no_surer_in_the_survey_than_the_map_was_whe
 def test_a_robot_that_was_found_is_held_by_the_laser_though_no_scan_had_fitted_for_long() -> None:
     """Light that is just beginning would be followed away from a place that the whole map has told."""
     state, _ = driven(laps=0.6)
-    state.next_key, state.fused.t_mono = 1000, 100.0
-    state.absolute = Absolute(placed=True, t_match=98.0)
+    state.map.next_key, state.motion.t_mono = 1000, 100.0
+    state.pose.alignment = SurveyAlignment(placed=True, t_match=98.0)
     assert begin(state)
-    assert blind(state)
-    resettle(state, next(reversed(state.keyframes.values())), 1e-6 * np.eye(3), None)
-    assert not blind(state)
+    assert blind(state.pose, state.motion)
+    resettle(state, next(reversed(state.map.keyframes.values())), 1e-6 * np.eye(3), None)
+    assert not blind(state.pose, state.motion)
 
 
 def test_what_is_adrift_leaves_the_older_map_as_it_is() -> None:
     state, truth = driven(laps=0.6)
-    state.next_key = 1000
-    before = {key: submap.T_map_submap.copy() for key, submap in state.atlas.submaps.items()}
-    older, joined = dict(state.keyframes), len(state.atlas.constraints.T)
+    state.map.next_key = 1000
+    before = {key: submap.T_map_submap.copy() for key, submap in state.map.graph.submaps.items()}
+    older, joined = dict(state.map.keyframes), len(state.map.graph.constraints.T)
     result = step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED)
     assert result.places == 0
     rng = np.random.default_rng(3)
     for key in range(1000, 1000 + 3 * SIZE):  # over the same floor, as the odometry has it
         k = key - 1000
-        lay(state, state.keyframes[k + 1].T_odom_keyframe, truth[k], rng, key)
+        lay(state, state.map.keyframes[k + 1].T_odom_keyframe, truth[k], rng, key)
         run_jobs(state)
-    adrift = state.atlas.adrift
+    adrift = state.map.parts.detached
     assert adrift is not None
-    assert {frame.submap.key for key, frame in state.keyframes.items() if key >= 1000} == {
+    assert {frame.submap.key for key, frame in state.map.keyframes.items() if key >= 1000} == {
         adrift,
         adrift + 1,
         adrift + 2,
     }
-    sides = state.atlas.constraints.between >= adrift
+    sides = state.map.graph.constraints.between >= adrift
     assert (sides[:, 0] == sides[:, 1]).all()
-    assert len(state.atlas.constraints.T) >= joined
-    assert older.items() <= state.keyframes.items()
+    assert len(state.map.graph.constraints.T) >= joined
+    assert older.items() <= state.map.keyframes.items()
     for key, T in before.items():
-        np.testing.assert_array_equal(state.atlas.submaps[key].T_map_submap, T)
+        np.testing.assert_array_equal(state.map.graph.submaps[key].T_map_submap, T)
 
 
 def test_a_pose_that_is_given_moves_only_what_is_adrift_and_a_second_break_forgets_it() -> None:
     state, truth = driven(laps=0.6)
-    state.next_key = 1000
+    state.map.next_key = 1000
     older = keyframe_poses(state)
     step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED)
-    adrift = state.atlas.adrift
+    adrift = state.map.parts.detached
     lay(state, truth[0], truth[0], np.random.default_rng(3), 1000)
     wanted = np.array((7.0, 8.0, 1.0))
     step(state, [Command(0.0, Order.SET_POSE, wanted)], UNLIMITED)
-    np.testing.assert_allclose(se2.compose(state.T_map_odom, state.fused.T_odom_base), wanted)
-    np.testing.assert_allclose(state.keyframes[1000].T_map_keyframe, wanted)
+    np.testing.assert_allclose(se2.compose(state.pose.T_map_odom, state.motion.T_odom_base), wanted)
+    np.testing.assert_allclose(state.map.keyframes[1000].T_map_keyframe, wanted)
     for key, T in older.items():
         np.testing.assert_array_equal(keyframe_poses(state)[key], T)
     step(state, [Command(0.0, Order.RELOCALISE)], UNLIMITED)
-    assert 1000 not in state.keyframes
-    assert state.atlas.adrift == adrift
+    assert 1000 not in state.map.keyframes
+    assert state.map.parts.detached == adrift
 
 
 HALL = (1.0, 6.0), (10.8, 6.0), (1.0, 6.0)
@@ -179,15 +180,15 @@ def test_switched_on_anywhere_in_a_stored_map(
     assert said[-1] is None
     assert robot.off()[0] < 0.1
     assert robot.off()[1] < np.radians(1.0)
-    atlas = robot.state.atlas
+    atlas = robot.state.map.graph
     crossing = (atlas.constraints.between > len(submaps)).sum(axis=1) == 1
     assert 1 <= crossing.sum() <= 2
     assert atlas.constraints.loop[crossing].all()
-    assert robot.state.jumps == 1
+    assert robot.state.pose.jumps == 1
     for key, (T, _) in enumerate(submaps, 1):
         np.testing.assert_array_equal(atlas.submaps[key].T_map_submap, T)
-    fresh = [frame for key, frame in robot.state.keyframes.items() if key >= 1000]
-    listed = {key for keys in robot.state.places.values() for key in keys}
+    fresh = [frame for key, frame in robot.state.map.keyframes.items() if key >= 1000]
+    listed = {key for keys in robot.state.map.places.values() for key in keys}
     assert {frame.key for frame in fresh} <= listed
 
 
@@ -213,7 +214,7 @@ def test_carried_to_another_room_and_what_was_mapped_since_comes_along(
     assert 0 in said
     assert said[-1] is None
     assert robot.off()[0] < 0.1
-    assert robot.state.anew == 1
+    assert robot.state.matching.restarts == 1
 
 
 @pytest.mark.jit
@@ -226,7 +227,7 @@ def test_in_a_part_that_is_not_mapped_nothing_is_said_until_the_robot_comes_into
     comes = robot.along(way(((13.65, 1.5), (13.65, 6.0), (1.85, 6.0), (1.85, 1.5)), 0.1))
     assert comes[-1] is None
     assert robot.off()[0] < 0.15
-    assert len(robot.state.atlas.submaps) > len(mapped(scene, west))
+    assert len(robot.state.map.graph.submaps) > len(mapped(scene, west))
 
 
 @pytest.mark.jit
@@ -245,7 +246,7 @@ def test_a_person_s_word_is_looked_at_first_and_does_not_move_a_restored_map(
     wrong.at(T, Command(wrong.t, Order.SET_POSE, np.array((9.05, 4.0, 0.0))))
     assert None not in [wrong.at(T).places for _ in range(8)]
     for key, (place, _) in enumerate(submaps, 1):
-        np.testing.assert_array_equal(wrong.state.atlas.submaps[key].T_map_submap, place)
+        np.testing.assert_array_equal(wrong.state.map.graph.submaps[key].T_map_submap, place)
 
 
 @pytest.mark.jit
@@ -259,11 +260,11 @@ def test_a_map_that_is_only_used_never_moves_and_what_is_laid_on_top_is_bounded(
     for T in way((*HALL, *TOUR), 0.2, 0.4):
         robot.at(T)
     assert robot.off()[0] < 0.06
-    assert state.atlas.closures > 3
-    own = [key for key in state.atlas.submaps if key > len(submaps)]
+    assert state.map.graph.closures > 3
+    own = [key for key in state.map.graph.submaps if key > len(submaps)]
     assert max(own) - len(submaps) > OWN
     assert len(own) <= OWN + 2
-    assert len([key for key in state.keyframes if key >= 1000]) <= OWN * SIZE
+    assert len([key for key in state.map.keyframes if key >= 1000]) <= OWN * SIZE
     for key, (T, settled) in enumerate(submaps, 1):
-        np.testing.assert_array_equal(state.atlas.submaps[key].T_map_submap, T)
-        assert state.atlas.submaps[key].settled is settled
+        np.testing.assert_array_equal(state.map.graph.submaps[key].T_map_submap, T)
+        assert state.map.graph.submaps[key].settled is settled

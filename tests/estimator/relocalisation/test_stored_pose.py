@@ -41,7 +41,7 @@ def test_a_robot_that_was_not_moved_is_found_where_it_stands(floor: Floor) -> No
     assert said.index(None) <= 2 * robot.late
     assert robot.off()[0] < 0.05
     assert robot.off()[1] < np.radians(1.0)
-    watch = robot.state.atlas.watch
+    watch = robot.state.map.parts.trial
     assert watch is not None
     assert watch.alone, "the laser alone has decided: nothing is stored of it before it has proved itself"
 
@@ -56,8 +56,8 @@ def test_a_robot_that_was_moved_is_not_where_it_was(floor: Floor, moved: tuple[f
     robot, said = stand(floor, HERE, HERE + np.array(moved), 20)
     assert None not in said, "not found yet, and not called found: it has to drive"
     robot.along(way(((1.85, 1.6), (1.85, 6.0), (4.0, 6.0)), 0.06))
-    assert robot.state.atlas.adrift is None
-    assert robot.state.atlas.seek.terrain is None, "what it was looked for in: the whole map a second time"
+    assert robot.state.map.parts.detached is None
+    assert robot.state.relocalisation.search.terrain is None, "what it was looked for in: the whole map a second time"
     assert robot.off()[0] < 0.1
 
 
@@ -97,19 +97,19 @@ def test_a_person_knows_better_and_a_pose_that_is_none_says_nothing(floor: Floor
     robot = Robot(stored(floor[1]), floor[0])
     there = np.array((9.05, 2.0, -1.4))
     robot.at(HERE, Command(robot.t, Order.SET_POSE, HERE), Command(robot.t + 0.01, Order.REMEMBERED, there))
-    assert robot.state.atlas.seek.remembered is None
+    assert robot.state.relocalisation.search.remembered is None
     for pose in (None, np.array((np.nan, 0.0, 0.0))):
         robot = Robot(stored(floor[1]), floor[0])
-        before = robot.state.T_map_odom.copy()
+        before = robot.state.pose.T_map_odom.copy()
         robot.at(HERE, Command(robot.t, Order.REMEMBERED, pose))
-        assert robot.state.atlas.seek.remembered is None
-        np.testing.assert_array_equal(se2.between(before, robot.state.T_map_odom), np.zeros(3))
+        assert robot.state.relocalisation.search.remembered is None
+        np.testing.assert_array_equal(se2.between(before, robot.state.pose.T_map_odom), np.zeros(3))
 
 
 def test_who_is_carried_off_after_the_start_is_not_held_by_an_old_memory(floor: Floor) -> None:
     robot, _ = stand(floor, HERE, HERE, 4)
     robot.at(HERE, Command(robot.t, Order.RELOCALISE))
-    assert robot.state.atlas.seek.remembered is None
+    assert robot.state.relocalisation.search.remembered is None
 
 
 def trial(seed: int) -> tuple[str, bool, float]:

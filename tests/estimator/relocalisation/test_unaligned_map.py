@@ -20,14 +20,15 @@ from daemon.recording.checkpoint import take
 from daemon.recording.restore import restore
 from daemon.snapshot import State as Said
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.map_snapshot import MapImage, finished, image_of, restored
+from estimator.mapping.map_snapshot import MapImage, finished
 from estimator.measurements import Array, Command, Order, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state
 from estimator.relocalisation import unaligned_map
 from estimator.relocalisation.global_scan_match import Fit, Verdict
-from estimator.relocalisation.hypothesis_tracking import Hypothesis
+from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside
 from estimator.state import State
+from estimator.stored_map import image_of, restored
 from tools.experiments.relocation.maps import drive_of
 from tools.experiments.relocation.trial import Moment, Robot
 from tools.experiments.relocation.worlds import PERIOD_S, Place, Site, lit_house, odometry
@@ -118,9 +119,9 @@ class Drive:
     def stored_off(self) -> float:
         """By how much (m) a submap of the stored map is off in the survey's frame, at most."""
         off = [
-            se2.between(se2.between(FRAME, piece.T_map_submap), self.state.atlas.submaps[piece.key].T_map_submap)
+            se2.between(se2.between(FRAME, piece.T_map_submap), self.state.map.graph.submaps[piece.key].T_map_submap)
             for piece in self.image.submaps
-            if piece.key in self.state.atlas.submaps
+            if piece.key in self.state.map.graph.submaps
         ]
         assert off
         return float(np.max(np.hypot(*np.array(off)[:, :2].T)))
@@ -131,7 +132,7 @@ def test_a_map_of_one_glance_is_no_reason_to_be_lost_and_is_let_go_of_where_it_i
     drive.on(8.0)
     assert drive.robot.result is not None
     assert drive.robot.result.aside
-    assert drive.state.let_go == 0
+    assert drive.state.relocalisation.maps_dropped == 0
     drive.on(17.0)
     assert drive.tracking_since() < SOON_S
     assert drive.never_wrong()
@@ -145,8 +146,8 @@ def test_a_map_of_one_glance_is_no_reason_to_be_lost_and_is_let_go_of_where_it_i
 def test_until_that_is_decided_the_stored_map_is_what_there_is_to_be_saved() -> None:
     drive = Drive(made(HOUSE, 0.0, 4.0), 60.0)
     drive.on(9.0)
-    assert drive.state.atlas.aside is not None
-    assert drive.state.atlas.unproved == drive.state.atlas.aside.first
+    assert drive.state.map.parts.aside is not None
+    assert drive.state.map.parts.unproved == drive.state.map.parts.aside.first
     image = image_of(drive.state)
     assert not image.identity.surveyed
     assert [one.key for one in image.submaps] == [one.key for one in drive.image.submaps]
@@ -161,38 +162,38 @@ def test_half_of_the_building_is_found_on_the_way_and_laid_to_where_it_belongs(l
     """The pose does not jump for that; what is only used is not let go of by being found."""
     drive = Drive(made(HOUSE, 60.0, 40.0), 20.0, settings=Settings(localise=localise))
     drive.on(9.0)
-    assert drive.state.atlas.aside is not None
-    assert not drive.state.atlas.held, "loops of a map that is its own do not move a robot that light holds"
+    assert drive.state.map.parts.aside is not None
+    assert not drive.state.map.parts.fixed, "loops of a map that is its own do not move a robot that light holds"
     assert drive.tracking_since() < SOON_S
-    while drive.state.atlas.aside is not None and len(drive.said) < 450:
-        jumps = drive.state.jumps
+    while drive.state.map.parts.aside is not None and len(drive.said) < 450:
+        jumps = drive.state.pose.jumps
         drive.on(PERIOD_S)
-    assert drive.state.jumps == jumps
-    assert drive.state.atlas.held is localise
-    assert drive.state.let_go == 0
-    assert drive.state.atlas.unproved is not None
+    assert drive.state.pose.jumps == jumps
+    assert drive.state.map.parts.fixed is localise
+    assert drive.state.relocalisation.maps_dropped == 0
+    assert drive.state.map.parts.unproved is not None
     assert not image_of(drive.state).identity.surveyed  # while it is watched
-    while drive.state.atlas.watch is not None:
+    while drive.state.map.parts.trial is not None:
         drive.on(1.0)
     assert drive.never_wrong()
     assert drive.stored_off() < 0.25
     assert image_of(drive.state).identity.surveyed
     assert drive.said[-1].off_m < 0.15
-    assert set(drive.state.keyframes) <= {key for keys in drive.state.places.values() for key in keys}
+    assert set(drive.state.map.keyframes) <= {key for keys in drive.state.map.places.values() for key in keys}
 
 
 @pytest.mark.slow
 def test_a_map_of_another_building_is_let_go_of_when_as_much_was_driven_as_it_is_of() -> None:
     drive = Drive(made(OTHER, 0.0, 15.0), 60.0)
     drive.on(9.0)
-    aside_now = drive.state.atlas.aside
-    assert aside_now is not None
-    enough = unaligned_map.enough(drive.state, aside_now)
+    aside_now = drive.state.map.parts.aside
+    assert isinstance(aside_now, SearchedAside)
+    enough = unaligned_map.enough(drive.state.map.settings.keyframe_m, aside_now)
     assert unaligned_map.LEAST_M < enough < unaligned_map.MOST_M
-    while drive.state.atlas.aside is not None:
+    while drive.state.map.parts.aside is not None:
         drive.on(PERIOD_S)
-    assert drive.state.atlas.way_m - aside_now.begun_m >= enough
-    assert drive.state.let_go == 1
+    assert drive.state.map.graph.way_m - aside_now.begun_m >= enough
+    assert drive.state.relocalisation.maps_dropped == 1
     assert drive.tracking_since() < SOON_S
     assert drive.never_wrong()
 
@@ -200,53 +201,53 @@ def test_a_map_of_another_building_is_let_go_of_when_as_much_was_driven_as_it_is
 def test_a_building_that_was_taken_for_this_one_is_taken_out_again_and_nobody_is_lost_for_it() -> None:
     drive = Drive(made(OTHER, 0.0, 15.0), 60.0)
     drive.on(9.0)
-    stored = drive.state.atlas.aside
-    assert stored is not None
-    frame, key = drive.state.keyframes[drive.state.anchor], max(stored.submaps)
+    stored = drive.state.map.parts.aside
+    assert isinstance(stored, SearchedAside)
+    frame, key = drive.state.map.keyframes[drive.state.pose.anchor], max(stored.submaps)
     T_map = stored.submaps[key].T_map_submap
     fit = Fit(T_map, np.diag((1e-4, 1e-4, 1e-5)), 0.9, 0.0, 0.01, key, se2.identity(), Verdict.HOLDS)
-    mapped = set(drive.state.atlas.submaps)
+    mapped = set(drive.state.map.graph.submaps)
     unaligned_map.found(drive.state, stored, Hypothesis(se2.identity(), ((frame, fit),), 1, 0, 0.9, (frame, fit), 1))
-    assert set(stored.submaps) | mapped == set(drive.state.atlas.submaps)
-    while drive.state.atlas.aside is None and len(drive.said) < 300:
+    assert set(stored.submaps) | mapped == set(drive.state.map.graph.submaps)
+    while drive.state.map.parts.aside is None and len(drive.said) < 300:
         drive.on(PERIOD_S)
-    again = drive.state.atlas.aside
+    again = drive.state.map.parts.aside
     assert again is not None
     assert again.begun_m == stored.begun_m
-    assert not set(again.submaps) & set(drive.state.atlas.submaps)
-    joined = set(drive.state.atlas.constraints.between.ravel().tolist())
-    assert joined <= set(drive.state.atlas.submaps)
+    assert not set(again.submaps) & set(drive.state.map.graph.submaps)
+    joined = set(drive.state.map.graph.constraints.between.ravel().tolist())
+    assert joined <= set(drive.state.map.graph.submaps)
     drive.on(10.0)
     assert drive.never_wrong()
     assert drive.said[-1].off_m < 0.15
-    assert drive.state.atlas.adrift is None
+    assert drive.state.map.parts.detached is None
 
 
-def test_carried_off_beside_a_map_that_is_put_aside_the_search_in_that_begins_anew() -> None:
+def test_carried_off_beside_a_map_that_is_set_aside_the_search_in_that_begins_anew() -> None:
     drive = Drive(made(HOUSE, 60.0, 40.0), 20.0)
     drive.on(12.0)
-    stored = drive.state.atlas.aside
-    assert stored is not None
-    seek = stored.seek
+    stored = drive.state.map.parts.aside
+    assert isinstance(stored, SearchedAside)
+    search = stored.search
     drive.robot.take(drive.said[-1].t, [Command(drive.said[-1].t, Order.RELOCALISE)])
-    assert drive.state.atlas.adrift is not None
-    assert drive.state.atlas.aside is stored
-    assert stored.seek is not seek
+    assert drive.state.map.parts.detached is not None
+    assert drive.state.map.parts.aside is stored
+    assert stored.search is not search
     drive.on(5.0)
-    assert drive.state.atlas.adrift is None
+    assert drive.state.map.parts.detached is None
     assert drive.never_wrong()
     drive.robot.take(drive.said[-1].t, [Command(drive.said[-1].t, Order.RESET)])
-    assert drive.state.atlas.aside is None
-    assert drive.state.atlas.unproved is None
-    assert drive.state.let_go == 0
+    assert drive.state.map.parts.aside is None
+    assert drive.state.map.parts.unproved is None
+    assert drive.state.relocalisation.maps_dropped == 0
 
 
-def test_a_kept_state_holds_what_was_put_aside() -> None:
+def test_a_kept_state_holds_what_was_set_aside() -> None:
     drive = Drive(made(HOUSE, 0.0, 4.0), 60.0)
     drive.on(8.0)
     state, _ = restore(take(drive.state, {}).pieces())
-    stored, kept = state.atlas.aside, drive.state.atlas.aside
-    assert stored is not None
+    stored, kept = state.map.parts.aside, drive.state.map.parts.aside
+    assert isinstance(stored, SearchedAside)
     assert kept is not None
     assert list(stored.submaps) == list(kept.submaps)
     assert all(frame.submap.key in stored.submaps for frame in stored.frames.values())
@@ -265,5 +266,5 @@ def test_lamps_that_were_moved_and_surveyed_anew_cost_neither_the_map_nor_the_pl
     drive.on(20.0)
     assert drive.tracking_since() < soon_s
     assert drive.never_wrong()
-    assert drive.state.let_go == 0
-    assert all(piece.key in drive.state.atlas.submaps for piece in image.submaps[-2:])
+    assert drive.state.relocalisation.maps_dropped == 0
+    assert all(piece.key in drive.state.map.graph.submaps for piece in image.submaps[-2:])

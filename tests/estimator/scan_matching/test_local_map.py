@@ -39,11 +39,11 @@ def test_work_and_memory_do_not_grow_with_the_way(two_rounds: Driven) -> None:
     assert np.ptp(two_rounds.truth[:, 0]) > 20.0
     assert thirds[2].mean() < 1.3 * thirds[0].mean()
     state = two_rounds.state
-    assert state.local is not None
-    assert len(state.local.elements) <= Settings().map.capacity
+    assert state.matching.local_map is not None
+    assert len(state.matching.local_map.elements) <= Settings().map.capacity
     places = {(round(2 * x), round(2 * y)) for x, y, _ in two_rounds.truth}
-    assert len(state.keyframes) <= 3 * Settings().keep * len(places)
-    assert state.next_key > 1.1 * len(state.keyframes)  # some were let go for later ones
+    assert len(state.map.keyframes) <= 3 * Settings().keep * len(places)
+    assert state.map.next_key > 1.1 * len(state.map.keyframes)  # some were let go for later ones
 
 
 @pytest.mark.jit
@@ -51,15 +51,15 @@ def test_matches_hold_while_people_walk_by(two_rounds: Driven) -> None:
     failed = [r for r in two_rounds.results[1:] if r.match is None or not r.match.ok]
     assert len(failed) <= 0.01 * len(two_rounds.results)
     assert np.percentile(two_rounds.step_error_m, 99) < 0.03
-    assert two_rounds.state.anew == 0
+    assert two_rounds.state.matching.restarts == 0
 
 
 def ghosts(driven: Driven, scene: SimulatedScene) -> float:
     """Share of the map's elements that stand where nothing of the building is."""
-    assert driven.state.local is not None
+    assert driven.state.matching.local_map is not None
     start = scene.truth(driven.t[:1])[0]
     T_site_odom = se2.compose(start, se2.inverse(driven.results[0].T_odom_base))
-    xy = se2.apply(T_site_odom, driven.state.local.elements[:, :2])
+    xy = se2.apply(T_site_odom, driven.state.matching.local_map.elements[:, :2])
     return float((scene.building.world.clearance(xy) > 0.15).mean())
 
 
@@ -117,7 +117,7 @@ def test_a_robot_at_rest_lays_no_keyframes() -> None:
     state, noise = new_state(), np.random.default_rng(3)
     for k in range(200):
         step(state, [scan_at(np.zeros(3), 0.05 * k, k, noise)], UNLIMITED)
-    assert state.next_key == 2
+    assert state.map.next_key == 2
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
@@ -203,7 +203,7 @@ def test_who_sees_nothing_contradicts_nothing() -> None:
     state, noise = new_state(), np.random.default_rng(5)
     for k in range(10):
         step(state, [scan_at(np.zeros(3), 0.05 * k, k, noise)], UNLIMITED)
-    local, blind = state.local, np.zeros(541, np.uint8)
+    local, blind = state.matching.local_map, np.zeros(541, np.uint8)
     for k in range(10, 20):
         covered = replace(scan_at(np.zeros(3), 0.05 * k, k, noise), beam=blind)
         result = step(state, [covered], UNLIMITED)
@@ -212,7 +212,7 @@ def test_who_sees_nothing_contradicts_nothing() -> None:
     result = step(state, [scan_at(np.zeros(3), 1.0, 20, noise)], UNLIMITED)
     assert result.match is not None
     assert result.match.ok
-    assert state.local is local
+    assert state.matching.local_map is local
     assert result.anew == 0
 
 

@@ -63,7 +63,7 @@ def test_a_drive_is_followed_by_each(settings: Settings) -> None:
     assert np.hypot(drift[0], drift[1]) < 0.06
     assert abs(drift[2]) < 0.02
     assert all(r.match is not None and r.match.ok for r in results[1:])
-    assert len(state.keyframes) > 5
+    assert len(state.map.keyframes) > 5
     assert sum(r.keyframe >= 0 for r in results) <= 11, "each new reference keeps its error: one per quarter metre"
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from daemon.maps.container import HEAD, ROW, BadMap
 from daemon.maps.image import image_from
 from daemon.maps.schema import read, summary
-from estimator.mapping.map_snapshot import restored
+from estimator.stored_map import restored
 from tests.daemon.mapmaker import Shape, content
 from tests.fuzz.targets import refused
 

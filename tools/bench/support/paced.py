@@ -114,11 +114,11 @@ class Solver(ThreadWorker):
     def submit(self, jobs: Iterable[Job]) -> None:
         """Submit the daemon's jobs and, while ``busy`` and none is under way, a graph solution of our own."""
         super().submit(jobs)
-        atlas = self._state.atlas
+        state = self._state
         if self.busy and not self._mine:
-            atlas.stale = True
-            solve_graph(self._state, atlas)
-            mine = [replace(job, job_id=-1 - job.job_id) for job in atlas.take_jobs()]
+            state.map.graph.stale = True
+            solve_graph(state.map, state.pose, state.motion)
+            mine = [replace(job, job_id=-1 - job.job_id) for job in state.jobs.take()]
             self._mine = {job.job_id for job in mine}
             super().submit(mine)
 
@@ -128,7 +128,7 @@ class Solver(ThreadWorker):
         for answer in answers:
             if answer.job_id in self._mine:
                 self._mine.discard(answer.job_id)
-                self._state.atlas.asked.clear()
+                self._state.jobs.pending.clear()
                 self.solved += 1
         return tuple(answer for answer in answers if answer.job_id >= 0)
 

@@ -131,9 +131,9 @@ class Log:
     def close(self, hours: float, state: State) -> None:
         """End a window."""
         gc.collect()
-        ms, atlas = 1e3 * np.array(self.took), state.atlas
+        ms, atlas = 1e3 * np.array(self.took), state.map.graph
         hung = sum(len(submap.hung) for submap in atlas.submaps.values())
-        counts = len(state.keyframes), len(atlas.submaps), len(atlas.constraints.loop), hung
+        counts = len(state.map.keyframes), len(atlas.submaps), len(atlas.constraints.loop), hung
         times = float(np.median(ms)), float(np.percentile(ms, 99)), float(ms.max())
         self.rows.append((hours, resident_mb(), *times, *map(float, counts), float(np.median(self.errors))))
         self.took.clear()

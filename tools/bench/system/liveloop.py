@@ -29,10 +29,10 @@ from daemon.runtime.cycle import Cycle, Parts
 from daemon.runtime.warmup import load
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.system.realtime import line_up
+from estimator.job_queue import SEARCH
 from estimator.mapping.keyframe import Settled, Submap
 from estimator.mapping.loop_closure import found_again
 from estimator.mapping.loop_verification import Found, LoopSettings
-from estimator.mapping.submap_graph import LOOK
 from estimator.measurements import Array, Job
 from estimator.numerics import se2
 from estimator.pipeline import State, new_state, step
@@ -82,7 +82,7 @@ class Idle:
 
 def old_map(state: State, count: int, settled: Settled | None = None, seed: int = 0) -> None:
     """Lay ``count`` submaps up and down a hall, rows joined by loops, that end where the robot starts."""
-    rng, atlas, P = np.random.default_rng(seed), state.atlas, np.diag(NOISE**2)
+    rng, atlas, P = np.random.default_rng(seed), state.map.graph, np.diag(NOISE**2)
     turn = [np.pi / 2 * (1 if (k // ROW) % 2 == 0 else -1) if k % ROW >= ROW - 2 else 0.0 for k in range(count)]
     truth = [np.array((100.0, 0.0, 0.0))]
     for k in range(count - 1):
@@ -138,17 +138,17 @@ def side(drive: EndlessDrive, count: int, clock: Hands, worker: Worker) -> Side:
 
 def offer_loop(one: Side, rng: np.random.Generator) -> None:
     """Let the search have found the newest keyframe in an old submap, a little off from where it was expected."""
-    atlas, told = one.state.atlas, LoopSettings()
-    frame = one.state.keyframes[one.state.anchor]
+    atlas, told = one.state.map.graph, LoopSettings()
+    frame = one.state.map.keyframes[one.state.pose.anchor]
     old = int(rng.choice([key for key, submap in atlas.submaps.items() if submap.way_m < -100.0]))
     T = se2.compose(se2.between(atlas.submaps[old].T_map_submap, frame.T_map_keyframe), MOVED * rng.choice((-1.0, 1.0)))
     found = Found(old, T, np.diag((0.01, 0.01, 0.003)) ** 2, 0.95, 0.0, 0.02, MOVED)
 
     def then(payload: object) -> None:
         found_again(atlas, told, frame, found)
-        one.begun, one.changed = time.perf_counter(), one.state.T_map_odom
+        one.begun, one.changed = time.perf_counter(), one.state.pose.T_map_odom
 
-    atlas.ask(LOOK, lambda: found, then)
+    atlas.jobs.ask(SEARCH, lambda: found, then)
 
 
 def pass_by(one: Side, due: Delivery, number: int) -> None:
@@ -160,7 +160,7 @@ def pass_by(one: Side, due: Delivery, number: int) -> None:
         one.stages.run(one.cycle.run)
     else:
         one.cycle.run()
-    if one.changed is not None and one.state.T_map_odom is not one.changed:
+    if one.changed is not None and one.state.pose.T_map_odom is not one.changed:
         one.waited.append(1e3 * (time.perf_counter() - one.begun))
         one.changed = None
 
@@ -201,9 +201,9 @@ def measure(seconds: float, submaps: int = SUBMAPS, settle_s: float = 10.0, pace
 
 def settled_of(one: Side) -> Settled:
     """Some submap of the drive so far, settled here and now."""
-    from estimator.mapping.submap import settle
+    from estimator.mapping.keyframe import settle
 
-    frames = list(one.state.keyframes.values())[:12]
+    frames = list(one.state.map.keyframes.values())[:12]
     return settle(frames, frames[0].T_odom_keyframe, 0.01)
 
 
@@ -211,7 +211,7 @@ def figures(busy: Side, quiet: Side) -> list[Figure]:
     """All rows."""
     waited = np.array(busy.waited or [np.inf])
     rows = [
-        Figure("submaps", float(len(busy.state.atlas.submaps)), "", command=COMMAND),
+        Figure("submaps", float(len(busy.state.map.graph.submaps)), "", command=COMMAND),
         Figure("loops timed", float(len(busy.waited)), "", command=COMMAND),
         Figure("loop to corrected pose, median", float(np.median(waited)), "ms", command=COMMAND),
         bounded("loop to corrected pose, longest", float(waited.max()), "ms", "<= 100", COMMAND),

@@ -26,10 +26,11 @@ from daemon.maps.schema import read
 from daemon.maps.store import Store
 from estimator.mapping.constraints import Constraints
 from estimator.mapping.keyframe import Submap
-from estimator.mapping.map_snapshot import Identity, MapImage, finished, image_of, restored
+from estimator.mapping.map_snapshot import Identity, MapImage, finished
 from estimator.measurements import UNLIMITED, Answer, Array, Beam, Odometry, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import State, new_state, step
+from estimator.stored_map import image_of, restored
 from tools.ci.figures import Figure, bounded
 from tools.sim.building.buildings import building
 from tools.sim.building.office import LENGTH
@@ -49,12 +50,12 @@ def run() -> list[Figure]:
     one = finished(image_of(state, Identity(7, "office")))
     image = side_by_side(one, math.ceil(WANTED_M2 / AREA_M2))
     running = restored(image)
-    running.atlas.adrift = None
+    running.map.parts.detached = None
     content = packed(image, meta_of(image, 0.0, "bench", "0"))
     frames = sum(1 for _ in image.keyframes())
     many = side_by_side(one, 8)
     later = restored(many)
-    later.atlas.adrift = None
+    later.map.parts.detached = None
     area = f"{math.ceil(WANTED_M2 / AREA_M2) * AREA_M2:.0f} m2"
     figures = [
         Figure("submaps", len(image.submaps), "", command=COMMAND),

@@ -20,10 +20,11 @@ from daemon.snapshot import Snapshot
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.cdma.epoch import LightEpoch
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.map_snapshot import MapImage, image_of, restored
+from estimator.mapping.map_snapshot import MapImage
 from estimator.numerics import se2
 from estimator.pipeline import Settings, new_state, step
 from estimator.pipeline import State as EstimatorState
+from estimator.stored_map import image_of, restored
 from hal.adc import AdcStatus, Blemish, RawSamples
 from hal.lidar import VALID, LidarGeometry, LidarStatus, Link, RawScan
 from hal.odometry import RawOdometry

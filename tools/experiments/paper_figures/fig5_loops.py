@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.submap import points_of_frame
+from estimator.mapping.keyframe import points_of_frame
 from estimator.numerics import se2
 from estimator.pipeline import Settings, keyframe_poses, new_state
 from tools.ci.figures import bounded
@@ -58,7 +58,7 @@ def trial(task: tuple[str, int, float]) -> Ending:
     placed = np.array([se2.compose(T, where[key]) for key in keys])
     kept = Track(np.array(keys, float), placed, np.array([watch.truth.pose[key] for key in keys]))
     at = dict(zip(keys, placed, strict=True))
-    points = [se2.apply(at[frame.key], points_of_frame(frame, SIGMA_M).xy) for frame in state.keyframes.values()]
+    points = [se2.apply(at[frame.key], points_of_frame(frame, SIGMA_M).xy) for frame in state.map.keyframes.values()]
     first = watch.truth.member
     loops = [(at[one.query][:2], at[first[one.submap][0]][:2]) for one in watch.loops]
     judged = errors(live.since(FROM_S) if lit else started(live))

@@ -16,10 +16,10 @@ from typing import Any, Final, cast
 
 import numpy as np
 
+from estimator.job_queue import SEARCH
 from estimator.light_filter.light_channel import LightsSetup
 from estimator.mapping.keyframe import Keyframe
 from estimator.mapping.loop_verification import Candidate, Found, LoopSettings, judged, told_by_light
-from estimator.mapping.submap_graph import LOOK
 from estimator.measurements import LightEpoch
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, new_state
@@ -112,19 +112,19 @@ class Watcher:
         self._take_accepted(state)
         if result.keyframe < 0:
             return
-        frame = state.keyframes[result.keyframe]
+        frame = state.map.keyframes[result.keyframe]
         self._frames[frame.key] = frame
         self.truth.laid(frame, result.t_mono)
         for job, payload in done:
-            if job.priority == LOOK and isinstance(payload, tuple):  # not where the whole map is looked through
+            if job.priority == SEARCH and isinstance(payload, tuple):  # not where the whole map is looked through
                 self.asked[frame.key] = self.truth.has_positive(frame.key)
                 self._waiting += [(frame.key, found) for found in payload]
-        if self.anywhere and state.atlas.laid % EVERY == 0:
+        if self.anywhere and state.jobs.keyframes % EVERY == 0:
             self._look_anywhere(state, frame)
 
     def _take_accepted(self, state: State) -> None:
         """Loops that have become constraints since the last scan."""
-        rows = state.atlas.constraints.T[state.atlas.constraints.loop]
+        rows = state.map.graph.constraints.T[state.map.graph.constraints.loop]
         for key, found in list(self._waiting):
             frame = self._frames[key]
             T = se2.compose(found.T_submap_keyframe, se2.between(frame.T_odom_keyframe, frame.submap.T_odom_submap))
@@ -146,7 +146,7 @@ class Watcher:
 
     def _look_anywhere(self, state: State, frame: Keyframe) -> None:
         """Look for a keyframe in every old submap without any guess, and where light has it."""
-        told, atlas = LoopSettings(points=90), state.atlas
+        told, atlas = LoopSettings(points=90), state.map.graph
         self.queries[frame.key] = self.truth.has_positive(frame.key)
         for submap in atlas.submaps.values():
             if submap.settled is None or atlas.way_m - submap.way_m < told.recent_m:

@@ -17,9 +17,10 @@ import numpy as np
 
 from daemon.integrity.observer import Observer
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.map_snapshot import MapImage, image_of
+from estimator.mapping.map_snapshot import MapImage
 from estimator.measurements import Array, Command, Order, Record, Scan
 from estimator.pipeline import new_state
+from estimator.stored_map import image_of
 from tools.experiments.relocation.trial import Robot
 from tools.experiments.relocation.worlds import BODY, PERIOD_S, Place, Site, odometry
 from tools.sim.building.people import Crowd

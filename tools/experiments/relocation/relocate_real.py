@@ -22,10 +22,11 @@ from daemon.config.schema import LidarConfig
 from daemon.devices.conversion import OdometryBridge, ScanBridge
 from daemon.integrity.observer import Observer
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.map_snapshot import MapImage, image_of
+from estimator.mapping.map_snapshot import MapImage
 from estimator.measurements import Array, LightEpoch, Odometry, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, keyframe_poses, new_state
+from estimator.stored_map import image_of
 from hal.odometry import RawOdometry
 from hal.replay.carmen import read_carmen
 from tools.ci.figures import Figure, bounded
@@ -159,7 +160,7 @@ def reference() -> tuple[Array, Array, Array]:
     poses = np.array([se2.compose(frames[anchor], T) for anchor, T in hung])
     walls = [
         se2.apply(submap.T_map_submap, submap.settled.elements[:, :2].astype(np.float64))
-        for submap in robot.state.atlas.submaps.values()
+        for submap in robot.state.map.graph.submaps.values()
         if submap.settled is not None
     ]
     cells = np.unique(np.round(np.vstack(walls) / WALL_M).astype(np.int64), axis=0)

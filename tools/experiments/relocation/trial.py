@@ -21,11 +21,12 @@ from daemon.integrity.state_machine import judge
 from daemon.integrity.state_memory import Memory
 from daemon.snapshot import State as Said
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.map_snapshot import MapImage, restored
+from estimator.mapping.map_snapshot import MapImage
 from estimator.measurements import UNLIMITED, Answer, Array, Job, Odometry, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, step
 from estimator.result import StepResult
+from estimator.stored_map import restored
 from hal.lidar import LidarStatus, Link
 from tools.experiments.relocation.worlds import PERIOD_S, Carried, Poses, Site, Stroll, odometry, person, stroll
 from tools.sim.building.people import Crowd

@@ -1,0 +1,35 @@
+"""What relocalisation remembers from step to step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimator.numerics import se2
+from estimator.numerics.arrays import Array
+from estimator.relocalisation.hypothesis_tracking import Seek, Suspicion
+
+
+@dataclass(slots=True, eq=False)
+class RelocalisationMemory:
+    """State of relocalisation.
+
+    Attributes:
+        search: for the robot's place, while a part of the map is detached. suspicion: that the robot was carried off.
+        unaligned: the restored map does not lie in the light survey's frame, and the robot has not been found in it.
+        T_left, P_left: the pose when the map was left, and its covariance (3, 3; map axes) in the survey's frame then.
+        maps_dropped: stored maps that were dropped because the robot is nowhere in them.
+    """
+
+    search: Seek = field(default_factory=Seek)
+    suspicion: Suspicion = field(default_factory=Suspicion)
+    unaligned: bool = False
+    T_left: Array = field(default_factory=se2.identity)
+    P_left: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    maps_dropped: int = 0
+
+    def forget(self) -> None:
+        """The map is forgotten."""
+        self.search, self.suspicion, self.unaligned = Seek(), Suspicion(), False
+        self.T_left, self.P_left = se2.identity(), np.zeros((3, 3))

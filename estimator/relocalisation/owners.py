@@ -1,0 +1,45 @@
+"""The owners that relocalisation reads and corrects."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from estimator.fusion.map_pose import MapPose
+from estimator.fusion.motion_model import Motion
+from estimator.fusion.time_offset import TimeOffset
+from estimator.light_filter.light_channel import Light
+from estimator.mapping.map_state import MapState
+from estimator.relocalisation.memory import RelocalisationMemory
+from estimator.scan_matching.match_memory import MatchMemory
+
+
+class Owners(Protocol):
+    """Those parts of the estimator's state; see `estimator.state.State`."""
+
+    @property
+    def motion(self) -> Motion:
+        """The pose in the odom frame."""
+
+    @property
+    def light(self) -> Light | None:
+        """Decoder and light filter."""
+
+    @property
+    def pose(self) -> MapPose:
+        """The pose in the map."""
+
+    @property
+    def matching(self) -> MatchMemory:
+        """What scan matching remembers."""
+
+    @property
+    def map(self) -> MapState:
+        """The map."""
+
+    @property
+    def relocalisation(self) -> RelocalisationMemory:
+        """What relocalisation remembers."""
+
+    @property
+    def time_offset(self) -> TimeOffset:
+        """Between the stamps of scans and wheels."""

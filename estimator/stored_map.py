@@ -1,0 +1,129 @@
+"""Taking a map out of a state within a cycle, and making a state with a stored map.
+
+:func:`image_of` only gathers references and copies places, so that it costs a cycle next to nothing; nothing that
+happens to the state later changes what it gathered.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+from estimator.light_filter.gain_memory import gains_known, recall, sensors_known
+from estimator.light_filter.light_channel import Light, LightsSetup
+from estimator.light_filter.survey import Lamp
+from estimator.mapping import live_grid
+from estimator.mapping.constraints import Constraints
+from estimator.mapping.keyframe import Submap, square_of
+from estimator.mapping.map_snapshot import NOISE_M, Gains, Identity, MapImage, Piece, finished
+from estimator.mapping.map_state import MapState
+from estimator.numerics import se2
+from estimator.numerics.arrays import Array
+from estimator.state import Settings, State, new_state
+
+LONG_AGO_M: Final = 1000.0
+"""Metres of way by which what is restored lies behind: it is no way just driven, and counts for loops."""
+
+
+def image_of(state: State, identity: Identity | None = None) -> MapImage:
+    """The map of this moment, without what is detached, or lies where only the laser has found it and is on trial.
+
+    While a stored map is set aside it is that one, as it was stored.
+
+    At most a millisecond.
+    """
+    graph, parts = state.map.graph, state.map.parts
+    whole = graph if parts.aside is None else parts.aside
+    frames = state.map.keyframes if parts.aside is None else parts.aside.frames
+    joined = whole.constraints
+    first = math.inf if parts.detached is None else parts.detached
+    first = min(first, parts.trial.first) if parts.trial is not None and parts.trial.alone else first
+    pieces: list[Piece] = []
+    hung: dict[int, tuple[int, Array]] = {}
+    for submap in whole.submaps.values():
+        if submap.key >= first:
+            break
+        pieces.append(_piece(submap))
+        if len(submap.hung):
+            hung |= {other.key: (submap.key, other.into[1]) for other in submap.hung if other.into is not None}
+    alignment, identity = state.pose.alignment, identity or Identity()
+    placed = alignment is not None and alignment.placed and parts.unproved is None
+    gains, sensors, lamps = _learned(state.light)
+    T_odom_base = state.motion.T_odom_base
+    return MapImage(
+        identity=replace(identity, surveyed=identity.surveyed or placed),
+        submaps=tuple(piece for piece in pieces if piece.settled is not None),
+        constraints=Constraints(joined.between, joined.T, joined.information, joined.loop),
+        frames=tuple(frames.values()),
+        hung=hung,
+        unsettled=tuple(piece for piece in pieces if piece.settled is None),
+        noise_m=state.matching.noise_m or NOISE_M,
+        gains=gains,
+        sensors=sensors,
+        lamps=lamps,
+        T_map_base=state.pose.here(T_odom_base),
+        P=state.pose.covariance(T_odom_base, state.motion.P),
+    )
+
+
+def _piece(submap: Submap) -> Piece:
+    T_map, T_odom = submap.T_map_submap, submap.T_odom_submap
+    return Piece(submap.key, submap.first, T_map, T_odom, submap.way_m, submap.settled, submap.light)
+
+
+def _learned(light: Light | None) -> tuple[Gains, tuple[Array, Array] | None, tuple[Lamp, ...]]:
+    """What the light filter has learned of lamps and sensors."""
+    if light is None:
+        return {}, None, ()
+    return gains_known(light.filter), sensors_known(light.filter), tuple(light.filter.catalogue.by_id.values())
+
+
+def restored(image: MapImage, settings: Settings | None = None, lights: LightsSetup | None = None) -> State:
+    """A robot that has just been switched on, with a map in which its place is not known yet (`MapParts.detached`).
+
+    The last pose is where it is guessed to be. Nothing of the image is changed by what the state does later.
+
+    Raises:
+        ValueError: as of `new_state`.
+    """
+    state = new_state(settings, lights)
+    image = finished(image)
+    if state.light is not None:
+        recall(state.light.filter, image.gains, image.sensors, image.lamps)
+    if not image.submaps:
+        return state
+    state.pose.T_map_odom = state.map.T_map_start = image.T_map_base.copy()
+    fill(state.map, image)
+    alignment, relocalisation = state.pose.alignment, state.relocalisation
+    if alignment is not None:
+        alignment.since = state.map.next_key
+        relocalisation.P_left, relocalisation.T_left = image.P.copy(), image.T_map_base.copy()
+        lit = any(piece.light is not None for piece in image.submaps)
+        relocalisation.unaligned = not (image.identity.surveyed or lit)
+    return state
+
+
+def fill(map_: MapState, image: MapImage) -> None:
+    """Fill an empty map with an image that holds submaps."""
+    graph, parts, last = map_.graph, map_.parts, image.submaps[-1]
+    for piece in image.submaps:
+        way_m = piece.way_m - last.way_m - LONG_AGO_M
+        T_map, T_odom = piece.T_map_submap.copy(), piece.T_odom_submap
+        graph.submaps[piece.key] = Submap(piece.key, piece.first, T_map, T_odom, way_m, piece.settled, piece.light)
+    joined = image.constraints
+    graph.constraints = Constraints(joined.between, joined.T, joined.information, joined.loop)
+    parts.detached = last.key + 1
+    for hung in image.keyframes():
+        submap = graph.submaps[hung.submap]
+        T_odom = se2.compose(submap.T_odom_submap, hung.T_submap_keyframe)
+        frame = replace(hung.frame, submap=submap, T_odom_keyframe=T_odom)
+        if frame.virtual is not None:
+            submap.lamps |= frame.virtual.accepted
+        map_.keyframes[frame.key] = frame
+        map_.places.setdefault(square_of(frame.T_map_keyframe), []).append(frame.key)
+    live_grid.begin(map_.live, map_.keyframes.values())
+    witnesses = (piece.settled.witness.key for piece in image.submaps if piece.settled is not None)
+    map_.next_key = 1 + max((*map_.keyframes, *(piece.first for piece in image.submaps), *witnesses))
+    parts.detached_since = parts.session_start = map_.next_key
+    parts.fixed = map_.settings.localise
