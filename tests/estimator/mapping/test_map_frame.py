@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from estimator.mapping.keyframe import Submap
-from estimator.mapping.map_alignment_covariance import BENT
-from estimator.mapping.map_frame import alignment_covariance
+from estimator.mapping.map_frame import BENT, alignment_covariance
 from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import Array
 from estimator.numerics import se2
