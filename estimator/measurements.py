@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from estimator.cdma.epoch import LightEpoch as LightEpoch  # records too, so they are offered from here
 from estimator.cdma.epoch import SampleBlock as SampleBlock
+from estimator.numerics import se2
 from estimator.numerics.arrays import Array as Array
 
 Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
@@ -63,6 +64,13 @@ class Odometry:
     t_begin: float
     t_end: float
     delta: Array  # (dx, dy, dyaw)
+
+    def part_after(self, t_mono: float, delta: Array) -> Array:
+        """The part of an increment ``delta``, made over the record's interval, that lies after an instant."""
+        dt = self.t_end - self.t_begin
+        if not dt > 0.0 or t_mono <= self.t_begin:
+            return delta
+        return se2.fraction(delta, max(0.0, (self.t_end - t_mono) / dt))
 
 
 @dataclass(frozen=True, slots=True)

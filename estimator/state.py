@@ -72,6 +72,10 @@ class State:
     time_offset: TimeOffset = field(default_factory=TimeOffset)
     journal: Journal | None = None
 
+    def use(self, settings: Settings) -> None:
+        """Go on with other settings; whether a live grid is kept is decided at the start."""
+        self.settings = self.map.settings = settings
+
 
 def new_state(settings: Settings | None = None, lights: LightsSetup | None = None) -> State:
     """A robot that has just been switched on, at the origin of its map.

@@ -76,7 +76,7 @@ class Restored:
 
     def keep_history(self) -> State:
         """The state, which keeps from now on what a replay wants to know at its end."""
-        self.state.settings = replace(self.state.settings, history=True)
+        self.state.use(replace(self.state.settings, history=True))
         return self.state
 
     def put_into(self, cycle: Cycle) -> None:

@@ -94,15 +94,7 @@ def last_used(light: Light | None) -> float:
 def pose_at(pose: MapPose, motion: Motion, t_mono: float) -> Array:
     """T_odom_base at an instant of the last second, at constant twist between two predictions; the ends are held."""
     assert pose.alignment is not None
-    after = motion.t_mono, motion.T_odom_base
-    if pose.alignment.poses and pose.alignment.poses[-1][0] > after[0]:  # at a late scan, the pose is taken back
-        after = pose.alignment.poses[-1]
-        if t_mono >= after[0]:
-            return after[1]
-    for t, T in reversed(pose.alignment.poses):
-        if t <= t_mono < after[0]:
-            twist = se2.log(se2.between(T, after[1]))
-            return se2.compose(T, se2.exp(twist * ((t_mono - t) / (after[0] - t))))
-        if t < after[0]:
-            after = t, T
-    return after[1] if t_mono < after[0] else motion.T_odom_base
+    poses, after = pose.alignment.poses, (motion.t_mono, motion.T_odom_base)
+    if poses.poses and poses.poses[-1][0] > after[0]:  # at a late scan, the pose is taken back
+        after = poses.poses[-1]
+    return after[1] if t_mono >= after[0] else poses.at(t_mono, after)

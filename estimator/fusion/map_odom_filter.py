@@ -78,8 +78,6 @@ SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
 """Covariance of a pose that a person gives."""
 SURER = 0.25
 """Share of the pose's generalised variance below which the lights' is taken as it is."""
-MEMORY_S = 1.0
-"""How late a light epoch may come."""
 
 
 def on_motion(pose: MapPose, motion: Motion, T_before: Array, P_before: Array, t_before: float) -> None:
@@ -101,9 +99,7 @@ def on_motion(pose: MapPose, motion: Motion, T_before: Array, P_before: Array, t
     alignment.P, alignment.X = both[0], both[1]
     alignment.way += way
     alignment.fresh = min(1.0, alignment.fresh + way / FRESH_M + (dt / FRESH_S if math.isfinite(dt) else 0.0))
-    alignment.poses.append((motion.t_mono, motion.T_odom_base))
-    while motion.t_mono - alignment.poses[0][0] > MEMORY_S:
-        alignment.poses.popleft()
+    alignment.poses.add(motion.t_mono, motion.T_odom_base)
 
 
 def on_match(pose: MapPose, motion: Motion, t_scan: float, before: tuple[Array, Array], lacked: Array) -> None:

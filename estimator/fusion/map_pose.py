@@ -14,6 +14,10 @@ from estimator.light_filter.collinear_lamps import Lately
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import hang, turn
+from estimator.numerics.pose_history import PoseHistory
+
+MEMORY_S = 1.0
+"""How late a light epoch may come."""
 
 JUMP_M, JUMP_RAD = 0.05, math.radians(1.0)
 
@@ -39,7 +43,7 @@ class SurveyAlignment:
         since: ID of the first keyframe laid after the pose was known for the last time.
         t_match: instant of the latest match; scan_s: what had passed since the scan before it.
         t_light: instant of the latest epoch, whatever was in it; light_s: what had passed since the one before it.
-        poses: T_odom_base of the last second, each with its instant.
+        poses: T_odom_base of the last second.
         swing: the heading of the odom frame by light over the last stretch of way. row: what a row of lamps leaves.
         mended: when light has mended the pose in the last seconds, and what part (3x3, odom axes) of its error is left.
     """
@@ -67,7 +71,7 @@ class SurveyAlignment:
     scan_s: float = 0.0
     t_light: float = -math.inf
     light_s: float = 0.0
-    poses: deque[tuple[float, Array]] = field(default_factory=deque)
+    poses: PoseHistory = field(default_factory=lambda: PoseHistory(MEMORY_S, first=False))
     swing: Swing = field(default_factory=Swing)
     row: Lately = field(default_factory=Lately)
     mended: deque[tuple[float, Array]] = field(default_factory=deque)

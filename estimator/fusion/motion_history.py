@@ -92,7 +92,7 @@ class Trail:
 def _part(stretch: Stretch, t_begin: float, t_end: float) -> Stretch:
     """The part of a stretch that lies within ``[t_begin, t_end]``, at constant twist."""
     share = (t_end - t_begin) / (stretch.t_end - stretch.t_begin)
-    return Stretch(t_begin, t_end, se2.exp(se2.log(stretch.delta) * share), stretch.variance * share)
+    return Stretch(t_begin, t_end, se2.fraction(stretch.delta, share), stretch.variance * share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

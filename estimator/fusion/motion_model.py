@@ -158,7 +158,7 @@ def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
     variance *= motion.doubt
     motion.gyro.turned_rad = motion.gyro.span_s = 0.0
     follows = abs(record.t_begin - motion.t_odometry) < 1e-6 and dt < LONGEST_CARRY_S
-    made = se2.between(motion.ahead, delta) if follows else remainder(delta, record, motion.t_mono)
+    made = se2.between(motion.ahead, delta) if follows else record.part_after(motion.t_mono, delta)
     move(motion, made, variance)
     if follows:
         motion.trail.take_back(record.t_begin)
@@ -168,14 +168,6 @@ def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
     feel(motion, delta, (record.t_begin, record.t_end), variance, noise)
     motion.ahead, motion.odometry, motion.t_odometry = se2.identity(), True, record.t_end
     motion.t_mono = max(motion.t_mono, record.t_end)
-
-
-def remainder(delta: Array, record: Odometry, t_mono: float) -> Array:
-    """The part of an increment ``delta``, made over the record's interval, that lies after an instant."""
-    dt = record.t_end - record.t_begin
-    if not dt > 0.0 or t_mono <= record.t_begin:
-        return delta
-    return se2.exp(se2.log(delta) * max(0.0, (record.t_end - t_mono) / dt))
 
 
 def odometry_variance(delta: Array, dt: float, noise: MotionNoise) -> Array:

@@ -18,7 +18,11 @@ from estimator.light_filter.state_vector import FIRST, OWN, SIZE, SLOTS
 from estimator.light_filter.survey import Survey
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
+from estimator.numerics.pose_history import PoseHistory
 from estimator.result import LightsResult
+
+TRAIL_S = 1.0
+"""How far back the dead-reckoned poses are kept, s."""
 
 
 class Pause(Enum):
@@ -183,7 +187,7 @@ class Course:
         wheels: whether odometry is alive. matched: it was matches that told it last, not wheels. velocity: (v_x, v_y,
             yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
         gyro_turned, gyro_span: added up since the last odometry.
-        T, trail: dead-reckoned pose since the start, and its last second as (instant, pose).
+        T, trail: dead-reckoned pose since the start, and its last second.
         way: metres driven.
     """
 
@@ -197,7 +201,7 @@ class Course:
     gyro_turned: float = 0.0
     gyro_span: float = 0.0
     T: Array = field(default_factory=se2.identity)
-    trail: list[tuple[float, Array]] = field(default_factory=list)
+    trail: PoseHistory = field(default_factory=lambda: PoseHistory(TRAIL_S, first=True))
     way: float = 0.0
 
 

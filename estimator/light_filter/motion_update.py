@@ -20,7 +20,6 @@ from estimator.numerics.arrays import Array
 
 CARRY_S: Final = 0.5
 """Odometry older than that is not missed for a moment; it has ended, and constant velocity takes over."""
-TRAIL_S: Final = 1.0
 GYRO_FRESH_S: Final = 0.1
 UNSEEN: Final = 0.5
 """m/s and rad/s of a robot that nobody watches."""
@@ -72,7 +71,7 @@ def on_odometry(lights: Lights, record: Odometry, velocity: Array | None = None)
         made, told = se2.between(course.ahead, se2.compose(delta, ahead)), delta
     else:
         ahead = se2.inverse(back_to(lights, record.t_end)) if course.t_mono > record.t_end else se2.identity()
-        made = told = rest(delta, record, course.t_mono)
+        made = told = record.part_after(course.t_mono, delta)
     way, turn = math.hypot(told[0], told[1]), abs(float(told[2]))
     idle = min(max(dt, 0.0), CARRY_S)
     skid = noise.skid**2 * turn
@@ -94,14 +93,6 @@ def gyro_until(lights: Lights, t_end: float) -> tuple[tuple[float, float], tuple
     later_s = min(max(course.t_gyro - t_end, 0.0), course.gyro_span)
     later = float(course.velocity[2]) * later_s, later_s
     return (course.gyro_turned - later[0], course.gyro_span - later_s), later
-
-
-def rest(delta: Array, record: Odometry, t_mono: float) -> Array:
-    """The part of an increment that lies after an instant."""
-    dt = record.t_end - record.t_begin
-    if not dt > 0.0 or t_mono <= record.t_begin:
-        return delta
-    return se2.exp(se2.log(delta) * min(1.0, max(0.0, (record.t_end - t_mono) / dt)))
 
 
 def on_imu(lights: Lights, record: Imu) -> None:
@@ -189,9 +180,7 @@ def move_all(lights: Lights, delta: Array, blame: Array, q: Array, t_mono: float
         way = speed * (t_mono - course.t_mono) if speed > STILL and math.isfinite(course.t_mono) else 0.0
     course.way += way if course.wheels else max(0.0, way - STILL * float(blame[0]))
     course.t_mono = max(course.t_mono, t_mono)
-    course.trail.append((course.t_mono, course.T))
-    while course.trail[0][0] < course.t_mono - TRAIL_S:
-        course.trail.pop(0)
+    course.trail.add(course.t_mono, course.T)
 
 
 def drive(lights: Lights, dt: float) -> None:
@@ -275,13 +264,5 @@ def face_forward(lights: Lights, track: Track) -> None:
 
 def back_to(lights: Lights, t_mono: float) -> Array:
     """Where the robot was at an instant, seen from where it is now; the trail's begin where it was earlier still."""
-    course, trail = lights.course, lights.course.trail
-    later = (course.t_mono, course.T)
-    for t, T in reversed(trail):
-        if t <= t_mono:
-            span = later[0] - t
-            share = 0.0 if span <= 0.0 else min(1.0, (t_mono - t) / span)
-            at = se2.compose(T, se2.exp(se2.log(se2.between(T, later[1])) * share))
-            return se2.between(course.T, at)
-        later = (t, T)
-    return se2.between(course.T, later[1])
+    course = lights.course
+    return se2.between(course.T, course.trail.at(t_mono, (course.t_mono, course.T)))

@@ -96,6 +96,11 @@ def adjoint(T: Array) -> Array:
     return A
 
 
+def fraction(T: Array, share: float) -> Array:
+    """The part of a motion that is made in a share of its time, at constant twist."""
+    return exp(log(T) * share)
+
+
 def lever_matrix(lever: Array) -> Array:
     """Jacobian (3, 3) of a pose error carried along a lever (x, y): a heading error moves the far end."""
     return np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0]), (0.0, 0.0, 1.0)))

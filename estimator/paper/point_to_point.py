@@ -20,7 +20,8 @@ from estimator.numerics.arrays import Array, Ints
 from estimator.paper import beam_model, point_to_point_sums
 from estimator.paper.pose_weighting import combine, information_weight, moved, paper_weight, turned, twist_between
 from estimator.scan_matching import icp
-from estimator.scan_matching.distance_region import Axis, Fused, build_axis, fuse, pair_fused
+from estimator.scan_matching.distance_axis import Axis, build_axis
+from estimator.scan_matching.distance_region import Fused, fuse, pair_fused
 from estimator.scan_matching.matcher_choice import CENTRE, First
 
 PROBES = 4

@@ -9,28 +9,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import partial
 from typing import Final
 
 import numpy as np
 
-from estimator.fusion import map_odom_filter
 from estimator.fusion.light_witness import blind, light_holds
 from estimator.job_queue import SEARCH
 from estimator.mapping import live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.loop_closure import join
-from estimator.mapping.loop_verification import Found
-from estimator.mapping.map_frame import alignment_covariance, relist, shift_map, unlist
-from estimator.mapping.submap_graph import SubmapGraph
+from estimator.mapping.map_frame import relist, unlist
 from estimator.numerics import se2
-from estimator.numerics.arrays import Array
-from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, look
-from estimator.relocalisation.hypothesis_tracking import WATCH_M, Hypothesis, SearchedAside, Seek, Watch
+from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside, Seek
+from estimator.relocalisation.landing import SURPRISE, land
 from estimator.relocalisation.owners import Owners
-from estimator.result import Fix, LoopReason
+from estimator.result import Fix
 from estimator.scan_matching.branch_and_bound import Around
 
 Take = Callable[[Owners, Seek, Keyframe, tuple[Hypothesis, ...], object], None]
@@ -54,8 +48,6 @@ STALE: Final = 5
 """Scans after which a keyframe that was found nowhere is laid anew, where light says that it must be here."""
 YOUNG: Final = 2
 """Keyframes of a map in which a robot can be looked for."""
-SURPRISE: Final = 16.3
-"""Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
 
 
 def begin(state: Owners) -> bool:
@@ -360,99 +352,3 @@ def said(state: Owners, one: Hypothesis) -> bool | None:
     if light_evidence.witness(state.light, state.map.graph, T_map_base):
         return True
     return False if light_evidence.compatible(state.light, state.map.graph, T_map_base) is False else None
-
-
-def land(state: Owners, one: Hypothesis, alone: bool) -> None:
-    """The place is known: join what was mapped adrift to the older map, and take the robot there.
-
-    A map in a frame of its own is taken to the robot instead, if light has told where that is. ``alone``: by the laser
-    alone.
-    """
-    graph, (frame, fit) = state.map.graph, one.held[-1]
-    found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in graph.submaps]
-    if fit.key not in graph.submaps or not found:
-        return
-    T_map_keyframe = se2.compose(graph.submaps[fit.key].T_map_submap, fit.T_submap_keyframe)
-    T_map_odom = se2.compose(T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
-    moved = se2.compose(T_map_odom, se2.inverse(state.pose.T_map_odom))
-    stays = state.relocalisation.unaligned and state.pose.alignment is not None and state.pose.alignment.placed
-    parts, was = graph.parts, state.pose.T_map_odom
-    since, first = parts.detached_since, parts.detached
-    shift_map(state.map, moved, since)
-    if stays:
-        state.pose.T_map_odom = T_map_odom  # for the moment: it is no jump
-    else:
-        state.pose.move(T_map_odom, state.motion.T_odom_base)
-    if first is not None:
-        parts.trial = Watch(
-            first=first,
-            until_m=graph.way_m + WATCH_M,
-            terrain=state.relocalisation.search.terrain,
-            since=since,
-            alone=alone,
-            foreign_m=graph.way_m if state.relocalisation.unaligned else None,
-        )
-    parts.attach()
-    state.relocalisation.search = Seek()
-    for at, it in found[: 1 if one.held[0] is one.held[-1] else 2]:
-        if it.key in graph.submaps:
-            R = se2.rotation(-graph.submaps[it.key].T_map_submap[2])
-            P = R @ it.P @ R.T
-            close = Found(it.key, it.T_submap_keyframe, P, it.share, it.against, it.residual_m, np.zeros(3))
-            join(graph, at, replace(close, reason=LoopReason.PLACED))
-    bridge(graph, first)
-    resettle(state, frame, fit.P, first)
-    if stays:
-        shift_map(state.map, se2.inverse(moved), 0)
-        state.pose.T_map_odom = was
-    relist(state.map, 0 if stays else since)
-
-
-def bridge(graph: SubmapGraph, first: int | None) -> None:
-    """The way driven across the break counts as one that may be false, where what was found agrees with it."""
-    told, graph.parts.bridge = graph.parts.bridge, None
-    if told is None or first not in graph.submaps or told[0] not in graph.submaps:
-        return
-    key, T, P = told
-    before, after = graph.submaps[key], graph.submaps[first]
-    off = se2.between(T, se2.between(before.T_map_submap, after.T_map_submap))
-    if float(off @ invert3(P) @ off) < SURPRISE:
-        graph.constraints.add(key, after.key, T, P, True)
-
-
-def resettle(state: Owners, frame: Keyframe, P_map: Array, first: int | None) -> None:
-    """How sure the pose is now: by the match that has decided, the way since, and the map it was found in.
-
-    ``first``: key of the first submap that is no part of that map.
-    """
-    graph = state.map.graph
-    newest = graph.newest
-    assert newest is not None
-    T_keyframe_newest = se2.between(frame.T_odom_keyframe, newest.T_odom_submap)
-    R = se2.rotation(-state.pose.T_map_odom[2])
-    P = se2.carry(frame.T_map_keyframe, T_keyframe_newest, P_map)
-    graph.marginal = R @ P @ R.T
-    state.pose.P_anchor = graph.spread(state.pose.T_odom_anchor)
-    alignment = state.pose.alignment
-    if alignment is None:
-        return
-    from estimator.relocalisation.light_evidence import disputed, told
-
-    if state.relocalisation.unaligned:  # map and robot are one again: light moves both, as after a first start
-        alignment.since, state.relocalisation.unaligned = 0, False
-    elif alignment.placed or told(state.light, state.map.graph):  # the map's frame is the survey's
-        map_odom_filter.hang_on_anchor(state.pose, state.motion)
-        here, left = (
-            state.pose.here(state.motion.T_odom_base),
-            (state.relocalisation.T_left, state.relocalisation.P_left),
-        )
-        P_map_survey = alignment_covariance(graph.submaps.values(), here, first, left)
-        alignment.P = alignment.P + R @ P_map_survey @ R.T  # no surer in the survey's frame than the map is
-        alignment.placed, alignment.proved, alignment.broken = True, True, False
-        alignment.gap, alignment.odd_since, alignment.since = None, None, state.map.next_key
-        map_odom_filter.place_given(alignment, True)
-        alignment.way_start = -math.inf if state.light is None else state.light.filter.way_start
-        alignment.unheard, alignment.t_match = (
-            disputed(state.light, state.map.graph),
-            state.motion.t_mono,
-        )  # the laser has just told the place

@@ -19,8 +19,9 @@ from estimator.mapping.map_frame import relist
 from estimator.mapping.map_parts import Trial
 from estimator.relocalisation.global_scan_match import Looked
 from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside, Seek
+from estimator.relocalisation.landing import land
 from estimator.relocalisation.owners import Owners
-from estimator.relocalisation.relocalisation import hand_out, land
+from estimator.relocalisation.relocalisation import hand_out
 from estimator.result import SURPRISE, Fix
 
 LEAST_M, MOST_M = 5.0, 100.0

@@ -16,7 +16,7 @@ import numpy as np
 from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 from estimator.numerics.symmetric3 import eigen3, positive, solve3
-from estimator.scan_matching.distance_region import glance, nearest, search
+from estimator.scan_matching.nearest_neighbour import glance, nearest, search
 
 GRAZE = 0.2
 """Part of the range noise that remains across a surface met at a grazing angle: footprint, roughness, bearing."""

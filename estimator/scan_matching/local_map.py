@@ -19,7 +19,8 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 from estimator.result import Virtual
-from estimator.scan_matching.distance_region import Axis, build_axis, nearest
+from estimator.scan_matching.distance_axis import Axis, build_axis
+from estimator.scan_matching.nearest_neighbour import nearest
 
 X, Y, NX, NY, SLOPE, WEIGHT, SEEN, STRIKES = range(8)
 """Columns of an element: place, normal towards the sensor, variance of the normal's direction (rad^2), scans averaged,

@@ -18,7 +18,7 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import LightsResult, LinkState, MatchResult, Reason, Virtual
 from estimator.scan_matching import icp, scan_matcher
-from estimator.scan_matching.distance_region import build_axis
+from estimator.scan_matching.distance_axis import build_axis
 from estimator.scan_matching.local_map import PlacedScan
 from estimator.scan_matching.scan_matcher import Asked, Attempt, Prior, View
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
-from estimator.scan_matching.distance_region import Axis, nearest
+from estimator.scan_matching.distance_axis import Axis
+from estimator.scan_matching.nearest_neighbour import nearest
 
 BESIDE_M = 0.2
 """Farther apart, two points in a row lie on different surfaces."""

@@ -63,7 +63,7 @@ def driven(
 ) -> tuple[State, Array]:
     """A state after the circuit with drift, all jobs done as they came; and the true poses. Loops go to ``news``."""
     state, truth = new_state(), circuit(laps=laps)
-    state.settings = replace(state.settings, loops=settings)
+    state.use(replace(state.settings, loops=settings))
     rng = np.random.default_rng(2)
     state.motion.T_odom_base = state.map.T_map_start = truth[0]
     for key, (T_odom, T_true) in enumerate(zip(drifted(truth, 1.004, turn), truth, strict=True), 1):

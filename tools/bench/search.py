@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from estimator.measurements import Array
 from estimator.numerics.arrays import Ints
-from estimator.scan_matching import distance_region
+from estimator.scan_matching import distance_region, nearest_neighbour
 from estimator.scan_matching.distance_axis import FEWEST, Axis, build_axis, sector_count
 from tools.bench.match import FAR, STILL, pairs, points
 from tools.bench.support.scenes import Scene, corridor, office, paper_room, round_room
@@ -50,7 +50,7 @@ class Task:
     def ours(self) -> None:
         """One pass."""
         axis, out = self.axis, (self.row, self.d2, self.e2, self.visits)
-        distance_region.nearest_all(axis.rows, axis.start, axis.rays, self.local, np.inf, out)
+        nearest_neighbour.nearest_all(axis.rows, axis.start, axis.rays, self.local, np.inf, out)
 
     def index(self) -> Axis:
         """Our index."""

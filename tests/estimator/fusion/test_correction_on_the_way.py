@@ -24,7 +24,7 @@ MOVED = np.array((5.0, -1.0, 2.5))
 def drifted() -> State:
     """With loops that the graph has not heard of."""
     state, _ = driven(settings=None)
-    state.settings = replace(state.settings, loops=TOLD)
+    state.use(replace(state.settings, loops=TOLD))
     atlas = state.map.graph
     a, *_, b = atlas.submaps.values()
     T = se2.between(a.T_map_submap, b.T_map_submap) + np.array((0.1, -0.05, 0.02))

@@ -30,7 +30,7 @@ HOW = (50, 1e-4, 10.0)
 def lit(tie: Array, told: Array = SURE) -> tuple[State, Array]:
     """After a drive, light has said of each submap but the newest where it lies; the tie is as sure as said."""
     state, truth = driven(settings=None)
-    state.settings = replace(state.settings, loops=TOLD)
+    state.use(replace(state.settings, loops=TOLD))
     state.pose.alignment = SurveyAlignment(placed=True, P=tie.copy())
     for submap in state.map.graph.submaps.values():
         submap.light = truth[submap.first - 1], told

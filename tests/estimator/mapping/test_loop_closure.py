@@ -285,7 +285,7 @@ def test_two_places_that_fit_close_nothing() -> None:
 
 def test_light_holds_the_map_and_the_loop_does_not_move_the_robot() -> None:
     state, truth = driven(settings=None)
-    state.settings = replace(state.settings, loops=TOLD)
+    state.use(replace(state.settings, loops=TOLD))
     state.pose.alignment = SurveyAlignment(placed=True, P=np.diag((0.03**2, 0.03**2, 0.01**2)))
     for submap in state.map.graph.submaps.values():
         first = state.map.keyframes[submap.first]

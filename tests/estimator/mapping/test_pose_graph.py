@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimator.mapping.pose_graph import Graph, cost, optimise
+from estimator.mapping.pose_graph import Graph, optimise
+from estimator.mapping.pose_graph_kernels import cost
 from estimator.measurements import Array
 from estimator.numerics import se2
 from estimator.numerics.block_ldl import factor, solve

@@ -17,7 +17,8 @@ from estimator.mapping.submap_graph import OWN
 from estimator.measurements import UNLIMITED, Array, Command, Order
 from estimator.numerics import se2
 from estimator.pipeline import Settings, fuse_light, keyframe_poses, new_state, step
-from estimator.relocalisation.relocalisation import begin, local_map_lost, resettle
+from estimator.relocalisation.landing import resettle
+from estimator.relocalisation.relocalisation import begin, local_map_lost
 from tests.estimator.adrift import Corners, Robot, furnished, mapped, stored, way
 from tests.estimator.circuit import driven, lay, run_jobs
 from tools.bench.support.scenes import Scene, box

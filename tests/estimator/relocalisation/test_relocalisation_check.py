@@ -25,7 +25,7 @@ from tests.estimator.circuit import driven, run_jobs
 def watched(until_m: float = 1e6) -> tuple[State, Watch, Keyframe]:
     """A robot that was found in a map that ends before its newest submap."""
     state, _ = driven(laps=0.6, settings=None)
-    state.settings = replace(state.settings, loops=LoopSettings())
+    state.use(replace(state.settings, loops=LoopSettings()))
     newest = state.map.graph.newest
     assert newest is not None
     state.map.parts.trial = Watch(first=newest.key, until_m=until_m)

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from estimator.measurements import Array
 from estimator.scan_matching.distance_axis import build_axis, sector_count, turn_of
-from estimator.scan_matching.distance_region import nearest, nearest_all, nearest_slow, query_axis, search
+from estimator.scan_matching.nearest_neighbour import nearest, nearest_all, nearest_slow, query_axis, search
 
 COARSE = st.integers(-6, 6).map(lambda n: n * 0.25)  # duplicates, ties and points on sector bounds are common
 POINTS = st.integers(0, 40).flatmap(lambda n: arrays(np.float64, (n, 2), elements=COARSE))

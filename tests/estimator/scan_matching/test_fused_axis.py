@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 from estimator.measurements import Array
 from estimator.numerics import se2
 from estimator.scan_matching.distance_axis import build_axis
-from estimator.scan_matching.distance_region import Kind, fuse, nearest_slow, pair_fused
+from estimator.scan_matching.distance_region import Kind, fuse, pair_fused
+from estimator.scan_matching.nearest_neighbour import nearest_slow
 
 COARSE = st.integers(-6, 6).map(lambda n: n * 0.25)  # duplicates, ties and points in the centre are common
 POINTS = st.integers(0, 25).flatmap(lambda n: arrays(np.float64, (n, 2), elements=COARSE))

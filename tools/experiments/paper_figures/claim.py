@@ -19,7 +19,7 @@ from estimator.numerics import se2
 from estimator.pipeline import Settings
 from estimator.scan_matching import local_map, matcher_choice, scan_matcher
 from estimator.scan_matching.deskew import oriented, points_of, unturned
-from estimator.scan_matching.distance_region import build_axis
+from estimator.scan_matching.distance_axis import build_axis
 from estimator.scan_matching.line_features import lines_of
 from estimator.scan_matching.local_map import LocalMap
 from estimator.scan_matching.scan_matcher import Attempt, MatchSettings, Prior, View

@@ -11,7 +11,7 @@ import numpy as np
 from estimator.numerics import se2
 from estimator.numerics.arrays import Ints
 from estimator.scan_matching import icp
-from estimator.scan_matching.distance_region import nearest_all
+from estimator.scan_matching.nearest_neighbour import nearest_all
 from tools.experiments.trajectory import Array
 
 Axis = tuple[Array, Ints, Array]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimator.numerics import se2
-from estimator.scan_matching.distance_region import build_axis
+from estimator.scan_matching.distance_axis import build_axis
 from tools.experiments.paper_figures import claim
 from tools.experiments.paper_figures.claim_cost import effort_of, look_up, timed
 from tools.experiments.paper_figures.claim_cycle import burden
