@@ -9,8 +9,8 @@ from estimator.fusion.map_pose import MapPose, SurveyAlignment
 from estimator.fusion.motion_model import Motion, MotionNoise
 from estimator.fusion.time_offset import TimeOffset
 from estimator.job_queue import JobQueue
-from estimator.light_filter.light_channel import Light, LightsSetup
-from estimator.mapping.live_grid import LiveMap
+from estimator.light_filter.light_channel import LightChannel, LightsSetup
+from estimator.mapping.live_grid import LiveGrid
 from estimator.mapping.map_state import MappingSettings, MapState
 from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import Scan
@@ -65,7 +65,7 @@ class State:
     map: MapState
     jobs: JobQueue
     motion: Motion = field(default_factory=Motion)
-    light: Light | None = None
+    light: LightChannel | None = None
     pose: MapPose = field(default_factory=MapPose)
     matching: MatchMemory = field(default_factory=MatchMemory)
     relocalisation: RelocalisationMemory = field(default_factory=RelocalisationMemory)
@@ -91,7 +91,7 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
     load(settings)
     state = State(settings, MapState(settings, SubmapGraph(jobs)), jobs)
     if settings.live_m > 0.0:
-        state.map.live = LiveMap(settings.live_m)
+        state.map.live = LiveGrid(settings.live_m)
     if lights is not None:
-        state.light, state.pose.alignment = Light(lights), SurveyAlignment()
+        state.light, state.pose.alignment = LightChannel(lights), SurveyAlignment()
     return state

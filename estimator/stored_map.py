@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 from estimator.light_filter.gain_memory import gains_known, recall, sensors_known
-from estimator.light_filter.light_channel import Light, LightsSetup
+from estimator.light_filter.light_channel import LightChannel, LightsSetup
 from estimator.light_filter.survey import Lamp
 from estimator.mapping import live_grid
 from estimator.mapping.constraints import Constraints
@@ -72,7 +72,7 @@ def _piece(submap: Submap) -> Piece:
     return Piece(submap.key, submap.first, T_map, T_odom, submap.way_m, submap.settled, submap.light)
 
 
-def _learned(light: Light | None) -> tuple[Gains, tuple[Array, Array] | None, tuple[Lamp, ...]]:
+def _learned(light: LightChannel | None) -> tuple[Gains, tuple[Array, Array] | None, tuple[Lamp, ...]]:
     """What the light filter has learned of lamps and sensors."""
     if light is None:
         return {}, None, ()

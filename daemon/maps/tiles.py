@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 
     from estimator.mapping.grid_patches import Cells, Tile
     from estimator.mapping.keyframe import Keyframe, Submap
-    from estimator.mapping.live_grid import LiveMap, Progress, Task
+    from estimator.mapping.live_grid import LiveGrid, Progress, Task
     from estimator.state import State
 
 log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class MapTiles:
         self.error = ""
         self._state = state
         self._changed = changed
-        self._live: LiveMap | None = None
+        self._live: LiveGrid | None = None
         self._frames: dict[int, list[Keyframe]] = {}
         self._seen = 0
         self._busy = False
@@ -101,11 +101,11 @@ class MapTiles:
 
     def _look(self, state: State) -> None:
         """Take in the keyframes that have come, and let go of submaps that have gone."""
-        from estimator.mapping.live_grid import LiveMap
+        from estimator.mapping.live_grid import LiveGrid
 
         live = self._live
         if live is None:
-            live = self._live = LiveMap(RESOLUTION_M)
+            live = self._live = LiveGrid(RESOLUTION_M)
         gone = [key for key, submap in live.submaps.items() if not _stands(state, submap)]
         if gone:
             self._let_go(live, gone)
@@ -121,7 +121,7 @@ class MapTiles:
         for key in [key for key in self._frames if key not in live.submaps]:
             del self._frames[key]
 
-    def _let_go(self, live: LiveMap, gone: list[int]) -> None:
+    def _let_go(self, live: LiveGrid, gone: list[int]) -> None:
         """Submaps that are another map's, or of a part that was forgotten: what they have shown is drawn again."""
         if len(gone) == len(live.submaps):
             self._seen = 0  # another map
@@ -158,7 +158,7 @@ class MapTiles:
 
     def _take(
         self,
-        live: LiveMap | None,
+        live: LiveGrid | None,
         done: tuple[Progress, dict[Tile, bytes]] | None,
         adrift: float,
         left: int,

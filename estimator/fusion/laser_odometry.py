@@ -13,7 +13,7 @@ from typing import Final
 
 from estimator.fusion.motion_model import Motion, too_far
 from estimator.fusion.pose_update import BLIND, loose_direction
-from estimator.light_filter.light_channel import Light
+from estimator.light_filter.light_channel import LightChannel
 from estimator.light_filter.motion_update import CARRY_S
 from estimator.measurements import Odometry
 from estimator.numerics import se2
@@ -23,7 +23,7 @@ WHEELS_GONE_S: Final = 5.0
 """Wheels that have been silent for longer are not waited for: what lamps said of their scale is given up."""
 
 
-def guide(light: Light | None, motion: Motion, match: MatchResult) -> None:
+def guide(light: LightChannel | None, motion: Motion, match: MatchResult) -> None:
     """Move the light filter by the way since the scan before, after ``match`` has been fused."""
     if light is None:
         return

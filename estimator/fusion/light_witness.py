@@ -9,7 +9,7 @@ import numpy as np
 from estimator.fusion.light_inflation import BESIDE_M, TRUST, across_the_row, doubted_covariance, without_heading
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
-from estimator.light_filter.light_channel import SILENT_S, Light
+from estimator.light_filter.light_channel import SILENT_S, LightChannel
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Fix, LightsResult, Virtual
@@ -22,7 +22,7 @@ SILENT_PERIODS = 2.5
 """Nor does light that has been silent for so many epochs, where these come slowly; see `SILENT_S`."""
 
 
-def virtual(pose: MapPose, motion: Motion, light: Light | None) -> Virtual | None:
+def virtual(pose: MapPose, motion: Motion, light: LightChannel | None) -> Virtual | None:
     """What light alone says of the place just now, as far as the map may rely on it; None where it says nothing good.
 
     What it does not know it must not say: a row of lamps would turn the map to and fro, so that its far end moved by
@@ -43,7 +43,7 @@ def virtual(pose: MapPose, motion: Motion, light: Light | None) -> Virtual | Non
     return Virtual(T_map_base, factor / TRUST * lights.covariance, lights.accepted)
 
 
-def restarting(light: Light, lights: LightsResult) -> bool:
+def restarting(light: LightChannel, lights: LightsResult) -> bool:
     """Whether light is only just finding its place, so that gains are not known yet.
 
     A heading that has become vague since, as that of a robot that stands where no wheels say so, and a stretch between
@@ -55,7 +55,7 @@ def restarting(light: Light, lights: LightsResult) -> bool:
     return not (known and lights.covariance[0, 0] + lights.covariance[1, 1] < KNOWN[0] + KNOWN[1])
 
 
-def holds_heading(pose: MapPose, motion: Motion, light: Light | None) -> bool:
+def holds_heading(pose: MapPose, motion: Motion, light: LightChannel | None) -> bool:
     """Whether the laser holds a heading that light has proved, and light has nothing as good.
 
     Without wheels the `lights` filter takes a robot to drive the way it faces, and its heading may settle the wrong way
@@ -78,7 +78,7 @@ def blind(pose: MapPose, motion: Motion) -> bool:
     return motion.t_mono - alignment.t_match > max(BLIND_S, BLIND_PERIODS * alignment.scan_s)
 
 
-def light_holds(pose: MapPose, motion: Motion, light: Light | None) -> bool:
+def light_holds(pose: MapPose, motion: Motion, light: LightChannel | None) -> bool:
     """Whether light has told the place and goes on telling; lamps that went out hold nobody where they once did."""
     alignment = pose.alignment
     if alignment is None or light is None or not alignment.placed:
@@ -86,7 +86,7 @@ def light_holds(pose: MapPose, motion: Motion, light: Light | None) -> bool:
     return motion.t_mono - light.filter.t_used <= max(SILENT_S, SILENT_PERIODS * alignment.light_s)
 
 
-def last_used(light: Light | None) -> float:
+def last_used(light: LightChannel | None) -> float:
     """When a link was used for the last time; -inf without a photodiode."""
     return -math.inf if light is None else light.filter.t_used
 

@@ -29,7 +29,7 @@ from estimator.fusion.map_pose import MapPose, SurveyAlignment
 from estimator.fusion.motion_history import KEPT_S
 from estimator.fusion.motion_model import Motion
 from estimator.light_filter.collinear_lamps import doubt, straighten, sure_part
-from estimator.light_filter.light_channel import Light, too_strong_at
+from estimator.light_filter.light_channel import LightChannel, too_strong_at
 from estimator.measurements import Command, Order
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
@@ -137,7 +137,9 @@ def remember(pose: MapPose, motion: Motion) -> None:
     alignment.kept = se2.compose(pose.T_map_odom, motion.T_odom_base), R @ alignment.P @ R.T
 
 
-def on_lights(pose: MapPose, motion: Motion, light: Light, lights: LightsResult, next_key: int) -> MapShift | None:
+def on_lights(
+    pose: MapPose, motion: Motion, light: LightChannel, lights: LightsResult, next_key: int
+) -> MapShift | None:
     """Take in a result of the light filter; returns by what the map is to be moved with the robot, if it is.
 
     ``next_key``: ID of the next keyframe.
@@ -186,7 +188,7 @@ def on_lights(pose: MapPose, motion: Motion, light: Light, lights: LightsResult,
     return shift
 
 
-def on_order(pose: MapPose, motion: Motion, light: Light | None, command: Command) -> None:
+def on_order(pose: MapPose, motion: Motion, light: LightChannel | None, command: Command) -> None:
     """What a person orders holds for light too: it looks about the given pose, or begins anew."""
     alignment, T_map_base = pose.alignment, command.T_map_base
     if alignment is None or light is None or command.order is Order.REMEMBERED:
@@ -309,7 +311,7 @@ def correct(pose: MapPose, T_map_base: Array, T_odom_base: Array, T_odom_now: Ar
     return shift
 
 
-def _contradicted(pose: MapPose, motion: Motion, light: Light, lights: LightsResult, off: Array) -> bool:
+def _contradicted(pose: MapPose, motion: Motion, light: LightChannel, lights: LightsResult, off: Array) -> bool:
     """Whether light has disagreed with the pose for long enough, and by enough, to be believed.
 
     Light that looks, or is off by less than the laser could have lost, says nothing against a proved pose held since;
@@ -343,7 +345,7 @@ def _apart(alignment: SurveyAlignment) -> bool:
     return alignment.gap > APART or not alignment.swing.rests
 
 
-def _elsewhere(pose: MapPose, motion: Motion, light: Light) -> bool:
+def _elsewhere(pose: MapPose, motion: Motion, light: LightChannel) -> bool:
     """Whether light has had to look for its place anew since it last agreed, or a lamp cannot be received here.
 
     Else it is its heading that wheels have led away, or that a row of lamps has left open: the laser holds its own, and

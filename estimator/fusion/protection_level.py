@@ -27,7 +27,7 @@ from estimator.fusion.light_inflation import BESIDE_M, doubted_covariance
 from estimator.fusion.light_witness import pose_at
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
-from estimator.light_filter.light_channel import Light
+from estimator.light_filter.light_channel import LightChannel
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Fix, Protection
@@ -56,7 +56,9 @@ K_FAULT: Final = ALIKE * math.sqrt(-2.0 * math.log(0.25 * RISK / FAULTY))
 """The same with one of two witnesses wrong, each of which may take a quarter of the risk."""
 
 
-def bound(pose: MapPose, motion: Motion, light: Light | None, matching: MatchMemory, P: Array) -> Protection | None:
+def bound(
+    pose: MapPose, motion: Motion, light: LightChannel | None, matching: MatchMemory, P: Array
+) -> Protection | None:
     """Bound on the error of the pose after this step, ``P`` being its covariance; None: there is none."""
     alignment = pose.alignment
     laser = matching.local_map is not None and (motion.t_mono - matching.t_match < 1.0)
@@ -74,7 +76,7 @@ def bound(pose: MapPose, motion: Motion, light: Light | None, matching: MatchMem
     return Protection(horizontal, yaw, laser, lit, motion.odometry)
 
 
-def on_wheels(light: Light | None) -> bool:
+def on_wheels(light: LightChannel | None) -> bool:
     """Whether wheels move the light filter."""
     return light is not None and light.on_wheels
 
@@ -101,7 +103,7 @@ def _without_light(pose: MapPose, motion: Motion, steps: float) -> tuple[float, 
     return math.hypot(off[0], off[1]) + far, abs(float(off[2])) + turned
 
 
-def _without_laser(pose: MapPose, motion: Motion, light: Light) -> tuple[float, float]:
+def _without_laser(pose: MapPose, motion: Motion, light: LightChannel) -> tuple[float, float]:
     """What light alone says: separation and spread. Without wheels it says nothing of the heading."""
     alignment = pose.alignment
     assert alignment is not None

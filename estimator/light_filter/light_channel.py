@@ -48,7 +48,7 @@ class Asked:
     misplaced: bool
 
 
-class Light:
+class LightChannel:
     """What is known from light, without a place by the laser.
 
     Attributes:
@@ -131,13 +131,13 @@ SILENT_S = 0.5
 """Light of which nothing could be used for so long says nothing of where the robot is now. One epoch may be lost."""
 
 
-def silent(light: Light) -> bool:
+def silent(light: LightChannel) -> bool:
     """Whether there is no usable epoch of now."""
     epoch = light.epoch
     return epoch is None or light.filter.course.t_mono - epoch.t_end > SILENT_S or bool(epoch.block & UNUSABLE)
 
 
-def too_strong_at(light: Light | None, T_map_base: Array) -> list[bool]:
+def too_strong_at(light: LightChannel | None, T_map_base: Array) -> list[bool]:
     """Of each lamp that is received now, whether it is stronger than it can be near a pose (x, y, yaw; map frame).
 
     Reads the latest epoch alone, neither the filter, which wheels can lead astray, nor the heading, of which strengths

@@ -1,7 +1,7 @@
 """The map as tiles that follow the submaps: only those are composed again on which a submap is new, moved or gone.
 
 The work is done by the background worker, a few patches and tiles at a time (:func:`advance`), and taken in within a
-cycle (:meth:`LiveMap.take`). Whoever shows the map asks for the tiles that have changed since the version that he has.
+cycle (:meth:`LiveGrid.take`). Whoever shows the map asks for the tiles that have changed since the version that he has.
 The final map of a replay and the picture of a map file are made by the same code, at once (:func:`at_once`).
 """
 
@@ -86,7 +86,7 @@ class Progress:
 
 
 @dataclass(slots=True, eq=False)
-class LiveMap:
+class LiveGrid:
     """A map that is kept up to date.
 
     Attributes:
@@ -182,7 +182,7 @@ class LiveMap:
         return Grid(origin, self.resolution, np.ascontiguousarray(part))
 
 
-def follow(live: LiveMap | None, graph: SubmapGraph, before: Submap | None, frames: Sequence[Keyframe]) -> None:
+def follow(live: LiveGrid | None, graph: SubmapGraph, before: Submap | None, frames: Sequence[Keyframe]) -> None:
     """A keyframe was laid; before it, ``before`` was the newest submap, with these keyframes."""
     newest = graph.newest
     if live is None or newest is None:
@@ -198,14 +198,14 @@ def follow(live: LiveMap | None, graph: SubmapGraph, before: Submap | None, fram
     go_on(live, graph)
 
 
-def begin(live: LiveMap | None, keyframes: Iterable[Keyframe]) -> None:
+def begin(live: LiveGrid | None, keyframes: Iterable[Keyframe]) -> None:
     """Show what a restored map holds."""
     if live is not None:
         for submap, frames in hanging(keyframes):
             live.laid(submap, frames)
 
 
-def redraw(live: LiveMap | None, graph: SubmapGraph, keyframes: Iterable[Keyframe]) -> None:
+def redraw(live: LiveGrid | None, graph: SubmapGraph, keyframes: Iterable[Keyframe]) -> None:
     """The map has become another one: show what it holds now; an answer that shows the other is not waited for."""
     if live is not None:
         graph.jobs.cancel(live)
@@ -213,7 +213,7 @@ def redraw(live: LiveMap | None, graph: SubmapGraph, keyframes: Iterable[Keyfram
         begin(live, keyframes)
 
 
-def forget(live: LiveMap | None, graph: SubmapGraph, first: int) -> None:
+def forget(live: LiveGrid | None, graph: SubmapGraph, first: int) -> None:
     """The submaps from key ``first`` on are taken out of the map; an answer that still shows them is not waited for."""
     if live is None:
         return
@@ -224,7 +224,7 @@ def forget(live: LiveMap | None, graph: SubmapGraph, first: int) -> None:
     live.fresh = {key: seen for key, seen in live.fresh.items() if key < first}
 
 
-def go_on(live: LiveMap | None, graph: SubmapGraph) -> None:
+def go_on(live: LiveGrid | None, graph: SubmapGraph) -> None:
     """Hand out the next piece of work, if there is any and none is under way."""
     detached = math.inf if graph.parts.detached is None else graph.parts.detached
     if live is None or not live.busy(detached) or graph.jobs.busy(live):
@@ -302,7 +302,7 @@ def at_once(pieces: Iterable[tuple[Submap, Sequence[Keyframe]]], resolution: flo
     """
     if not resolution > 0.0:
         raise ValueError(f"map resolution is {resolution} m per cell; it must be positive")
-    live = LiveMap(resolution)
+    live = LiveGrid(resolution)
     for number, (submap, frames) in enumerate(pieces, 1):
         alone = Submap(number, submap.first, submap.place(), submap.T_odom_submap)
         live.laid(alone, frames)

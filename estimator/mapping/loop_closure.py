@@ -73,9 +73,9 @@ def add_keyframe(map_: MapState, pose: MapPose, frame: Keyframe, odometry: tuple
         look_back(graph, pose, loops, frame)
 
 
-def look_back(graph: SubmapGraph, pose: MapPose, told: LoopSettings, frame: Keyframe) -> None:
+def look_back(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: Keyframe) -> None:
     """Hand out the search for a keyframe in the submaps that may lie here."""
-    asked = candidates(graph, pose, told, frame)
+    asked = candidates(graph, pose, settings, frame)
     if not asked:
         return
     graph.since_look = 0
@@ -83,16 +83,16 @@ def look_back(graph: SubmapGraph, pose: MapPose, told: LoopSettings, frame: Keyf
     def then(payload: object) -> None:
         assert isinstance(payload, tuple)
         for found in payload:
-            found_again(graph, told, frame, found)
+            found_again(graph, settings, frame, found)
 
-    graph.jobs.ask(SEARCH, lambda: look(frame, asked, told), then, owner=LOOP_SEARCH)
+    graph.jobs.ask(SEARCH, lambda: look(frame, asked, settings), then, owner=LOOP_SEARCH)
 
 
-def candidates(graph: SubmapGraph, pose: MapPose, told: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
+def candidates(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
     """The nearest submaps that may be where the keyframe is, and were not left only just now."""
     T = frame.T_map_keyframe
     here_x, here_y, _ = T.tolist()
-    near, left_before, most_m = [], graph.way_m - told.recent_m, told.most_m
+    near, left_before, most_m = [], graph.way_m - settings.recent_m, settings.most_m
     vaguest = placed_trace(pose)  # no submap is less certain, so that most are passed over without knowing how much
     for submap in graph.of_part(frame.submap):
         settled = submap.settled
@@ -105,19 +105,19 @@ def candidates(graph: SubmapGraph, pose: MapPose, told: LoopSettings, frame: Key
         middle = se2.compose(submap.T_map_submap, settled.witness.T_odom_keyframe)
         x, y, yaw = se2.between(middle, T).tolist()
         far = math.hypot(x, y)
-        if far >= min(told.most_m, told.reach_m + 3.0 * math.sqrt(vaguest)):
+        if far >= min(settings.most_m, settings.reach_m + 3.0 * math.sqrt(vaguest)):
             continue
-        if far >= told.reach_m:
+        if far >= settings.reach_m:
             P = certainty(graph, pose, submap, frame)
-            if far >= told.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])):
+            if far >= settings.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])):
                 continue
         # who looks the other way sees little of the same
-        near.append((far + told.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled))
+        near.append((far + settings.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled))
     near.sort(key=lambda one: one[:2])
     made = []
-    for _, key, submap, settled in near[: told.candidates]:
+    for _, key, submap, settled in near[: settings.candidates]:
         R, P = se2.rotation(-submap.T_map_submap[2]), certainty(graph, pose, submap, frame)
-        said = told_by_light(frame, submap, told)
+        said = told_by_light(frame, submap, settings)
         made.append(Candidate(key, settled, se2.between(submap.T_map_submap, T), R @ P @ R.T, said))
     return tuple(made)
 
@@ -148,7 +148,7 @@ def turned(pose: MapPose, P_odom: Array) -> Array:
     return np.asarray(R @ P_odom @ R.T)
 
 
-def found_again(graph: SubmapGraph, told: LoopSettings, frame: Keyframe, found: Found) -> None:
+def found_again(graph: SubmapGraph, settings: LoopSettings, frame: Keyframe, found: Found) -> None:
     """Accept a loop, or let it wait for others that agree where it would move the pose far."""
     if found.key not in graph.submaps or graph.submaps.get(frame.submap.key) is not frame.submap:
         return  # forgotten meanwhile, and its key may have been given to another
@@ -156,9 +156,11 @@ def found_again(graph: SubmapGraph, told: LoopSettings, frame: Keyframe, found: 
         graph.waiting = []
         return
     one = Waiting(found, frame, se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe)))
-    if not within(found.moved, told, 1.0) and found.reason is not LoopReason.LIT:  # there light is the second witness
-        friends = supporters(graph, told, one)
-        far = min(math.hypot(*found.moved[:2]), told.most_m)
+    if (
+        not within(found.moved, settings, 1.0) and found.reason is not LoopReason.LIT
+    ):  # there light is the second witness
+        friends = supporters(graph, settings, one)
+        far = min(math.hypot(*found.moved[:2]), settings.most_m)
         if not friends or max(apart(one, other) for other in friends) < far:
             graph.waiting = [*graph.waiting[-TOGETHER:], one]
             return
@@ -167,20 +169,22 @@ def found_again(graph: SubmapGraph, told: LoopSettings, frame: Keyframe, found: 
             join(graph, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
         found = replace(found, reason=LoopReason.SUPPORTED)
     graph.waiting = [  # the others are refuted, or were left long ago
-        other for other in graph.waiting if comparable(graph, one, other) and within(off(graph, one, other), told, 1.0)
+        other
+        for other in graph.waiting
+        if comparable(graph, one, other) and within(off(graph, one, other), settings, 1.0)
     ]
     join(graph, frame, found)
 
 
-def supporters(graph: SubmapGraph, told: LoopSettings, one: Waiting) -> list[Waiting]:
+def supporters(graph: SubmapGraph, settings: LoopSettings, one: Waiting) -> list[Waiting]:
     """The loops that agree with this one, newest first, as far back as none contradicts it."""
     friends: list[Waiting] = []
     for other in reversed(graph.waiting):
         if not comparable(graph, one, other):
             continue
-        if not within(off(graph, one, other), told, 1.0):
+        if not within(off(graph, one, other), settings, 1.0):
             break
-        if within(off(graph, one, other), told, 0.5):
+        if within(off(graph, one, other), settings, 0.5):
             friends.append(other)
     return friends
 
@@ -211,10 +215,10 @@ def off(graph: SubmapGraph, one: Waiting, other: Waiting) -> Array:
     return se2.between(there, se2.compose(T_b_a, one.found.T_submap_keyframe))
 
 
-def within(moved: Array, told: LoopSettings, share: float) -> bool:
+def within(moved: Array, settings: LoopSettings, share: float) -> bool:
     """Whether a pose is moved by less than this share of what asks for support."""
     x, y, yaw = moved.tolist()
-    return math.hypot(x, y) <= share * told.supported_m and abs(yaw) <= share * told.supported_rad
+    return math.hypot(x, y) <= share * settings.supported_m and abs(yaw) <= share * settings.supported_rad
 
 
 def join(graph: SubmapGraph, frame: Keyframe, found: Found) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from estimator.mapping.keyframe import Keyframe, Square, Submap
-from estimator.mapping.live_grid import LiveMap
+from estimator.mapping.live_grid import LiveGrid
 from estimator.mapping.loop_verification import LoopSettings
 from estimator.mapping.map_parts import MapParts
 from estimator.mapping.submap_graph import SubmapGraph
@@ -56,7 +56,7 @@ class MapState:
     places: dict[Square, list[int]] = field(default_factory=dict)
     retired: dict[int, tuple[Submap, Array]] = field(default_factory=dict)
     light_anchors: dict[int, Submap] = field(default_factory=dict)
-    live: LiveMap | None = None
+    live: LiveGrid | None = None
     T_map_start: Array = field(default_factory=se2.identity)
     next_key: int = 1
     newest_step: int = 0

@@ -143,30 +143,30 @@ class Looked:
     nodes: int
 
 
-def look(query: Query, told: LoopSettings) -> Looked:
+def look(query: Query, settings: LoopSettings) -> Looked:
     """Look for a keyframe in the whole map."""
     terrain = terrain_of(query.pieces, query.before)
-    view = view_of(query.frame, told)
+    view = view_of(query.frame, settings)
     firm = query.firm or (False,) * len(query.guesses)
     asked = zip(query.guesses, firm, strict=True)
-    guesses = tuple(fit(view, terrain, T, told, query.outvoted or held) for T, held in asked)
+    guesses = tuple(fit(view, terrain, T, settings, query.outvoted or held) for T, held in asked)
     if view is None or not query.search:
         return Looked(terrain, guesses, (), None, 0)
     hits, complete, nodes = searched(query, terrain, view)
     known = [one.T_map_keyframe for one in guesses]
-    past = [(frame, view_of(frame, told)) for frame in query.past] if hits else []
+    past = [(frame, view_of(frame, settings)) for frame in query.past] if hits else []
     fresh = []
     for T in hits:
         if any(same(T, other) for other in known):
             continue
-        one = fit(view, terrain, T, told, query.outvoted)
+        one = fit(view, terrain, T, settings, query.outvoted)
         if one.verdict is Verdict.NO or any(same(one.T_map_keyframe, other) for other in known):
             continue
         known.append(one.T_map_keyframe)
         earlier = []
         for frame, seen in past:
             T_back = se2.between(query.frame.T_odom_keyframe, frame.T_odom_keyframe)
-            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), told, query.outvoted))
+            earlier.append(fit(seen, terrain, se2.compose(one.T_map_keyframe, T_back), settings, query.outvoted))
         if query.outvoted or all(other.verdict is not Verdict.NO for other in earlier):
             fresh.append((one, tuple(earlier)))
     return Looked(terrain, guesses, tuple(fresh), complete, nodes)
@@ -193,12 +193,12 @@ def placed(piece: Piece) -> Array:
     return elements
 
 
-def view_of(frame: Keyframe, told: LoopSettings) -> View | None:
+def view_of(frame: Keyframe, settings: LoopSettings) -> View | None:
     """A keyframe as something to match; None where it has seen too little."""
     points = points_of_frame(frame, 0.01)
     if len(points.xy) < MatchSettings().min_points:
         return None
-    return View(oriented(points, told.points), frame.T_base_lidar, frame.beams(), 0.01)
+    return View(oriented(points, settings.points), frame.T_base_lidar, frame.beams(), 0.01)
 
 
 def searched(query: Query, terrain: Terrain, view: View) -> tuple[list[Array], bool, int]:
@@ -224,7 +224,7 @@ def same(T: Array, other: Array) -> bool:
     return math.hypot(x, y) < SAME_M and abs(yaw) < SAME_RAD
 
 
-def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings, outvoted: bool = False) -> Fit:
+def fit(view: View | None, terrain: Terrain, T: Array, settings: LoopSettings, outvoted: bool = False) -> Fit:
     """Match a scan at a place of the map, and judge it.
 
     ``outvoted``: something else says that it is here or nearby (light, a person, earlier looks). Then a single witness
@@ -239,20 +239,20 @@ def fit(view: View | None, terrain: Terrain, T: Array, told: LoopSettings, outvo
     T_found = result.T_odom_base  # the prediction where the match is none
     against, second = worst(terrain, near, local, T_found, view)
     share = result.inliers / max(1, result.queries) if result.ok else 0.0
-    extra = np.diag((told.extra_m**2, told.extra_m**2, told.extra_rad**2))
+    extra = np.diag((settings.extra_m**2, settings.extra_m**2, settings.extra_rad**2))
     P = invert3(result.information) + extra if result.ok else np.eye(3)
-    verdict = judged(result, share, against, told) if same(T, T_found) else Verdict.NO
+    verdict = judged(result, share, against, settings) if same(T, T_found) else Verdict.NO
     if outvoted and against > POSSIBLE >= second and result.ok and same(T, T_found):
         verdict = Verdict.OPEN
     T_submap_keyframe = se2.between(piece.T_map_submap, T_found)
     return Fit(T_found, P, share, against, result.residual_m, piece.key, T_submap_keyframe, verdict)
 
 
-def judged(result: MatchResult, share: float, against: float, told: LoopSettings) -> Verdict:
+def judged(result: MatchResult, share: float, against: float, settings: LoopSettings) -> Verdict:
     """What a match says of its place."""
     if against > POSSIBLE:
         return Verdict.NO
-    sure = result.ok and share >= told.share and against <= told.against and result.residual_m <= told.sse_m
+    sure = result.ok and share >= settings.share and against <= settings.against and result.residual_m <= settings.sse_m
     return Verdict.HOLDS if sure and result.known_axes.all() else Verdict.OPEN
 
 

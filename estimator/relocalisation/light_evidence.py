@@ -21,7 +21,7 @@ from estimator.light_filter.collinear_lamps import ACROSS_M, ROW_M, spread
 from estimator.light_filter.filter_state import Lights, Track
 from estimator.light_filter.grid_likelihood import CAP
 from estimator.light_filter.initialisation import RIVAL, Place, direct, places, probabilities, straight
-from estimator.light_filter.light_channel import SILENT_S, Asked, Light, silent, too_strong_at
+from estimator.light_filter.light_channel import SILENT_S, Asked, LightChannel, silent, too_strong_at
 from estimator.light_filter.link_association import NEARER_M, strong_at
 from estimator.mapping.submap_graph import SubmapGraph
 from estimator.numerics import se2
@@ -70,14 +70,14 @@ class Window:
     chance: float
 
 
-def told(light: Light | None, graph: SubmapGraph) -> bool:
+def told(light: LightChannel | None, graph: SubmapGraph) -> bool:
     """Whether there is light, and the map's frame is that of its survey."""
     if light is None:
         return False
     return any(submap.light is not None for submap in graph.settled())
 
 
-def windows(light: Light | None, graph: SubmapGraph, T_base_frame: Array | None = None) -> tuple[Window, ...]:
+def windows(light: LightChannel | None, graph: SubmapGraph, T_base_frame: Array | None = None) -> tuple[Window, ...]:
     """Where light allows the robot to be, likeliest first; none where it says nothing.
 
     Where the links contradict the place that the `lights` filter still holds, as when the robot has been carried off,
@@ -101,7 +101,7 @@ def windows(light: Light | None, graph: SubmapGraph, T_base_frame: Array | None 
     return clustered(lights, se2.identity() if T_base_frame is None else T_base_frame)
 
 
-def glimpsed(light: Light) -> tuple[Place, ...]:
+def glimpsed(light: LightChannel) -> tuple[Place, ...]:
     """Places at which the latest epoch fits, whatever was known before; read once.
 
     One link more that does not fit rules no place out unless its lamp is too strong there: what a wall reflects counts
@@ -122,17 +122,17 @@ def contradicted(lights: Lights) -> bool:
     return len(lights.tracks) == 1 and (math.isfinite(lights.t_lost) or math.isfinite(lights.t_odd))
 
 
-def disputed(light: Light | None, graph: SubmapGraph) -> bool:
+def disputed(light: LightChannel | None, graph: SubmapGraph) -> bool:
     """Whether what is received does not fit the place that was held, or a new one has had to be looked for."""
     return light is not None and (contradicted(light.filter) or light.filter.lost) and told(light, graph)
 
 
-def elsewhere(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool:
+def elsewhere(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -> bool:
     """Whether light has the robot under one set of lamps, and not here."""
     return compatible(light, graph, T_map_base) is False and under_the_same_lamps(light, graph)
 
 
-def out_of_place(light: Light | None, T_map_base: Array) -> bool:
+def out_of_place(light: LightChannel | None, T_map_base: Array) -> bool:
     """Whether a lamp is received now that cannot be received about a pose, as strong as it is.
 
     It asks the latest epoch alone, not the `lights` filter, which wheels that turn more than they say can lead astray;
@@ -141,7 +141,7 @@ def out_of_place(light: Light | None, T_map_base: Array) -> bool:
     return any(too_strong_at(light, T_map_base))
 
 
-def misplaced(light: Light | None, alignment: SurveyAlignment | None, T_map_base: Array) -> bool:
+def misplaced(light: LightChannel | None, alignment: SurveyAlignment | None, T_map_base: Array) -> bool:
     """Whether most of the lamps received, two at least, are stronger than they can be about a pose.
 
     What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
@@ -158,7 +158,7 @@ def misplaced(light: Light | None, alignment: SurveyAlignment | None, T_map_base
     return asked.misplaced
 
 
-def _misplaced(light: Light, T_map_base: Array, compared: bool) -> bool:
+def _misplaced(light: LightChannel, T_map_base: Array, compared: bool) -> bool:
     result = light.result
     heard = sum(link.state not in UNHEARD for link in result.links)
     if heard < MISPLACED or (compared and 2 * len(result.accepted) >= heard):
@@ -167,7 +167,7 @@ def _misplaced(light: Light, T_map_base: Array, compared: bool) -> bool:
     return sum(strong) >= MISPLACED and 2 * sum(strong) > len(strong)
 
 
-def glimpsed_elsewhere(light: Light | None, T_map_base: Array) -> bool:
+def glimpsed_elsewhere(light: LightChannel | None, T_map_base: Array) -> bool:
     """Whether the latest epoch, read by itself, has the robot nowhere within `NEARER_M`, but somewhere.
 
     Wheels that turn more than they say lead the filter astray, and not one epoch; it says more than that the lamps of
@@ -180,7 +180,7 @@ def glimpsed_elsewhere(light: Light | None, T_map_base: Array) -> bool:
     return len(found) > 0 and all(math.hypot(one.x - x, one.y - y) > NEARER_M for one in found)
 
 
-def in_place(light: Light | None, T_map_base: Array) -> bool:
+def in_place(light: LightChannel | None, T_map_base: Array) -> bool:
     """Whether lamps enough are received now, all of them as strong as they can be about a pose, and it may be there."""
     strong = too_strong_at(light, T_map_base)
     return len(strong) >= LEAST and not any(strong) and not glimpsed_elsewhere(light, T_map_base)
@@ -229,7 +229,7 @@ def beside(lights: Lights) -> float:
     return ACROSS_M * math.exp(-spread(at)[1] / ROW_M**2) if at else ACROSS_M
 
 
-def compatible(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool | None:
+def compatible(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -> bool | None:
     """Whether light allows a pose of the robot now; None where it says nothing."""
     around = windows(light, graph)
     if not around:
@@ -257,7 +257,7 @@ def fits(track: Track, T_map_base: Array) -> bool:
     return float(off @ invert3(FACTOR * track.P[:3, :3] + SLACK) @ off) < SURPRISE
 
 
-def witness(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool:
+def witness(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -> bool:
     """Whether light counts as the second witness of a pose that the laser has found.
 
     It does where lamps are used and few are against it, and where the same lamps allow no other part of the building:
@@ -279,7 +279,7 @@ def witness(light: Light | None, graph: SubmapGraph, T_map_base: Array) -> bool:
     return used >= LEAST and against <= AGAINST * (used + against)
 
 
-def under_the_same_lamps(light: Light | None, graph: SubmapGraph) -> bool:
+def under_the_same_lamps(light: LightChannel | None, graph: SubmapGraph) -> bool:
     """Whether what is received comes from the same lamps at all places that light allows."""
     around = windows(light, graph)
     if len(around) < 2:

@@ -7,7 +7,7 @@ from typing import Protocol
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
 from estimator.fusion.time_offset import TimeOffset
-from estimator.light_filter.light_channel import Light
+from estimator.light_filter.light_channel import LightChannel
 from estimator.mapping.map_state import MapState
 from estimator.relocalisation.memory import RelocalisationMemory
 from estimator.scan_matching.match_memory import MatchMemory
@@ -21,7 +21,7 @@ class Owners(Protocol):
         """The pose in the odom frame."""
 
     @property
-    def light(self) -> Light | None:
+    def light(self) -> LightChannel | None:
         """Decoder and light filter."""
 
     @property

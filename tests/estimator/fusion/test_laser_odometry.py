@@ -15,7 +15,7 @@ from estimator.fusion import laser_odometry
 from estimator.light_filter import collinear_lamps, light_filter, motion_update, state_vector
 from estimator.light_filter.collinear_lamps import LASTING_S
 from estimator.light_filter.gain_memory import sensors_known
-from estimator.light_filter.light_channel import Light
+from estimator.light_filter.light_channel import LightChannel
 from estimator.light_filter.light_filter import HELD_S
 from estimator.light_filter.motion_update import prior_scales
 from estimator.measurements import Array, Imu, Odometry, Record
@@ -210,8 +210,8 @@ class Told:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.moves, self.alone = list[Odometry](), 0
-        monkeypatch.setattr(Light, "move", lambda _, record, _v: self.moves.append(record))
-        monkeypatch.setattr(Light, "left_alone", lambda _: self.leave())
+        monkeypatch.setattr(LightChannel, "move", lambda _, record, _v: self.moves.append(record))
+        monkeypatch.setattr(LightChannel, "left_alone", lambda _: self.leave())
 
     def leave(self) -> None:
         self.alone += 1

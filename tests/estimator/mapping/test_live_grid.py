@@ -9,7 +9,7 @@ import pytest
 
 from estimator.mapping.grid_patches import SIDE, UNIT, render
 from estimator.mapping.keyframe import Keyframe, Submap, keep
-from estimator.mapping.live_grid import LiveMap, advance, at_once
+from estimator.mapping.live_grid import LiveGrid, advance, at_once
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import UNLIMITED, Answer, Array, Beam, Job, Odometry, Record, Scan
 from estimator.numerics import se2
@@ -37,7 +37,7 @@ def stretch(key: int, T_map: Array, scene: Scene, at: tuple[Array, ...]) -> tupl
     return submap, frames
 
 
-def settle(live: LiveMap) -> None:
+def settle(live: LiveGrid) -> None:
     while live.busy():
         live.take(advance(live.task()))
 
@@ -51,9 +51,9 @@ def poses(x: float) -> tuple[Array, ...]:
     return tuple(np.array((x + dx, 0.3 * dx, yaw)) for dx in (-0.5, 0.0, 0.5) for yaw in (0.0, 1.6, 3.1, -1.6))
 
 
-def two_rooms() -> tuple[LiveMap, Submap, Submap]:
+def two_rooms() -> tuple[LiveGrid, Submap, Submap]:
     """Rooms 40 m apart, each seen by a submap of its own."""
-    live = LiveMap(CELL)
+    live = LiveGrid(CELL)
     (a, seen_a), (b, seen_b) = (stretch(k, poses(x)[0], far(x), poses(x)) for k, x in ((1, 0.0), (2, 40.0)))
     live.laid(a, seen_a)
     live.laid(b, seen_b)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.light_filter.light_channel import Light, LightsSetup
+from estimator.light_filter.light_channel import LightChannel, LightsSetup
 from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.live_grid import LiveMap, go_on
+from estimator.mapping.live_grid import LiveGrid, go_on
 from estimator.mapping.loop_closure import take_answer
 from estimator.mapping.loop_verification import LoopSettings
 from estimator.mapping.submap_graph import SubmapGraph
@@ -84,7 +84,7 @@ def test_one_witness_of_the_map_against_a_place_where_light_has_the_robot_does_n
 ) -> None:
     """A door that stood open then is shut now."""
     state, _, frame = watched()
-    state.light = Light(LightsSetup())
+    state.light = LightChannel(LightsSetup())
     monkeypatch.setattr("estimator.relocalisation.light_evidence.witness", lambda *_: witness)
     monkeypatch.setattr(relocalisation_check, "look", lambda query, _: query.outvoted)
     state.jobs.take()
@@ -119,7 +119,7 @@ def test_what_was_mapped_in_a_place_that_was_the_wrong_one_goes_if_the_laser_alo
 def test_the_live_map_no_longer_shows_it() -> None:
     state, seen, frame = watched()
     seen.since, seen.alone = frame.submap.first, True
-    live = state.map.live = LiveMap(0.1)
+    live = state.map.live = LiveGrid(0.1)
     live.laid(frame.submap, state.map.graph.frames)
     go_on(state.map.live, state.map.graph)
     run_jobs(state)
