@@ -364,5 +364,5 @@ def keyframe_poses(state: State) -> dict[int, Array]:
 
 
 def render_map(state: State, resolution: float) -> Grid:
-    """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (`livemap.at_once`)."""
+    """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (`live_grid.at_once`)."""
     return live_grid.at_once(hanging(state.map.keyframes.values()), resolution)

@@ -200,10 +200,10 @@ class LightsResult:
             True for ``t_pose``, which is the instant of the newest record of any kind.
         links: strongest first. accepted: lamp IDs of the links used (the paper's S).
         gained: 3x3 information that this step's links added to the pose beyond the prediction, and ``gained_by``: the
-            pose's correction they made; `fused` takes exactly this, so that odometry is never counted twice.
+            pose's correction they made; the pose takes exactly this, so that odometry is never counted twice.
         floor: the diffuse part as estimated. block: flags of the latest sample block. clock_ppm: of the sample clock.
         bent: how much farther than usual, and than they have long been, lamps are taken for others than was expected;
-            deviations squared, of a lamp (`bent.Bent`).
+            deviations squared, of a lamp (`model_consistency.Bent`).
     """
 
     t_mono: float
@@ -278,14 +278,14 @@ class StepResult:
         lights: of the `lights` filter, None where there is no photodiode. placed: light has told where the map lies;
             before that the map frame is the start pose's. gap: squared Mahalanobis distance (3 degrees of freedom)
             between T_map_base and the lights' own at the latest epoch, None where that cannot be said.
-        apart: the two do not agree, or one of them is still on its way (`Absolute.apart`).
+        apart: the two do not agree, or one of them is still on its way (`SurveyAlignment.apart`).
         misplaced: most of the lamps that are received cannot be received at T_map_base.
         anew: how often the local map has been begun anew because nothing fitted the old one: since then the place in
             the map is a guess.
         protection: bound on the error of T_map_base; None: none can be given.
         places: None where the place in the map is known; else how many places of it fit all that was seen: 0 none yet,
             1 one that is being confirmed.
-        aside: a stored map is put aside: light tells the place, and in that map it is still looked for. let_go: how
+        aside: a stored map is set aside: light tells the place, and in that map it is still looked for. let_go: how
             many stored maps were let go of since the start, because the robot is nowhere in them: the map is another.
         lag: between the stamps of scans and wheels, None where none is beyond doubt.
         jobs: work for the background worker; each answer comes back as a record of a later step.

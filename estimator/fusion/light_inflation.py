@@ -36,8 +36,8 @@ ANY_HEADING = math.pi**2 / 3.0
 def doubted(lights: LightsResult, known_m: float, wheels: bool = True, in_row: float = 0.0) -> LightsResult:
     """The lights' result with less trust in it; no heading is less certain than one that may be any.
 
-    ``known_m``: way since light last began to find its place. ``wheels``: it is told how the robot moves.
-    ``in_row``: how much of a row the lamps in use are, or were of late, 0 to 1 (`row.Lately.narrow` of `BESIDE_M`).
+    ``known_m``: way since light last began to find its place. ``wheels``: it is told how the robot moves. ``in_row``:
+    how much of a row the lamps in use are, or were of late, 0 to 1 (`collinear_lamps.Lately.narrow` of `BESIDE_M`).
     """
     P, factor = doubted_covariance(lights, known_m, wheels, in_row)
     return replace(lights, covariance=P, gained=lights.gained / factor)
@@ -73,7 +73,8 @@ def without_heading(lights: LightsResult) -> LightsResult:
 def across_the_row(more: Array, lights: LightsResult) -> LightsResult:
     """The lights' result, trusted less across the row in which all lamps in use stand, or have stood until lately.
 
-    ``more``: covariance (3, 3; m, m, rad; survey axes) that is added, see `row.doubt` and `row.Lately`.
+    ``more``: covariance (3, 3; m, m, rad; survey axes) that is added, see `collinear_lamps.doubt` and
+    `collinear_lamps.Lately`.
     """
     if not more.any():
         return lights

@@ -13,7 +13,7 @@ separation, Blanch et al., NAVIGATION 2010; docs/integrity.md has the derivation
 Where there is one witness only nothing can be separated, and the first bound is widened instead. Laser and light share
 the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself. Without wheels they share
 the laser's way (`guide`): a laser that slides leads light along until lamps have corrected it, for which the level
-believes its position less (`lights_trust.UNGUIDED`); and of the heading the laser is the only witness.
+believes its position less (`light_inflation.UNGUIDED`); and of the heading the laser is the only witness.
 """
 
 from __future__ import annotations

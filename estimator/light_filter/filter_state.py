@@ -207,7 +207,7 @@ class Course:
 
 @dataclass(slots=True, eq=False)
 class Lights:
-    """All of the filter; made by `lights.new_lights`, changed only by the functions of that module.
+    """All of the filter; made by `light_filter.new_lights`, changed only by the functions of that module.
 
     Attributes:
         tracks: hypotheses, likeliest first; one when the place is known, none before a start.
@@ -220,7 +220,7 @@ class Lights:
         corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
         lost: the last start was made necessary by a contradiction.
         before: what an earlier run knew of the sensors, for the first hypothesis. recalled: and of lamps, as ``gains``.
-        bent: how far lamps are taken for others than was expected (`lights_memory.bend`).
+        bent: how far lamps are taken for others than was expected (`gain_memory.bend`).
     """
 
     survey: Survey

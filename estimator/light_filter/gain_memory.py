@@ -63,7 +63,7 @@ def expected_of(lights: Lights, lamp_id: int) -> tuple[Sequence[float], Sequence
 
 
 def bend(lights: Lights, used: list[Sight]) -> None:
-    """Note how far the likeliest hypothesis takes lamps for others than was expected (`bent.Bent`).
+    """Note how far the likeliest hypothesis takes lamps for others than was expected (`model_consistency.Bent`).
 
     Of a lamp it is the sum of the squares of what is taken for its own gain, its lean and the error of its link: in
     deviations, of the link in usual ones, though at first more is allowed for. In plain numbers: arrays of three cost

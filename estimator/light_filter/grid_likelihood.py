@@ -54,7 +54,7 @@ def search(lamps: Array, rx: Array, links: Array, poses: Array, floor: float, ou
     """Cost of every pose.
 
     Args:
-        lamps: (n, 7) of the links, rows of `optics.pack_lamps`.
+        lamps: (n, 7) of the links, rows of `lambertian.pack_lamps`.
         rx: (9,) receiver.
         links: (n, 2) ln amplitude, and its variance with all that the gain and the model may be wrong by.
         poses: (G, 3).

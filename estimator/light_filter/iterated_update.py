@@ -42,8 +42,8 @@ class Seen(NamedTuple):
     """Links and what they are compared by.
 
     Attributes:
-        links: (L, LINK_COLUMNS). lamps: (slots, 7), rows of `optics.pack_lamps`. view: (VIEW_COLUMNS,), see
-            `ekf_links.linearise`.
+        links: (L, LINK_COLUMNS). lamps: (slots, 7), rows of `lambertian.pack_lamps`. view: (VIEW_COLUMNS,), see
+            `measurement_update.linearise`.
     """
 
     links: Array

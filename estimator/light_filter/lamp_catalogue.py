@@ -52,7 +52,7 @@ class Catalogue:
         rims: by number, what each gives at the very edge of view of a level receiver, A.
         heard: by number, when each that the survey does not name was last heard, longest ago first.
         told: by number, the frame and code last learned, the lamp they were of, and whether the survey says otherwise.
-        doubts: by numbers of lamps, what they do not tell together (`row.doubt`).
+        doubts: by numbers of lamps, what they do not tell together (`collinear_lamps.doubt`).
     """
 
     depth: float

@@ -56,7 +56,7 @@ class LightChannel:
         result: after the latest
             epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself. guided:
             instant and pose (odom frame) of the latest scan, if its match may tell how the robot moves; see `guide`.
-        asked: what `relocate_light.misplaced` was asked last.
+        asked: what `light_evidence.misplaced` was asked last.
     """
 
     def __init__(self, setup: LightsSetup) -> None:

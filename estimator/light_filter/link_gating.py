@@ -131,7 +131,7 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, news: flo
         lights: all of the filter.
         track: the hypothesis.
         kept: its links.
-        out: what `ekf_links.linearise` says of them, changed.
+        out: what `measurement_update.linearise` says of them, changed.
         news: how much of an epoch is news by the way driven since the one before, 0 to 1.
 
     Returns:

@@ -72,7 +72,7 @@ def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: 
         x: state.
         P: its covariance.
         links: (L, LINK_COLUMNS).
-        lamps: (slots, 7), rows of `optics.pack_lamps`.
+        lamps: (slots, 7), rows of `lambertian.pack_lamps`.
         view: (VIEW_COLUMNS,) receiver, pose at the epoch seen from the state's, sigmas of the model.
         out: (L, OUT_COLUMNS), filled.
     """

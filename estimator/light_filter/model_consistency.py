@@ -2,7 +2,7 @@
 
 Light that has come by way of a wall fits as well as any, with lamps that are unlikely, at a place that is wrong by
 several of its deviations; so does that of two lamps whose codes were exchanged, and, for a while, that of a lamp which
-goes out slowly. How much the place is doubted for it: `lights_trust`.
+goes out slowly. How much the place is doubted for it: `light_inflation`.
 """
 
 from __future__ import annotations

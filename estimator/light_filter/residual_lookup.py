@@ -65,7 +65,7 @@ class ResidualCorrections:
         self._index = {lamp_id: k for k, lamp_id in enumerate(residuals.lamp_ids)}
 
     def at(self, lamp_ids: Sequence[int], T_map_base: Array) -> Array:
-        """See `lights_state.Corrections`."""
+        """See `filter_state.Corrections`."""
         x, y, _ = se2.compose(T_map_base, self._arm).tolist()
         out = np.tile((0.0, -1.0, 0.0, 0.0), (len(lamp_ids), 1))
         for i, lamp_id in enumerate(lamp_ids):

@@ -21,7 +21,7 @@ from estimator.scan_matching.local_map import LocalMap, MapSettings
 
 Square = tuple[int, int, int]
 Elements = npt.NDArray[np.float32]
-"""Line elements (n, localmap.WIDTH) in the submap's frame; float32 resolves a micrometre over 10 m."""
+"""Line elements (n, local_map.WIDTH) in the submap's frame; float32 resolves a micrometre over 10 m."""
 
 ANYWHERE = np.diag((1e3, 1e3, 10.0))
 """Covariance (m, m, rad) of a place that no way joins with the others."""
@@ -45,7 +45,7 @@ class Submap:
         lamps: IDs of the lamps used at any of its keyframes (the paper's S_M, of this stretch).
         into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
         hung: those that lie in this one and that something still hangs on.
-        strayed: what the way until there may have strayed, see `Atlas.strayed_since`; as given: no way is known.
+        strayed: what the way until there may have strayed, see `SubmapGraph.strayed_since`; as given: no way is known.
     """
 
     key: int

@@ -11,7 +11,7 @@ from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 
 Pattern = tuple[Ints, Ints, Ints, Ints]
-"""Column start and rows, row start and columns: see `elimination.columns`."""
+"""Column start and rows, row start and columns: see `elimination_ordering.columns`."""
 
 
 @kernel("b1(f8[:, ::1], f8[:, ::1])", inner=True)

@@ -8,7 +8,7 @@ Every hot function is written as a plain Python function and decorated with :fun
   arithmetic of a small kernel, and while a background job runs Python, whoever has let go waits for it every time;
 * NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
 * ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
-* cached on disk, in the directory of `kernel_folder`, and taken from there by `kernel_kept`.
+* cached on disk, in the directory of `jit_cache`, and taken from there by `jit_cache_load`.
 """
 
 from __future__ import annotations

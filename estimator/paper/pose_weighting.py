@@ -5,10 +5,10 @@ along the shortest way between the two: ``T_k = T2 Exp(W Log(T2^-1 T1))``; ``W =
 weight is, Eq. 15 tells in two ways (`matchers.Weight`).
 
 No information is counted twice. T1 comes from the `lights` filter (odometry and lamps, never laser), T2 from the laser
-alone, and a `MatchResult` reports the laser's information only. `fused` predicts with the same odometry as `lights`
+alone, and a `MatchResult` reports the laser's information only. the pose predicts with the same odometry as `lights`
 does; therefore it never takes the lights' pose with its covariance, but through ``T_map_odom`` and only what links have
 *added* (``LightsResult.gained``, see `absolute.gain`), each epoch once and for one stretch of way no more than one
-filter's worth. The default matcher takes T1 from `fused` itself: its prediction is the prior inside the normal
+filter's worth. The default matcher takes T1 from the pose itself: its prediction is the prior inside the normal
 equations, whose solution is this combination to first order, and `fusion.fuse` adds the laser's information to the
 prediction's once.
 """

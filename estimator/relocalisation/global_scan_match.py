@@ -3,7 +3,7 @@
 The scan is searched for by branch and bound in one field of all settled submaps; each place that comes out is matched
 against the submaps that lie there and judged as a loop is: by the share of the beams that fit, by what speaks against
 it, by rank and by residual. A place that has been found before is only matched again where odometry says that the
-robot must be by now. What the answers come to over several keyframes is decided elsewhere (`adrift`).
+robot must be by now. What the answers come to over several keyframes is decided elsewhere (`relocalisation`).
 
 All of this is work for the background job; nothing here reads or changes a state.
 """
@@ -86,8 +86,8 @@ class Fit:
     """How a keyframe fits at a place.
 
     Attributes:
-        T_map_keyframe: the place as matched. P: covariance, 3x3, axes of the map.
-        share, against, residual_m: how well, as of `loop.Found`. key: submap nearest to it, and the place in that one.
+        T_map_keyframe: the place as matched. P: covariance, 3x3, axes of the map. share, against, residual_m: how well,
+        as of `loop_verification.Found`. key: submap nearest to it, and the place in that one.
     """
 
     T_map_keyframe: Array

@@ -1,4 +1,4 @@
-"""Places where a robot that is adrift may be: found by looks in the map, carried along by odometry, ruled out by looks.
+"""Hypotheses of the pose during relocalisation: found by searches of the map, predicted by odometry, ruled out.
 
 A place is a hypothesis of where the odom frame lies. Every look at a later keyframe tests each of them where odometry
 says that the robot must be by now; a place that is found later has to be true of the earlier keyframes too. The laser
@@ -101,7 +101,7 @@ class Hypothesis:
 
 @dataclass(slots=True, eq=False)
 class Seek:
-    """What has been found since the robot is adrift.
+    """What has been found since the robot is being relocalised.
 
     Attributes:
         alive: places left. past: some earlier keyframes that were looked for. complete: the latest search was; then

@@ -6,14 +6,13 @@ is suspected where physics says that something else than driving has happened:
 * a match moves the pose farther than any driving can have in that time;
 * the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
   seen afterwards is not what was seen before;
-* what is seen changes from one scan to the next, all at once (`leap`);
+* what is seen changes from one scan to the next, all at once (`scene_change`);
 * the wheels stand, and for a while much of the map is looked through that should be in view (`was_strange`).
 
-One look in the whole map then decides: if another place fits nearly as well the robot is adrift, and after a leap also
-if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the local
-map; all else may have been a door, a table that was carried away, or somebody who sat and left.
-Until the answer has come nothing is laid into the map. While light tells the place light is the witness, see
-`adrift.doubt`.
+One look in the whole map then decides: if another place fits nearly as well the robot is being relocalised, and after a
+leap also if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the
+local map; all else may have been a door, a table that was carried away, or somebody who sat and left. Until the answer
+has come nothing is laid into the map. While light tells the place light is the witness, see `relocalisation.doubt`.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from estimator.scan_matching import local_map
 from estimator.scan_matching.deskew import ScanPoints, unturned
 
 SURPRISE: Final = 25.0
-"""Squared Mahalanobis distance of a correction that no driving explains; as that of `matching.demand_on`."""
+"""Squared Mahalanobis distance of a correction that no driving explains; as that of `scan_matcher.demand_on`."""
 ROW: Final = 3
 """Scans in a row that do not fit, and then do; so many more, before the place is looked for: the first that fits may be
 of two places, or blurred."""
@@ -247,14 +246,16 @@ def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> N
 
 
 def answered(state: Owners, asked: Question, payload: object) -> None:
-    """Be adrift if the place is not the only one, or does not hold after a jump; look again if that was not found out.
+    """Search the whole map if the place is not the only one, or does not hold after a jump.
+
+    A search that was not complete is repeated.
 
     An answer that comes late counts as well: what was laid meanwhile is of the place that it is about.
     """
     assert isinstance(payload, Looked)
     doubt = state.relocalisation.suspicion
     if doubt.question is not asked:
-        return  # light tells the place, the robot is adrift, or the map has been begun anew since
+        return  # light tells the place, the robot is being relocalised, or the map has been begun anew since
     doubt.question = None
     here = payload.guesses[0]
     least = max(global_scan_match.LEAST, here.share - BEHIND)
@@ -273,7 +274,7 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
 
 
 def carried_off(state: Owners) -> None:
-    """Be adrift; a map of one scan, in which nobody can be looked for, is begun anew: it would be one of two places."""
+    """Search the whole map; a map of one scan, in which nobody can be looked for, is forgotten."""
     graph, since = state.map.graph, state.relocalisation.suspicion.since
     first = next((one.key for one in graph.submaps.values() if one.first >= since > 0), None)
     if first is not None:

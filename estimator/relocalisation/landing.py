@@ -26,7 +26,7 @@ SURPRISE: Final = 16.3
 
 
 def land(state: Owners, one: Hypothesis, alone: bool) -> None:
-    """The place is known: join what was mapped adrift to the older map, and take the robot there.
+    """The place is known: join what was mapped detached to the older map, and take the robot there.
 
     A map in a frame of its own is taken to the robot instead, if light has told where that is. ``alone``: by the laser
     alone.

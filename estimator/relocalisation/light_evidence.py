@@ -1,4 +1,4 @@
-"""What light says of the place while the robot is adrift in a stored map: windows to look in, and a witness.
+"""What light says of the place while the robot is being relocalised in a stored map: windows to look in, and a witness.
 
 Light names lamps, and with stored gains their strengths give the position to a decimetre from the first epochs on;
 where codes repeat there are several. It says little of the heading until the robot has moved: that, and the

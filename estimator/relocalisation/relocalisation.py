@@ -1,8 +1,8 @@
 """Where in the map the robot is, when that is not known: after the start in a stored map, or after it was carried off.
 
 Until it is found the robot maps on as ever, in a part of the graph that nothing joins to the older one. Looks in the
-older one (`relocate`, jobs for the background) leave over some places (`hypotheses`); when one of them is sure, a loop
-joins the two parts, ``T_map_odom`` takes the robot there at once, and ordinary loops take over.
+older one (`global_scan_match`, jobs for the background) leave over some places (`hypothesis_tracking`); when one of
+them is sure, a loop joins the two parts, ``T_map_odom`` takes the robot there at once, and ordinary loops take over.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ def local_map_lost(state: Owners) -> None:
     """The local map is begun anew: the robot may have been carried off, unless light that tells now holds it here.
 
     Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One
-    that is adrift already may have been carried on: what was looked for before says nothing of where it is now.
+    that is being relocalised already may have been carried on: what was looked for before says nothing of where it is
+    now.
     """
     alignment = state.pose.alignment
     held = False
@@ -138,7 +139,7 @@ def hinted(state: Owners) -> None:
 
 
 def keyframe_laid(state: Owners, frame: Keyframe) -> None:
-    """Look for a new keyframe, if the robot is adrift and no other look is under way."""
+    """Look for a new keyframe, if the robot is being relocalised and no other look is under way."""
     graph, told = state.map.graph, state.map.settings.loops
     if graph.parts.detached is None or told is None or graph.jobs.busy(state.relocalisation.search):
         return
@@ -149,7 +150,7 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
 
 
 def look_for(state: Owners, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
-    """Hand out a look for a keyframe in what is not adrift."""
+    """Hand out a look for a keyframe in what is not detached."""
     hand_out(state, state.relocalisation.search, frame, state.map.graph.settled(), around, take_look)
 
 
@@ -205,7 +206,7 @@ def step_done(state: Owners) -> None:
 
 
 def by_light_alone(state: Owners) -> bool:
-    """End being adrift where light has long told the place, in a part of the building that the map does not know.
+    """End the search where light has long told the place, in a part of the building that the map does not know.
 
     Both parts of the graph then hang on what light has said of them.
     """
@@ -237,7 +238,7 @@ def doubt(state: Owners) -> None:
     The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here. Where
     light once proved the place, it must also receive a lamp that cannot be received here, or, where scans do not fit or
     did not, epochs read by themselves must have the robot elsewhere: the filter itself can be led astray by wheels, and
-    a robot that the laser holds is not set adrift for that. A place that was found before the filter agreed is no such
+    a robot that the laser holds is not detached for that. A place that was found before the filter agreed is no such
     proof: it may have been found in somebody's hands.
     """
     from estimator.relocalisation import light_evidence
@@ -268,7 +269,7 @@ def doubt(state: Owners) -> None:
 
 
 def afresh(state: Owners) -> bool:
-    """Be adrift from the next scan on, with a new local map."""
+    """Detach the map from the next scan on, with a new local map."""
     if not begin(state):
         return False
     state.matching.local_map, state.matching.failures = None, 0

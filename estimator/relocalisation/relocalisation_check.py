@@ -1,9 +1,10 @@
 """After a place was found in the whole map: whether what is seen from there on goes on being true of it.
 
-A room that is not in the map may look like one that is. While the robot stays in it nothing tells; what it sees when
-it leaves does, and then it is adrift again instead of going on in the wrong place. What it has mapped there meanwhile
-goes if the laser alone had decided; until the watch is over that is not saved, and takes the place of nothing older.
-Where light has the place and the map came in a frame of its own, it is the map that goes: it is put aside (`aside`).
+A room that is not in the map may look like one that is. While the robot stays in it nothing tells; what it sees when it
+leaves does, and then it is being relocalised again instead of going on in the wrong place. What it has mapped there
+meanwhile goes if the laser alone had decided; until the watch is over that is not saved, and takes the place of nothing
+older. Where light has the place and the map came in a frame of its own, it is the map that goes: it is set aside
+(`unaligned_map`).
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def compare(
 ) -> None:
     """Count the points of a scan that another one looks through (``told[0]``), and those that it sees too (``[1]``).
 
-    Each scan as in :class:`Glance`. ``margin``: see `localmap.look_at`.
+    Each scan as in :class:`Glance`. ``margin``: see `local_map.look_at`.
     """
     hits = 0
     for i in range(len(kind)):
@@ -81,7 +81,7 @@ class Glance:
 
     Attributes:
         t_end: its end. view: (5,) x, y, yaw of the lidar in the odom frame, first bearing and angle from beam to beam.
-        reach, kind: range in metres and kind (`records.Beam`) of each beam.
+        reach, kind: range in metres and kind (`measurements.Beam`) of each beam.
     """
 
     t_end: float
