@@ -46,7 +46,6 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation import (
     kidnap_detection,
-    light_evidence,
     relocalisation,
     relocalisation_check,
     unaligned_map,
@@ -339,6 +338,8 @@ def misplaced(state: State) -> bool:
     alignment = state.pose.alignment
     if alignment is None or not alignment.placed:
         return False
+    from estimator.relocalisation import light_evidence  # costs nothing where there is no photodiode
+
     return light_evidence.misplaced(state.light, alignment, state.pose.here(state.motion.T_odom_base))
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from estimator.fusion.map_pose import MapPose, SurveyAlignment
 from estimator.fusion.motion_model import Motion, MotionNoise
 from estimator.fusion.time_offset import TimeOffset
 from estimator.job_queue import JobQueue
-from estimator.light_filter.light_channel import LightChannel, LightsSetup
 from estimator.mapping.live_grid import LiveGrid
 from estimator.mapping.map_state import MappingSettings, MapState
 from estimator.mapping.submap_graph import SubmapGraph
@@ -21,6 +21,9 @@ from estimator.scan_matching.local_map import MapSettings
 from estimator.scan_matching.match_memory import MatchMemory
 from estimator.scan_matching.matcher_choice import Matcher, Weight, load
 from estimator.scan_matching.scan_matcher import Asked, MatchSettings
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel, LightsSetup
 
 Journal = Callable[[Scan, ScanPoints, Asked | None, MatchResult], None]
 """Takes a scan, its points, what the matcher was given (None where it was not called) and its result. It may keep all
@@ -93,5 +96,7 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
     if settings.live_m > 0.0:
         state.map.live = LiveGrid(settings.live_m)
     if lights is not None:
+        from estimator.light_filter.light_channel import LightChannel
+
         state.light, state.pose.alignment = LightChannel(lights), SurveyAlignment()
     return state

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from estimator.light_filter.gain_memory import gains_known, recall, sensors_known
-from estimator.light_filter.light_channel import LightChannel, LightsSetup
 from estimator.light_filter.survey import Lamp
 from estimator.mapping import live_grid
 from estimator.mapping.constraints import Constraints
@@ -21,6 +19,9 @@ from estimator.mapping.map_state import MapState
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.state import Settings, State, new_state
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel, LightsSetup
 
 LONG_AGO_M: Final = 1000.0
 """Metres of way by which what is restored lies behind: it is no way just driven, and counts for loops."""
@@ -76,6 +77,8 @@ def _learned(light: LightChannel | None) -> tuple[Gains, tuple[Array, Array] | N
     """What the light filter has learned of lamps and sensors."""
     if light is None:
         return {}, None, ()
+    from estimator.light_filter.gain_memory import gains_known, sensors_known
+
     return gains_known(light.filter), sensors_known(light.filter), tuple(light.filter.catalogue.by_id.values())
 
 
@@ -90,6 +93,8 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
     state = new_state(settings, lights)
     image = finished(image)
     if state.light is not None:
+        from estimator.light_filter.gain_memory import recall
+
         recall(state.light.filter, image.gains, image.sensors, image.lamps)
     if not image.submaps:
         return state

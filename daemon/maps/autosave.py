@@ -1,6 +1,6 @@
 """Saves the map while the robot drives: on a schedule, when asked, and at the stop.
 
-The loop's thread only gathers references (`estimator.mapping.map_snapshot.image_of`). Packing and writing is for a
+The loop's thread only gathers references (`estimator.stored_map.image_of`). Packing and writing is for a
 thread of its own, which lets the loop in between slices of a fraction of a millisecond: Python's lock is held by one of
 them at a time.
 """
@@ -267,7 +267,7 @@ class Keeper:
     def _revision(self, state: State) -> Revision:
         """Changes when there is something new to save."""
         atlas = state.map.graph
-        if (first := atlas.parts.unproved) is not None:
+        if (first := state.map.parts.unproved) is not None:
             return self._map_id(), first, -1
         return self._map_id(), state.map.next_key, atlas.closures
 

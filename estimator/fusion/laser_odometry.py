@@ -9,15 +9,17 @@ where matches hold every axis; where they do not, as in a corridor, the filter g
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from estimator.fusion.motion_model import Motion, too_far
 from estimator.fusion.pose_update import BLIND, loose_direction
-from estimator.light_filter.light_channel import LightChannel
 from estimator.light_filter.motion_update import CARRY_S
 from estimator.measurements import Odometry
 from estimator.numerics import se2
 from estimator.result import MatchResult
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel
 
 WHEELS_GONE_S: Final = 5.0
 """Wheels that have been silent for longer are not waited for: what lamps said of their scale is given up."""

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.fusion.light_inflation import BESIDE_M, TRUST, across_the_row, doubted_covariance, without_heading
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
-from estimator.light_filter.light_channel import SILENT_S, LightChannel
+from estimator.light_filter.filter_state import SILENT_S
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Fix, LightsResult, Virtual
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel
 
 BLIND_S, BLIND_PERIODS, SLOWEST_S = 0.5, 1.5, 3.0
 """Without a match for so long, or so many scan periods (of a slow laser), light and odometry are all there is."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,13 +30,15 @@ from estimator.fusion.map_pose import MapPose, SurveyAlignment
 from estimator.fusion.motion_history import KEPT_S
 from estimator.fusion.motion_model import Motion
 from estimator.light_filter.collinear_lamps import doubt, straighten, sure_part
-from estimator.light_filter.light_channel import LightChannel, too_strong_at
 from estimator.measurements import Command, Order
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.covariance3 import grow_tie, hang, mend_tie
 from estimator.numerics.symmetric3 import det3, invert3, largest_of, positive_part, symmetric
 from estimator.result import SURPRISE, Fix, LightsResult
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -355,6 +358,8 @@ def _elsewhere(pose: MapPose, motion: Motion, light: LightChannel) -> bool:
     assert light is not None
     if light.filter.way_start > pose.alignment.way_start:
         return True
+    from estimator.light_filter.light_channel import too_strong_at  # only where there is a photodiode
+
     return any(too_strong_at(light, se2.compose(pose.T_map_odom, motion.T_odom_base)))
 
 

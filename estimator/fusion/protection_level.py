@@ -19,7 +19,7 @@ believes its position less (`light_inflation.UNGUIDED`); and of the heading the 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -27,11 +27,13 @@ from estimator.fusion.light_inflation import BESIDE_M, doubted_covariance
 from estimator.fusion.light_witness import pose_at
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
-from estimator.light_filter.light_channel import LightChannel
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Fix, Protection
 from estimator.scan_matching.match_memory import MatchMemory
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel
 
 RISK: Final = 1e-4
 """Probability with which an error may be above its bound, a pose."""

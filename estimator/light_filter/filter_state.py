@@ -21,6 +21,9 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.pose_history import PoseHistory
 from estimator.result import LightsResult
 
+SILENT_S = 0.5
+"""Light of which nothing could be used for so long says nothing of where the robot is now. One epoch may be lost."""
+
 TRAIL_S = 1.0
 """How far back the dead-reckoned poses are kept, s."""
 

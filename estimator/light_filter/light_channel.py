@@ -10,6 +10,7 @@ from estimator.cdma import decoder
 from estimator.cdma.air_interface import PROFILE_A, Profile
 from estimator.cdma.epoch import UNUSABLE, LightEpoch, SampleBlock
 from estimator.light_filter import light_filter
+from estimator.light_filter.filter_state import SILENT_S
 from estimator.light_filter.initialisation import Place
 from estimator.light_filter.link_association import strong_at
 from estimator.light_filter.residual_lookup import ResidualCorrections
@@ -125,10 +126,6 @@ class LightChannel:
     def reset(self) -> None:
         """Forget the place and what was learned of the lamps."""
         light_filter.reset(self.filter)
-
-
-SILENT_S = 0.5
-"""Light of which nothing could be used for so long says nothing of where the robot is now. One epoch may be lost."""
 
 
 def silent(light: LightChannel) -> bool:

@@ -18,10 +18,10 @@ import numpy as np
 from estimator.cdma.epoch import UNUSABLE
 from estimator.fusion.map_pose import SurveyAlignment
 from estimator.light_filter.collinear_lamps import ACROSS_M, ROW_M, spread
-from estimator.light_filter.filter_state import Lights, Track
+from estimator.light_filter.filter_state import SILENT_S, Lights, Track
 from estimator.light_filter.grid_likelihood import CAP
 from estimator.light_filter.initialisation import RIVAL, Place, direct, places, probabilities, straight
-from estimator.light_filter.light_channel import SILENT_S, Asked, LightChannel, silent, too_strong_at
+from estimator.light_filter.light_channel import Asked, LightChannel, silent, too_strong_at
 from estimator.light_filter.link_association import NEARER_M, strong_at
 from estimator.mapping.submap_graph import SubmapGraph
 from estimator.numerics import se2

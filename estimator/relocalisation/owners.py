@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
 from estimator.fusion.time_offset import TimeOffset
-from estimator.light_filter.light_channel import LightChannel
 from estimator.mapping.map_state import MapState
 from estimator.relocalisation.memory import RelocalisationMemory
 from estimator.scan_matching.match_memory import MatchMemory
+
+if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
+    from estimator.light_filter.light_channel import LightChannel
 
 
 class Owners(Protocol):
