@@ -51,9 +51,8 @@ from estimator.relocalisation import (
     unaligned_map,
 )
 from estimator.result import LightsResult, MatchResult, Reason, StepResult
-from estimator.scan_matching import matcher_choice, scan_matcher
+from estimator.scan_matching import scan_matcher
 from estimator.scan_matching.deskew import ScanPoints, oriented, points_of, unturned
-from estimator.scan_matching.matcher_choice import First, Matcher, first_of
 from estimator.scan_matching.scan_matcher import Asked, Prior, View
 from estimator.scan_matching.scan_validation import in_time, nothing_of, refused
 from estimator.state import Settings, State, new_state
@@ -135,7 +134,7 @@ def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:
     """Whether a keyframe is due; never from next to nothing, nor where the robot may have been carried off."""
     if (match.ok and kidnap_detection.waits(state)) or len(points.xy) < state.settings.matching.min_points:
         return False
-    every_step = state.settings.matcher is Matcher.LINE
+    every_step = not state.settings.newest_only
     return keyframe_due(state.map, state.pose, state.motion, state.matching, match, every_step)
 
 
@@ -146,7 +145,8 @@ def extend_map(state: State, scan: Scan, points: ScanPoints, limits: Limits, mat
         learn_correlation(matching, oriented(points, limits.points), motion.T_odom_base)
     frame = make_keyframe(map_, pose, motion, scan, points.turned_rad)
     noise_m, anew = noise_of(matching, scan), lost(motion, matching)
-    frame.virtual = virtual(pose, motion, state.light)
+    light_pose = state.settings.light_pose
+    frame.virtual = virtual(pose, motion, state.light) if light_pose is None else light_pose()
     if anew and matching.local_map is not None:
         relocalisation.local_map_lost(state)
     P = hang_on(map_, pose, motion, frame)
@@ -180,10 +180,10 @@ def in_turn(state: State, records: Iterable[Record]) -> list[Record]:
     Until the scan has been matched nobody knows how the robot has moved since the one before, and light would be held
     against where the velocity has carried it: of a robot that is suddenly pushed and turned that is wrong by more than
     light is, and what light then says of the place turns its heading. No epoch waits where there is no scan, nor for a
-    scan behind an order that came later than it; nor for the paper's matcher, which begins where light has it.
+    scan behind an order that came later than it.
     """
     told = sorted(records, key=order)
-    guided = state.light is not None and state.light.guided is not None and state.settings.matcher is Matcher.LINE
+    guided = state.light is not None and state.light.guided is not None
     if not guided or not any(isinstance(record, Scan) for record in told):
         return told
     waiting: list[Record] = []
@@ -264,7 +264,7 @@ def virtual_frame(state: State, scan: Scan) -> ScanPoints:
 def match_scan(
     state: State, scan: Scan, points: ScanPoints, limits: Limits, refusal: Reason | None = None
 ) -> MatchResult:
-    """Eq. 12-14: nearest neighbours on the distance axis, point-to-line, the prediction weighted in."""
+    """Eq. 12-14: nearest neighbours on the distance axis, the scan matcher, the prediction weighted in."""
     state.matching.scans_since_keyframe += 1
     T_pred, count = state.motion.T_odom_base, len(points.xy)
     asked: Asked | None = None
@@ -285,20 +285,11 @@ def match_scan(
         )
         prior = Prior(T_pred, invert3(state.motion.P))
         asked = (view, state.matching.local_map, prior, limits.icp_iterations, state.settings.matching)
-        if state.settings.matcher is Matcher.LINE:
-            result = scan_matcher.match(*asked)
-        else:
-            result, asked = matcher_choice.match(asked, light_first(state, prior), state.settings), None
+        result = state.settings.match(*asked)
     if state.journal is not None:
-        state.journal(scan, points, asked, result)
+        traced = state.settings.match is scan_matcher.match
+        state.journal(scan, points, asked if traced else None, result)
     return result
-
-
-def light_first(state: State, prior: Prior) -> First:
-    """T1 of Eq. 14 for the paper's matcher: from light, or the prediction where light tells nothing good."""
-    assert state.matching.local_map is not None
-    lights = None if state.light is None else state.light.result
-    return first_of(prior, state.matching.local_map.newest, virtual(state.pose, state.motion, state.light), lights)
 
 
 def report(state: State, match: MatchResult | None, keyframe: int, limits: Limits = UNLIMITED) -> StepResult:

@@ -15,12 +15,12 @@ from estimator.mapping.map_state import MappingSettings, MapState
 from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import Scan
 from estimator.relocalisation.memory import RelocalisationMemory
-from estimator.result import MatchResult
+from estimator.result import MatchResult, Virtual
+from estimator.scan_matching import scan_matcher
 from estimator.scan_matching.deskew import ScanPoints
 from estimator.scan_matching.local_map import MapSettings
 from estimator.scan_matching.match_memory import MatchMemory
-from estimator.scan_matching.matcher_choice import Matcher, Weight, load
-from estimator.scan_matching.scan_matcher import Asked, MatchSettings
+from estimator.scan_matching.scan_matcher import Asked, MatchSettings, ScanMatcher
 
 if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.light_filter.light_channel import LightChannel, LightsSetup
@@ -37,14 +37,18 @@ class Settings(MappingSettings):
     Attributes:
         far_m: L of the paper's quality filter; ranges beyond it are not used.
         quality: Q of the filter; a beam whose intensity is lower is not used (only where a scan has intensities).
-        matcher: the default one, or one to compare it with. weight: of Eq. 15, where the matcher is the paper's.
+        match: the scan matcher. newest_only: it matches with the newest keyframe alone, so a keyframe is laid only a
+            whole step away from the one before, whose error stays for good.
+        light_pose: gives the light solution that a keyframe keeps, where it is not that of the pipeline's own light
+            filter; None where there is no such solution.
         map: of the local map. matching: of the matcher. noise: of the motion.
     """
 
     far_m: float = 80.0
     quality: float = 0.0
-    matcher: Matcher = Matcher.LINE
-    weight: Weight = Weight.INFORMATION
+    match: ScanMatcher = scan_matcher.match
+    newest_only: bool = False
+    light_pose: Callable[[], Virtual | None] | None = None
     map: MapSettings = field(default_factory=MapSettings)
     matching: MatchSettings = field(default_factory=MatchSettings)
     noise: MotionNoise = field(default_factory=MotionNoise)
@@ -91,7 +95,6 @@ def new_state(settings: Settings | None = None, lights: LightsSetup | None = Non
         ValueError: a stored sample clock outside the profile's range.
     """
     settings, jobs = settings or Settings(), JobQueue()
-    load(settings)
     state = State(settings, MapState(settings, SubmapGraph(jobs)), jobs)
     if settings.live_m > 0.0:
         state.map.live = LiveGrid(settings.live_m)

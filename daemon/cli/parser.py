@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final
 
+from estimator.paper import LUMILOOP, METHODS
+
 OK: Final = 0
 FAILED: Final = 1
 USAGE: Final = 2
@@ -155,6 +157,8 @@ def _replay(parser: argparse.ArgumentParser) -> None:
         "--journal", metavar="N[,N..]", help="write these matches in full, counted from 1; or: failed; or failed,5"
     )
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
+    known = "; ".join(f"{name}: {what}" for name, what in METHODS.items())
+    parser.add_argument("--method", choices=METHODS, default=LUMILOOP, help=f"{known}; default: {LUMILOOP}")
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.cli.replay", "main"))
 

@@ -36,6 +36,7 @@ from daemon.runtime.light_setup import Lights, SurveyError, from_header, load_li
 from daemon.system.versions import release, versions
 from estimator.mapping.map_snapshot import Identity
 from estimator.mapping.occupancy_grid import Grid
+from estimator.paper import LUMILOOP
 from hal.errors import DataInvalid, HalError
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
@@ -73,24 +74,27 @@ class Outcome:
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.journal is None and args.journal_at is None:
-        return command(args, _write_all)
+        return command(args, _write_all, method=args.method)
     from daemon.replay import match_journal
 
     try:
         wanted = match_journal.choice_of(args.journal, args.journal_at)
     except match_journal.BadChoice as error:
         return parser.fail(str(error), parser.USAGE)
-    return command(args, _write_all, match_journal.MatchJournal(wanted))
+    return command(args, _write_all, match_journal.MatchJournal(wanted), args.method)
 
 
 def command(
-    args: argparse.Namespace, write: Callable[[Folder, Outcome], None], journal: MatchJournal | None = None
+    args: argparse.Namespace,
+    write: Callable[[Folder, Outcome], None],
+    journal: MatchJournal | None = None,
+    method: str = LUMILOOP,
 ) -> int:
     """Replay ``args.log``, let ``write`` put results into ``args.out``, and say how it went; returns the exit code."""
     try:
         folder = Folder(args.out)
         keys = tuple(override.partition("=")[0].strip() for override in args.set)
-        outcome = replay(args.log, args.settings, Given(args.config is not None, keys), journal)
+        outcome = replay(args.log, args.settings, Given(args.config is not None, keys), journal, method)
         write(folder, outcome)
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return parser.fail(str(error))
@@ -99,14 +103,21 @@ def command(
     return _verdict(outcome)
 
 
-def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: MatchJournal | None = None) -> Outcome:
-    """Run a log through the pipeline.
+def replay(
+    path: Path,
+    config: Config,
+    given: Given = NOTHING_GIVEN,
+    journal: MatchJournal | None = None,
+    method: str = LUMILOOP,
+) -> Outcome:
+    """Run a log through the pipeline, or through another method.
 
     Args:
         path: the log.
         config: resolved configuration.
         given: what of it a person has asked for; what nobody asked for is taken from a log that knows it.
         journal: which matches are kept to be looked at.
+        method: name of the method, see `estimator.paper.METHODS`.
 
     Raises:
         HalError: the log cannot be opened; what goes wrong later ends the run and is said in `Outcome.stopped`.
@@ -118,8 +129,12 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: Ma
     lights = lights_for(source, used, given)
     if lights is not None:
         warmup.load_aloud(parser.say, "warm-lights", partial(warmup.load, lights))
-    start = start_for(source, used, lights, given)
-    outcome = Outcome(source, used, Rerun(source, used, lights, journal, start), journal)
+    if method == LUMILOOP:
+        start = start_for(source, used, lights, given)
+    else:
+        start = None
+        _load_method(source, given, method)
+    outcome = Outcome(source, used, Rerun(source, used, lights, journal, start, method), journal)
     outcome.seconds["read"] = time.perf_counter() - begun
     begun = time.perf_counter()
     try:
@@ -131,6 +146,13 @@ def replay(path: Path, config: Config, given: Given = NOTHING_GIVEN, journal: Ma
     outcome.rerun.finish()
     outcome.seconds["run"] = time.perf_counter() - begun
     return outcome
+
+
+def _load_method(source: Source, given: Given, method: str) -> None:
+    """Load the kernels of another method than the daemon's, and note the map that it begins without."""
+    warmup.load_aloud(parser.say, "warm-methods", warmup.load, "estimator.paper.methods")
+    if source.begin is not None or MAP in source.header or any(key.startswith("map.") for key in given.keys):
+        source.report.notes.append(f"method {method} begins with an empty map")
 
 
 def config_for(source: Source, config: Config, given: Given) -> Config:
@@ -328,6 +350,7 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
             "lidar": {"missed": source.status.missed, "invalid": source.status.invalid},
             "recorded_versions": source.header.get("versions"),
         },
+        "method": rerun.method,
         "complete": not outcome.stopped,
         "stopped": outcome.stopped,
         "counts": {
@@ -371,9 +394,9 @@ def _matches(outcome: Outcome) -> list[dict[str, Any]] | None:
 
 
 def _recorded(outcome: Outcome) -> dict[str, Any] | None:
-    """How a recording's replay compares with what was recorded; None for other logs."""
+    """How a recording's replay compares with what was recorded; None for other logs and other methods."""
     compared = outcome.rerun.comparison
-    if not outcome.source.recorded:
+    if not outcome.source.recorded or outcome.rerun.method != LUMILOOP:
         return None
     return {
         "cycles": compared.cycles,

@@ -27,14 +27,15 @@ from daemon.replay.results import finest
 from daemon.replay.sources import Event, Source, Turn
 from daemon.replay.trajectories import Ledger
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, CycleRecord, Parts
-from daemon.runtime.light_setup import Lights, begun, new_state
+from daemon.runtime.cycle import Cycle, CycleRecord, Parts, Step
+from daemon.runtime.light_setup import Lights, begun, new_state, setup_of
 from daemon.runtime.vitals import vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
 from estimator import pipeline
 from estimator.mapping.map_snapshot import Identity, MapImage
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import UNLIMITED, Array, Limits, Order, Record
+from estimator.paper import LUMILOOP, method
 from estimator.result import StepResult
 from estimator.stored_map import image_of
 from hal.adc import AdcStatus, RawSamples
@@ -115,13 +116,18 @@ class Rerun:
         lights: Lights | None = None,
         journal: MatchJournal | None = None,
         start: Start | None = None,
+        name: str = LUMILOOP,
     ) -> None:
-        """``start``: the map that it begins with; where the log begins with a state, that counts.
+        """A run of the method called ``name``.
+
+        ``start``: the map that it begins with; where the log begins with a state, that counts. Another method than the
+        daemon's begins with neither, has no caps and is not compared with what was recorded.
 
         Raises:
             DataInvalid: that state cannot be used.
         """
-        begin = None if source.begin is None else source.begin.load()
+        self.method, own = name, name == LUMILOOP
+        begin = source.begin.load() if own and source.begin is not None else None
         self.ledger = Ledger()
         self.comparison = Comparison()
         self.timing = Timing()
@@ -131,9 +137,15 @@ class Rerun:
         self.watch: Callable[[CycleRecord], object] | None = None
         self._source = source
         self._clock = ReplayClock()
-        self._lights, self._localise = lights, config.map.localise
-        settings = pipeline.Settings(history=True, localise=config.map.localise)
-        self._state = begun(lights, settings, start) if begin is None else begin.keep_history()
+        self._localise = own and config.map.localise
+        settings = pipeline.Settings(history=True, localise=self._localise)
+        if own:
+            self._state = begun(lights, settings, start) if begin is None else begin.keep_history()
+            self._estimate: Step = partial(pipeline.step, self._state)
+        else:
+            other = method(name)(settings, None if lights is None else setup_of(lights))
+            self._state, self._estimate, lights = other.state, other.step, lights if other.lit else None
+        self._lights = lights
         self._journal = journal
         if journal is not None:
             journal.attach(self._state)
@@ -148,7 +160,7 @@ class Rerun:
             begin.put_into(self.cycle)
 
     def _parts(self, config: Config, lights: Lights | None, begin: Restored | None) -> Parts:
-        worker = CycleWorker() if not self._source.recorded else self._scheduled(begin)
+        worker = self._scheduled(begin) if self._repeats else CycleWorker()
         return Parts(
             clock=self._clock,
             step=self._step,
@@ -170,6 +182,11 @@ class Rerun:
         if begin is None:
             return ScheduledWorker(self._answers)
         return ScheduledWorker(self._answers, begin.rest["cycle"]["cycles"], begin.jobs)
+
+    @property
+    def _repeats(self) -> bool:
+        """Whether the run repeats a recorded one to the last bit."""
+        return self._source.recorded and self.method == LUMILOOP
 
     @property
     def state(self) -> State:
@@ -227,10 +244,10 @@ class Rerun:
 
     def lamps(self) -> Array | None:
         """(k, 2) surveyed places of the lamps in the map frame; None until light has told where the map lies."""
-        tie, light = self._state.pose.alignment, self._state.light
-        if tie is None or light is None or not tie.placed:
+        result = self.cycle.result
+        if result is None or self._lights is None or not result.placed:
             return None
-        return np.array([(lamp.x, lamp.y) for lamp in light.setup.survey.lamps]).reshape(-1, 2)
+        return np.array([(lamp.x, lamp.y) for lamp in self._lights.survey.lamps]).reshape(-1, 2)
 
     def _arrive(self, t_rx: float) -> None:
         self._clock.t_mono = max(self._clock.t_mono, t_rx)
@@ -250,10 +267,11 @@ class Rerun:
         self.t_first = min(self.t_first, turn.t_mono)
         for command in entry.orders():
             self.cycle.inbox.put_command(command)
-        if entry.switched:
-            self.cycle.switch(partial(self._switch, entry.switched))
-        self._caps.now = entry.caps() or UNLIMITED
-        self._answers[self.cycle.cycles + 1] = entry.answers
+        if self._repeats:
+            if entry.switched:
+                self.cycle.switch(partial(self._switch, entry.switched))
+            self._caps.now = entry.caps() or UNLIMITED
+            self._answers[self.cycle.cycles + 1] = entry.answers
         self._source.status.link = Link.WAITING if entry.waiting else Link.STREAMING
         self._published = frozenset(entry.faults)
         try:
@@ -262,7 +280,8 @@ class Rerun:
             self.comparison.cycles += 1
             self.comparison.note(entry.cycle, str(error))
         else:
-            self._compare(entry, record)
+            if self._repeats:
+                self._compare(entry, record)
 
     def _switch(self, sha256: str) -> tuple[int, str]:
         """Go on in the map that the recorded run went on in.
@@ -314,7 +333,7 @@ class Rerun:
         if any(getattr(record, "order", None) is Order.RESET for record in records):
             self.ledger.settle(pipeline.keyframe_poses(self._state))
         begun = time.perf_counter()
-        result = pipeline.step(self._state, records, limits)
+        result = self._estimate(records, limits)
         self.timing.steps.append(time.perf_counter() - begun)
         return result
 

@@ -40,6 +40,7 @@ __all__ = [
     "lost_residuals",
     "new_state",
     "read_residuals",
+    "setup_of",
 ]
 
 HEADER: Final = "lights"
@@ -155,7 +156,7 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     """
     from estimator import pipeline
 
-    setup = None if lights is None else _setup(lights)
+    setup = None if lights is None else setup_of(lights)
     if start is None:
         return pipeline.new_state(settings, setup)
     from daemon.maps.image import image_from
@@ -180,7 +181,8 @@ def begun(lights: Lights | None, settings: Settings, start: Start | None) -> Sta
         return new_state(lights, settings)
 
 
-def _setup(lights: Lights) -> LightsSetup:
+def setup_of(lights: Lights) -> LightsSetup:
+    """The photodiode as the estimator takes it; a residual map that cannot be used is named in the log."""
     from estimator.light_filter.light_channel import LightsSetup
 
     return LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights))

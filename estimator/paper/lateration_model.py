@@ -135,6 +135,12 @@ class Links:
             self.exponent[i], self.d[i], self.range2[i], self.rim[i], self.diffuse[i], self.variance[i],
         )  # fmt: skip
 
+    def residuals(self, xy: Array) -> Array:
+        """(n,) of ln RSS against Eq. 1, 2 with the receiver at ``xy``."""
+        d2 = np.sum((xy - self.xy) ** 2, axis=1) + self.h**2
+        residuals: Array = self.exponent * np.log(np.sqrt(d2) / self.d)
+        return residuals
+
     def covariance(self, doubt: Doubt) -> Array:
         """(n, n) of ln strength, what links share included."""
         shared = doubt.common_ln**2 + doubt.floor**2 * np.outer(self.diffuse, self.diffuse)

@@ -2,9 +2,7 @@
 
     T1 -> virtual frame (Eq. 10-11) -> fused axis (Eq. 12) -> pairs -> T2 (Eq. 13) -> weight (Eq. 15) -> T_k (Eq. 14)
 
-It is kept beside the default matcher (icp.py) for experiments. T1 is the relative pose of the `lights` filter: Eq. 13
-on the only points that light knows, the lamps, seen from both bodies (``p_i = X_ref^-1 L_i``, ``q_i = X_new^-1 L_i``),
-returns ``X_ref^-1 X_new`` wherever the lamps are. The reference is the newest keyframe's scan in its lidar's frame.
+T1 is of `estimator.paper.first_transform`. The reference is the newest keyframe's scan in its lidar's frame.
 """
 
 from __future__ import annotations
@@ -18,12 +16,14 @@ from estimator.measurements import Beams
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array, Ints
 from estimator.paper import beam_model, point_to_point_sums
+from estimator.paper.first_transform import First
 from estimator.paper.pose_weighting import combine, information_weight, moved, paper_weight, turned, twist_between
 from estimator.scan_matching import icp
 from estimator.scan_matching.distance_axis import Axis, build_axis
 from estimator.scan_matching.distance_region import Fused, fuse, pair_fused
-from estimator.scan_matching.matcher_choice import CENTRE, First
 
+CENTRE = np.zeros(2)
+"""Of the reference's axis: its lidar."""
 PROBES = 4
 """Steps along the normals by which the solution's own error is looked for."""
 
@@ -69,13 +69,17 @@ class Limits:
 
 @dataclass(slots=True, eq=False)
 class Course:
-    """How the iterations go: pose, robust scale, steps, and the sums and trace that `matching.verdict` judges."""
+    """How the iterations go: pose, robust scale, steps, and the sums and trace that `scan_matcher.verdict` judges.
+
+    ``share``: the scalar weight of T1 in the latest iteration; 0 with a matrix weight.
+    """
 
     T: Array
     scale: float
     lever: float
     way: float = math.inf
     damping: float = 1.0
+    share: float = 0.0
     before: Array = field(default_factory=lambda: np.zeros(3))
     sums: Array = field(default_factory=lambda: np.zeros(icp.SUMS))
     trace: list[Array] = field(default_factory=list)
@@ -114,6 +118,7 @@ def register(new: New, reference: Reference, first: First, limits: Limits) -> tu
             break
         if limits.scalar:
             paper_weight(*likelihoods(new, reference, first, course.T), W)
+            course.share = float(W[0, 0])
         combine(first.T, T2, W, after)
         advance(course, after, limits)
     H = information(new, reference, course)

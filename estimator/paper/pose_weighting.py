@@ -2,7 +2,7 @@
 
 Eq. 14 reads ``T_k = w T1 + (1 - w) T2``. A sum of two homogeneous matrices is no rigid motion, so the same is said
 along the shortest way between the two: ``T_k = T2 Exp(W Log(T2^-1 T1))``; ``W = 0`` is T2, ``W = 1`` is T1. What the
-weight is, Eq. 15 tells in two ways (`matchers.Weight`).
+weight is, Eq. 15 tells in two ways (:class:`Weight`).
 
 No information is counted twice. T1 comes from the `lights` filter (odometry and lamps, never laser), T2 from the laser
 alone, and a `MatchResult` reports the laser's information only. the pose predicts with the same odometry as `lights`
@@ -15,11 +15,20 @@ prediction's once.
 
 from __future__ import annotations
 
+from enum import Enum
+
 import numpy as np
 
 from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 from estimator.numerics.symmetric3 import invert3
+
+
+class Weight(Enum):
+    """How Eq. 15 weighs T1 against T2 in the paper's matcher."""
+
+    INFORMATION = "matrix (L1 + L2)^-1 L1: each direction from the witness that knows it"
+    PAPER = "scalar ratio of the probabilities of both measurements at the present pose, in each iteration"
 
 
 @kernel("void(f8[::1], f8[::1], f8[::1])")

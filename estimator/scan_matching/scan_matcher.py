@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -111,6 +112,13 @@ class Prior:
 
 Asked = tuple[View, LocalMap, Prior, int, MatchSettings]
 """What :func:`match` is asked with; whoever keeps it can have the match told again, iteration by iteration."""
+
+
+class ScanMatcher(Protocol):
+    """Matches one scan with the local map, or with its newest keyframe; :func:`match` is the default."""
+
+    def __call__(self, view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings, /) -> MatchResult:
+        """Match a scan from its prediction in at most ``cap`` iterations."""
 
 
 @dataclass(slots=True, eq=False)

@@ -1,0 +1,177 @@
+"""The paper's light filter: an EKF of wheels and of places by the shortest links (Eq. 5-7).
+
+    Eq. 5    z = h(x) + delta, delta ~ N(0, Q):    z place of the receiver by Eq. 3, 4; h(x) = p + R(theta) l
+    Eq. 6    p(z | x):                             Q the place's covariance; how well the links fit is `misfit`
+    Eq. 7    J = dh/dx = [1  R'(theta) l]
+
+x = (p, theta) is the pose of the base in the survey's frame, l the receiver's lever arm. A photodiode alone gives no
+heading. So the start collects places along the way of the wheels and brings one onto the other by Eq. 13.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+from estimator.cdma import decoder
+from estimator.cdma.epoch import BlockFlag
+from estimator.fusion.motion_model import MotionNoise, odometry_variance
+from estimator.light_filter.lamp_catalogue import catalogue_of
+from estimator.light_filter.light_channel import LightsSetup
+from estimator.mapping.keyframe import Virtual
+from estimator.measurements import Array, LightEpoch, Odometry, Record, SampleBlock
+from estimator.numerics import se2
+from estimator.numerics.symmetric3 import symmetric
+from estimator.paper.lateration import Place, Prior
+from estimator.paper.lateration_model import LINK_N, Method, Solver
+from estimator.paper.point_to_point_sums import align
+from estimator.paper.shortest_link import PAUSED, links_of, misfit, select
+from estimator.result import Fix, LightsResult
+
+BASE_M: Final = 1.0
+"""Extent of the way over which the start is aligned."""
+APART_M: Final = 0.05
+"""Way between two places of the start."""
+PLACES: Final = 200
+"""Most places of a start; the oldest are dropped, so that wheels that slipped do not hold it up for good."""
+FITS_M: Final = 0.5
+"""RMS distance of the places from the aligned way up to which a start is taken."""
+STALE_S: Final = 0.5
+"""Age from which the latest epoch gives no pose any more."""
+
+
+class LightPose:
+    """The light solution by the paper's means.
+
+    Attributes:
+        method: solver and Link_n. T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``; in the survey's frame
+            once ``placed``, before that in the frame of the wheels' start. velocity: (v_x, v_y, yaw rate), base frame.
+        selection: links and place of the latest epoch. result: after the latest epoch.
+    """
+
+    def __init__(self, setup: LightsSetup, noise: MotionNoise, link_n: int = LINK_N) -> None:
+        """Nothing received yet; raises ValueError for an impossible survey or stored sample clock."""
+        self.setup, self.noise = setup, noise
+        self.method = Method(Solver.LS, link_n)
+        self.decoder = decoder.new_decoder(setup.profile, setup.clock_ppm, {lamp.code for lamp in setup.survey.lamps})
+        self.catalogue = catalogue_of(setup.survey)
+        self.lever = np.array((setup.survey.receiver.x, setup.survey.receiver.y))
+        self.T, self.P, self.velocity = se2.identity(), np.zeros((3, 3)), np.zeros(3)
+        self.t_mono = self.t_epoch = -math.inf
+        self.placed = False
+        self.selection = PAUSED
+        self._start: deque[tuple[Array, Array]] = deque(maxlen=PLACES)
+        self.result = self._result(None)
+
+    def take(self, record: Record) -> None:
+        """Take wheels, a block of samples or an epoch; other records are passed over."""
+        match record:
+            case Odometry():
+                self.move(record)
+            case SampleBlock():
+                self.update(decoder.decode(self.decoder, record))
+            case LightEpoch():
+                self.update(record)
+
+    def search(self, codes: int) -> None:
+        """Continue the acquisition of lamps, with an effort of so many codes."""
+        decoder.search(self.decoder, codes)
+
+    def move(self, record: Odometry) -> None:
+        """Prediction: the pose and its covariance after an increment of the wheels."""
+        dt = record.t_end - record.t_begin
+        if not (dt > 0.0 and np.isfinite(record.delta).all()):
+            return
+        R, x, y = se2.rotation(self.T[2]), float(record.delta[0]), float(record.delta[1])
+        turned = R[:2, :2] @ (-y, x)
+        F = np.array(((1.0, 0.0, turned[0]), (0.0, 1.0, turned[1]), (0.0, 0.0, 1.0)))
+        self.P = F @ self.P @ F.T + R @ np.diag(odometry_variance(record.delta, dt, self.noise)) @ R.T
+        self.T, self.t_mono = se2.compose(self.T, record.delta), record.t_end
+        self.velocity = se2.log(record.delta) / dt
+
+    def at(self, t_mono: float) -> Array:
+        """The pose at an instant near the latest increment, at constant velocity."""
+        dt = t_mono - self.t_mono
+        return se2.compose(self.T, se2.exp(self.velocity * dt)) if abs(dt) < STALE_S else self.T
+
+    def update(self, epoch: LightEpoch) -> None:
+        """Eq. 3-7: select the links, solve for the place, and take it into the pose or into the start."""
+        T = self.at(0.5 * (epoch.t_begin + epoch.t_end))
+        receiver, J = self._receiver(T)
+        prior = Prior(receiver, J @ self.P @ J.T + 1e-6 * np.eye(2)) if self.placed else None
+        self.selection = select(epoch, self.catalogue, self.setup.survey, self.method, prior)
+        self.t_epoch = epoch.t_end
+        place = self.selection.place
+        if place is not None and self.placed:
+            self._correct(place, receiver, J)
+        elif place is not None:
+            self._begin(place, receiver)
+        self.result = self._result(epoch)
+
+    def virtual(self, t_mono: float) -> Virtual | None:
+        """The light solution at an instant: the virtual consistent components; None while light is paused."""
+        accepted = self.selection.accepted
+        if not (self.placed and accepted and t_mono - self.t_epoch < STALE_S):
+            return None
+        return Virtual(self.at(t_mono), self.P, accepted)
+
+    def misfit(self) -> float:
+        """Mean squared normalised residual of the links in use at the pose; 0 without any."""
+        used = self.selection.used
+        return 0.0 if used is None else misfit(used, self.method, self._receiver(self.at(self.t_epoch))[0])
+
+    def _receiver(self, T: Array) -> tuple[Array, Array]:
+        """Place (2,) of the receiver with the base at ``T``, and its Jacobian (2, 3) by that pose (Eq. 7)."""
+        lever = se2.rotation(T[2])[:2, :2] @ self.lever
+        return T[:2] + lever, np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0])))
+
+    def _correct(self, place: Place, receiver: Array, J: Array) -> None:
+        """EKF update by a place (Joseph form)."""
+        K = self.P @ J.T @ np.linalg.inv(J @ self.P @ J.T + place.covariance)
+        keep = np.eye(3) - K @ J
+        self.T = self.T + K @ (place.xy - receiver)
+        self.T[2] = se2.wrap(float(self.T[2]))
+        self.P = symmetric(keep @ self.P @ keep.T + K @ place.covariance @ K.T)
+
+    def _begin(self, place: Place, receiver: Array) -> None:
+        """Keep a place, and align the way of the wheels with the places once it is long enough (Eq. 13)."""
+        if self._start and math.dist(self._start[-1][0], receiver) < APART_M:
+            return
+        self._start.append((receiver, place.xy))
+        way, places = (np.ascontiguousarray(side) for side in zip(*self._start, strict=True))
+        around = way - way.mean(axis=0)
+        if 2.0 * float(np.hypot(*around.T).max()) < BASE_M:
+            return
+        T_map_wheels = np.empty(3)
+        align(way, places, T_map_wheels)
+        square = float(np.mean((se2.apply(T_map_wheels, way) - places) ** 2))
+        if square > FITS_M**2:
+            return
+        doubt = max(square, 0.5 * float(np.trace(place.covariance)))
+        self.T = se2.compose(T_map_wheels, self.T)
+        self.P = np.diag((doubt, doubt, 2.0 * doubt / float(np.mean((around**2).sum(axis=1)))))
+        self.placed = True
+        self._start.clear()
+
+    def _result(self, epoch: LightEpoch | None) -> LightsResult:
+        """The result after an epoch."""
+        accepted, nothing = self.selection.accepted, np.zeros((3, 3))
+        found, paused = (Fix.GOOD, Fix.HELD) if self.placed else (Fix.STARTING, Fix.NONE)
+        xy = self._receiver(self.at(self.t_epoch))[0] if self.placed else None
+        return LightsResult(
+            t_mono=self.t_epoch,
+            fix=found if accepted else paused,
+            T_map_base=self.T,
+            covariance=self.P,
+            links=links_of(self.selection, self.method, xy),
+            accepted=accepted,
+            gained=nothing,
+            gained_by=np.zeros(3),
+            floor=self.setup.survey.floor,
+            block=BlockFlag.NONE if epoch is None else epoch.block,
+            clock_ppm=None if epoch is None else epoch.clock_ppm,
+            t_pose=self.t_mono,
+        )
