@@ -21,15 +21,15 @@ from estimator.cdma.epoch import BlockFlag
 from estimator.fusion.motion_model import MotionNoise, odometry_variance
 from estimator.light_filter.lamp_catalogue import catalogue_of
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.keyframe import Virtual
-from estimator.measurements import Array, LightEpoch, Odometry, Record, SampleBlock
+from estimator.measurements import LightEpoch, Odometry, Record, SampleBlock
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import symmetric
 from estimator.paper.lateration import Place, Prior
 from estimator.paper.lateration_model import LINK_N, Method, Solver
 from estimator.paper.point_to_point_sums import align
 from estimator.paper.shortest_link import PAUSED, links_of, misfit, select
-from estimator.result import Fix, LightsResult
+from estimator.result import Fix, LightsResult, Virtual
 
 BASE_M: Final = 1.0
 """Extent of the way over which the start is aligned."""
@@ -37,8 +37,9 @@ APART_M: Final = 0.05
 """Way between two places of the start."""
 PLACES: Final = 200
 """Most places of a start; the oldest are dropped, so that wheels that slipped do not hold it up for good."""
-FITS_M: Final = 0.5
-"""RMS distance of the places from the aligned way up to which a start is taken."""
+FITS: Final = 0.5
+"""RMS distance of the places from the aligned way, as a share of the way's own RMS extent, up to which a start is
+taken."""
 STALE_S: Final = 0.5
 """Age from which the latest epoch gives no pose any more."""
 
@@ -147,12 +148,13 @@ class LightPose:
             return
         T_map_wheels = np.empty(3)
         align(way, places, T_map_wheels)
-        square = float(np.mean((se2.apply(T_map_wheels, way) - places) ** 2))
-        if square > FITS_M**2:
+        extent2 = float(np.mean((around**2).sum(axis=1)))
+        square = float(np.mean(((se2.apply(T_map_wheels, way) - places) ** 2).sum(axis=1)))
+        if square > FITS**2 * extent2:
             return
-        doubt = max(square, 0.5 * float(np.trace(place.covariance)))
+        doubt = 0.5 * max(square, float(np.trace(place.covariance)))
         self.T = se2.compose(T_map_wheels, self.T)
-        self.P = np.diag((doubt, doubt, 2.0 * doubt / float(np.mean((around**2).sum(axis=1)))))
+        self.P = np.diag((doubt, doubt, 2.0 * doubt / extent2))
         self.placed = True
         self._start.clear()
 

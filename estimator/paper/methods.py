@@ -29,16 +29,17 @@ import numpy as np
 
 from estimator import pipeline
 from estimator.light_filter.light_channel import LightsSetup
-from estimator.mapping.keyframe import Keyframe, Virtual
-from estimator.mapping.map_frame import move_map, shift_map
-from estimator.measurements import Array, Command, Lap, Limits, Odometry, Order, Record, Scan, no_lap
+from estimator.mapping.map_frame import apply_correction
+from estimator.measurements import Command, Lap, Limits, Odometry, Order, Record, Scan, no_lap
 from estimator.numerics import se2
+from estimator.numerics.arrays import Array
 from estimator.paper.first_transform import First, from_light, predicted
 from estimator.paper.lateration_model import LINK_N
 from estimator.paper.light_pose import LightPose
 from estimator.paper.pose_weighting import combine
 from estimator.paper.registration import Pic, PointToPoint
-from estimator.result import StepResult
+from estimator.result import StepResult, Virtual
+from estimator.scan_matching.local_map import PlacedScan
 from estimator.scan_matching.scan_matcher import Prior
 from estimator.state import Settings, State
 
@@ -116,8 +117,8 @@ class PaperMethod:
             self._scan_to_map(result)
         return replace(
             result,
-            T_map_odom=self.state.T_map_odom,
-            jumps=self.state.jumps,
+            T_map_odom=self.state.pose.T_map_odom,
+            jumps=self.state.pose.jumps,
             lights=self.light.result,
             placed=self.placed,
             protection=None,
@@ -125,9 +126,9 @@ class PaperMethod:
 
     def _virtual(self) -> Virtual | None:
         """The light solution at the pipeline's present instant; None while light is paused."""
-        return None if self.light is None else self.light.virtual(self.state.fused.t_mono)
+        return None if self.light is None else self.light.virtual(self.state.motion.t_mono)
 
-    def _first(self, prior: Prior, reference: Keyframe) -> First:
+    def _first(self, prior: Prior, reference: PlacedScan) -> First:
         """T1: from light where reference and scan both have a light solution, else the prediction."""
         now = self._virtual()
         if self.light is None or now is None or reference.virtual is None:
@@ -147,15 +148,15 @@ class PaperMethod:
         if self.placed:
             T, since = np.empty(3), result.keyframe
             combine(light.T_map_base, T2, self.matcher.share * np.eye(3), T)
-        shift_map(self.state, se2.compose(T, se2.inverse(T2)), since)
-        move_map(self.state, se2.compose(T, se2.inverse(result.T_odom_base)))
+        T_map_odom = se2.compose(T, se2.inverse(result.T_odom_base))
+        apply_correction(self.state.map, self.state.pose, T_map_odom, since, result.T_odom_base)
         self.placed = True
 
     def _guide(self, result: StepResult) -> None:
         """Without wheels, the motion between steps moves the light solution."""
         assert self.light is not None
         before, self._before = self._before, (result.t_mono, result.T_odom_base)
-        if before is not None and not self.state.fused.odometry:
+        if before is not None and not self.state.motion.odometry:
             self.light.move(Odometry(before[0], result.t_mono, se2.between(before[1], result.T_odom_base)))
 
 

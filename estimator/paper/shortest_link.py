@@ -17,7 +17,7 @@ import numpy as np
 from estimator.cdma.epoch import UNUSABLE, LightEpoch, LinkFlag
 from estimator.light_filter.lamp_catalogue import Catalogue
 from estimator.light_filter.survey import Lamp, Survey
-from estimator.measurements import Array
+from estimator.numerics.arrays import Array
 from estimator.paper.lateration import Place, Prior, Why, locate
 from estimator.paper.lateration_model import Links, Method, Received, usable
 from estimator.result import Link, LinkState

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.numerics import jit
-from estimator.pipeline import Settings, new_state, render_map
+from estimator.paper import LUMILOOP, METHODS, method
+from estimator.pipeline import Settings, render_map
 from estimator.scan_matching.line_features import lines_of
-from estimator.scan_matching.matcher_choice import Matcher
 from tests.estimator.cdma_scene import Run, ceiling
 from tests.estimator.lit import lit_state, play, scans, together
 from tests.estimator.test_pipeline import drive, scan_at
@@ -23,13 +23,13 @@ from tools.sim.light.link_drive import room_run
 
 
 def figures() -> dict[str, list[float]]:
-    """Numbers by name: poses of drives with each matcher and under lamps, lines of a scan, cells, lamps' strengths."""
+    """Numbers by name: poses of drives with each method and under lamps, lines of a scan, cells, lamps' strengths."""
     out: dict[str, list[float]] = {}
-    for matcher in Matcher:
-        state = new_state(Settings(matcher=matcher))
+    for name in METHODS:
+        state = method(name)(Settings(), None).state
         _, results = drive(state, odometry=True, n=40)
-        out[f"poses {matcher.name}"] = np.ravel([result.T_odom_base for result in results]).tolist()
-        if matcher is Matcher.LINE:
+        out[f"poses {name}"] = np.ravel([result.T_odom_base for result in results]).tolist()
+        if name == LUMILOOP:
             out["cells"] = [float((render_map(state, 0.1).log_odds > 1.0).sum())]
     out["lines"] = lines_of(points_in(scan_at(np.zeros(3), 0.0, 0)))[:, :4].ravel().tolist()
     run = replace(room_run(seed=1, people=0), seconds=8.0)

@@ -1,4 +1,4 @@
-"""Bad scans through the whole step, with each matcher: a reason, no exception, no wrong pose, and it goes on."""
+"""Bad scans through the whole step, by each method: a reason, no exception, no wrong pose, and it goes on."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from estimator.measurements import UNLIMITED, Array, Beam, Odometry, Record, Scan
 from estimator.numerics import se2
+from estimator.paper import LUMILOOP, METHODS, method
 from estimator.pipeline import Settings, State, new_state, step
 from estimator.result import Reason, StepResult
-from estimator.scan_matching.matcher_choice import Matcher
 from tests.estimator.scan_matching.test_bad_input import OUTSIDE
 from tests.estimator.test_pipeline import BEARING, path, scan_at
 
@@ -76,9 +76,10 @@ MISFITS: dict[str, Callable[[Scan], Scan]] = {
 }
 
 
-def settled(matcher: Matcher, scans: int = 12) -> tuple[State, Array]:
+def settled(name: str, scans: int = 12) -> tuple[State, Array]:
     """A robot that has come to a stop after a short drive, and where it is."""
-    state, truth, noise = new_state(Settings(matcher=matcher)), path(60)[:scans], np.random.default_rng(1)
+    state = method(name)(Settings(), None).state
+    truth, noise = path(60)[:scans], np.random.default_rng(1)
     for k, T in enumerate(truth):
         records: list[Record] = [scan_at(T, 0.05 * k, k, noise)]
         if k:
@@ -107,7 +108,7 @@ def honest(result: StepResult, truth: Array) -> bool:
 
 @pytest.mark.parametrize("name", MALFORMED)
 def test_what_is_no_scan_is_refused(name: str) -> None:
-    state, T = settled(Matcher.LINE, 4)
+    state, T = settled(LUMILOOP, 4)
     before = state.motion.T_odom_base
     scan = MALFORMED[name](scan_at(T, 0.7, 50))
     result = stand(state, 0.7, scan)
@@ -132,9 +133,9 @@ def test_a_robot_that_is_switched_on_with_it_waits_for_a_scan(name: str) -> None
     assert first.keyframe > 0
 
 
-@pytest.mark.parametrize("matcher", Matcher)
-def test_scans_without_points_say_so(matcher: Matcher) -> None:
-    state, T = settled(matcher)
+@pytest.mark.parametrize("method_name", METHODS)
+def test_scans_without_points_say_so(method_name: str) -> None:
+    state, T = settled(method_name)
     t, before = 1.2, state.motion.T_odom_base
     for k, change in enumerate(WITHOUT_POINTS.values()):
         result = stand(state, t + 0.05 * k, change(scan_at(T, t + 0.05 * k, 50 + k)))
@@ -147,11 +148,11 @@ def test_scans_without_points_say_so(matcher: Matcher) -> None:
     assert again.match.ok
 
 
-@pytest.mark.parametrize("matcher", Matcher)
+@pytest.mark.parametrize("method_name", METHODS)
 @pytest.mark.parametrize("name", MISFITS)
-def test_scans_that_fit_nowhere_move_nothing(name: str, matcher: Matcher) -> None:
+def test_scans_that_fit_nowhere_move_nothing(name: str, method_name: str) -> None:
     """Two are passed over; a third in a row begins the map anew, at the place where the robot is."""
-    state, T = settled(matcher)
+    state, T = settled(method_name)
     for k in range(5):
         t = 1.2 + 0.05 * k
         result = stand(state, t, MISFITS[name](scan_at(T, t, 50 + k)))
@@ -166,9 +167,9 @@ def test_scans_that_fit_nowhere_move_nothing(name: str, matcher: Matcher) -> Non
     assert result.match.ok
 
 
-@pytest.mark.parametrize("matcher", Matcher)
-def test_a_scan_from_before_is_too_late(matcher: Matcher) -> None:
-    state, T = settled(matcher)
+@pytest.mark.parametrize("method_name", METHODS)
+def test_a_scan_from_before_is_too_late(method_name: str) -> None:
+    state, T = settled(method_name)
     far = path(60)[0]
     late = stand(state, 1.2, scan_at(far, 0.3, 3))
     assert late.match is not None
@@ -180,7 +181,7 @@ def test_a_scan_from_before_is_too_late(matcher: Matcher) -> None:
 
 
 def test_a_clock_that_was_set_back_costs_one_scan() -> None:
-    state, T = settled(Matcher.LINE)
+    state, T = settled(LUMILOOP)
     said = [step(state, [scan_at(T, 0.05 * k - 100.0, k)], UNLIMITED) for k in range(5)]
     assert [result.match.reason for result in said if result.match is not None] == [
         Reason.LATE,
@@ -189,10 +190,10 @@ def test_a_clock_that_was_set_back_costs_one_scan() -> None:
     assert all(honest(result, T) for result in said)
 
 
-@pytest.mark.parametrize("matcher", Matcher)
-def test_the_same_scan_again_and_again_is_the_same_place(matcher: Matcher) -> None:
+@pytest.mark.parametrize("method_name", METHODS)
+def test_the_same_scan_again_and_again_is_the_same_place(method_name: str) -> None:
     """A stuck device: what is known does not shrink to nothing, and the pose stays."""
-    state, T = settled(matcher)
+    state, T = settled(method_name)
     scan = scan_at(T, 1.2, 50, np.random.default_rng(4))
     for _ in range(40):
         result = step(state, [scan], UNLIMITED)
@@ -206,7 +207,7 @@ def test_the_same_scan_again_and_again_is_the_same_place(matcher: Matcher) -> No
 
 def test_a_hundred_thousand_beams() -> None:
     """Two hundred times the map's density, no error, no other place."""
-    state, T = settled(Matcher.LINE)
+    state, T = settled(LUMILOOP)
     n = 100_000
     bearing = np.linspace(BEARING[0], BEARING[-1], n)
     ranges = np.interp(bearing, BEARING, scan_at(T, 0.0, 0).range_m)
@@ -266,15 +267,15 @@ FELL_TOGETHER = [
 left for them: it once fitted a wall nine metres off."""
 
 
-@pytest.mark.parametrize("matcher", Matcher)
+@pytest.mark.parametrize("method_name", METHODS)
 @settings(max_examples=15, deadline=None)
 @given(cases=st.lists(FUZZ, min_size=1, max_size=6))
 @example(cases=FELL_TOGETHER)
 def test_whatever_comes_the_step_goes_on(
-    matcher: Matcher, cases: list[tuple[int, tuple[float, float], str, int, float, float, tuple[float, ...]]]
+    method_name: str, cases: list[tuple[int, tuple[float, float], str, int, float, float, tuple[float, ...]]]
 ) -> None:
     """Records at random on a robot that stands: never an exception, never a confident wrong pose, and it recovers."""
-    state, T = settled(matcher, 4)
+    state, T = settled(method_name, 4)
     t = 0.7
     for case in cases:
         scan = fuzzed(case, T, t)

@@ -17,7 +17,9 @@ import numpy as np
 from estimator.light_filter.light_channel import LightsSetup
 from estimator.measurements import UNLIMITED, LightEpoch, Odometry, Record, Scan
 from estimator.numerics import se2
-from estimator.pipeline import Settings, State, keyframe_poses, new_state, step
+from estimator.paper import LUMILOOP, method
+from estimator.paper.methods import Method
+from estimator.pipeline import Settings, State, keyframe_poses
 from estimator.result import Fix, StepResult
 from tools.experiments.trajectory import Array, Track, moved
 from tools.sim.building.buildings import building
@@ -79,7 +81,7 @@ def outing(where: str, seed: int, seconds: float) -> Outing:
 
 @dataclass(slots=True, eq=False)
 class Log:
-    """What a state came to over a pass, ten times a second.
+    """What a robot came to over a pass, ten times a second.
 
     ``kept``: the same way as the keyframes are known at the end. ``lights``: of lamps and odometry alone, NaN where not
     known.
@@ -105,14 +107,14 @@ class Log:
 NOWHERE: Final = np.full(3, np.nan)
 
 
-def play(state: State, streams: Iterable[Iterable[Record]]) -> Log:
-    """All records through `step`, one step a scan."""
+def play(robot: Method, streams: Iterable[Iterable[Record]]) -> Log:
+    """All records through a method, one step a scan."""
     log, pending = Log([], [], [], []), list[Record]()
     ordered: Iterable[Any] = merge(*streams, key=lambda record: record.t_end)  # type: ignore[union-attr]  # no orders
     for record in ordered:
         pending.append(record)
         if isinstance(record, Scan):
-            result = step(state, pending, UNLIMITED)
+            result = robot.step(pending, UNLIMITED)
             pending = []
             if record.seq % THIN == 0:
                 note(log, result)
@@ -128,10 +130,13 @@ def note(log: Log, result: StepResult) -> None:
     log.lights.append(result.lights.T_map_base if known and result.lights is not None else NOWHERE)
 
 
-def fresh(run: LightRun, lit: bool, settings: Settings) -> State:
-    """A robot that has just been switched on; with a photodiode it knows the lamps as new. No loops are closed."""
-    kept = replace(settings, history=True, loops=None)
-    return new_state(kept, LightsSetup(run.survey, clock_ppm=0.0) if lit else None)
+def fresh(run: LightRun, lit: bool, name: str = LUMILOOP) -> Method:
+    """A robot that has just been switched on; with a photodiode it knows the lamps as new. No loops are closed.
+
+    ``name``: of its method.
+    """
+    lights = LightsSetup(run.survey, clock_ppm=0.0) if lit else None
+    return method(name)(Settings(history=True, loops=None), lights)
 
 
 def reckoned(records: list[Odometry], t: Array, truth: Callable[[Array], Array]) -> Track:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from daemon.app import Daemon, World
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.recording.recorder import Recorder
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle import Cycle, Sink
 from daemon.runtime.worker import CycleWorker
@@ -87,6 +89,7 @@ def run(
     faults: str = "",
     odometry: bool = True,
     lidar: bool = True,
+    record: Path | None = None,
 ) -> Run:
     """Run daemon and world together for some virtual seconds.
 
@@ -98,6 +101,7 @@ def run(
             (``robot``, see tools/sim/hands.py).
         odometry: whether wheel odometry is fed.
         lidar: whether there is a lidar; without one, lights must be in the scenario.
+        record: folder for a recording of the run; light has to come as words of the converter.
 
     Raises:
         RuntimeError: the daemon ended by itself, or never published a pose.
@@ -118,7 +122,7 @@ def run(
         ),
     )
     log = _Log()
-    sent = run_virtual(_main(settings, scene, log, _Order(seconds, faults, seed)))
+    sent = run_virtual(_main(settings, scene, log, _Order(seconds, faults, seed, record)))
     return _collect(log, scene, sent)
 
 
@@ -127,6 +131,7 @@ class _Order:
     seconds: float
     faults: str
     seed: int
+    record: Path | None
 
 
 class _Log:
@@ -159,13 +164,14 @@ async def _main(settings: Config, scene: Scene, log: _Log, order: _Order) -> int
     schedule = FaultSchedule(targets)
     if order.faults:
         schedule.load(order.faults)
-    daemon = Daemon(settings, around)
+    recorder = None if order.record is None else Recorder(order.record, settings, clock, around.lights)
+    daemon = Daemon(settings, around, recorder)
     log.cycle = daemon.cycle
     if light is not None and light.lights.fidelity == LINK:
         daemon.cycle.parts.samples = LinkBridge(light)
     stop = asyncio.Event()
     loop.call_later(order.seconds, stop.set)
-    wheels = _connect_wheels(daemon, scene, clock) if settings.odometry.port else None
+    wheels = _connect_wheels(daemon, scene, clock, recorder) if settings.odometry.port else None
     try:
         await daemon.run(stop)
     finally:
@@ -196,12 +202,13 @@ def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
     )
 
 
-def _connect_wheels(daemon: Daemon, scene: Scene, clock: LoopClock) -> asyncio.Task[None]:
+def _connect_wheels(daemon: Daemon, scene: Scene, clock: LoopClock, recorder: Recorder | None) -> asyncio.Task[None]:
     """Feed odometry datagrams past the socket, which would wait in real time."""
     for part in ("odometry", "imu"):
         daemon.network.parts.pop(part)
     port = InputPort(clock, "", _ANY_PORT)
-    port.send_odometry_to(daemon.cycle.inbox.put_odometry)
+    put = daemon.cycle.inbox.put_odometry
+    port.send_odometry_to(put if recorder is None else recorder.on_odometry(put))
     return asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
 
 

@@ -111,3 +111,12 @@ def test_the_map_that_a_replay_writes_is_one_to_begin_with(
     assert parser.main(["map", "verify", str(tmp_path / "out" / "map.lumimap")]) == parser.OK
     assert "good, map" in capsys.readouterr().out
     assert started(MapConfig(folder=str(tmp_path / "out")), None)[1] is not None
+
+
+def test_another_method_begins_with_an_empty_map(
+    run: tuple[Path, Bench, Start], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary = replay(run[0] / "second", tmp_path / "out", "--method", "pic")
+    assert summary["method"] == "pic"
+    assert summary["recorded_run"] is None
+    assert "method pic begins with an empty map" in capsys.readouterr().err

@@ -133,8 +133,8 @@ def record(
     return run_virtual(go())
 
 
-def replay(folder: Path, out: Path) -> dict[str, dict[str, object]]:
-    assert parser.main(["replay", str(folder), "--out", str(out)]) == parser.OK
+def replay(folder: Path, out: Path, *options: str) -> dict[str, dict[str, object]]:
+    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == parser.OK
     summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
     return summary
 

@@ -8,10 +8,10 @@ import pytest
 from estimator.measurements import Array
 from estimator.numerics import se2
 from estimator.paper import pic
-from estimator.pipeline import Settings
+from estimator.paper.registration import Pic
 from estimator.scan_matching import icp
 from estimator.scan_matching.distance_axis import build_axis
-from estimator.scan_matching.matcher_choice import First, Matcher, match
+from estimator.scan_matching.scan_matcher import MatchSettings
 from tests.estimator.world import map_of, place_both, prior_at, scan_in, view_of
 from tools.bench.support.scenes import bearings, paper_room
 
@@ -92,14 +92,14 @@ def test_it_ends_where_the_points_are() -> None:
 @pytest.mark.jit
 def test_it_converges_and_its_covariance_is_of_the_right_size() -> None:
     """In a room: millimetres; pairs along walls make its covariance too small, though not by an order."""
-    rng, bearing, settings = np.random.default_rng(2), bearings(721, 180.0), Settings(matcher=Matcher.PIC)
+    rng, bearing = np.random.default_rng(2), bearings(721, 180.0)
     errors, squares = [], []
     for _ in range(40):
         T, T_new = place_both(paper_room(), rng, 0.1, np.radians(3.0))
         local = map_of([(T, scan_in(paper_room(), T, bearing, rng))])
         view = view_of(scan_in(paper_room(), T_new, bearing, rng))
         prior = prior_at(T, 0.1, 0.05)
-        result = match((view, local, prior, 50, settings.matching), First(prior.T, prior.L), settings)
+        result = Pic()(view, local, prior, 50, MatchSettings())
         assert result.ok
         e = result.T_odom_base - T_new
         e[2] = se2.wrap(e[2])

@@ -10,16 +10,19 @@ import pytest
 from estimator.measurements import Array
 from estimator.numerics import se2
 from estimator.paper import point_to_point, point_to_point_sums
-from estimator.pipeline import Settings
+from estimator.paper.first_transform import First
+from estimator.paper.pose_weighting import Weight
+from estimator.paper.registration import Pic, PointToPoint, points_of
 from estimator.result import Reason
 from estimator.scan_matching import icp
-from estimator.scan_matching.matcher_choice import First, Matcher, match, points_of
-from estimator.scan_matching.scan_matcher import Prior
+from estimator.scan_matching.scan_matcher import MatchSettings, Prior, ScanMatcher
 from tests.estimator.world import map_of, place_both, prior_at, scan_in, view_of
 from tools.bench.support.scenes import Scene, bearings, corridor, office, paper_room
 
-POINT = Settings(matcher=Matcher.POINT)
 WEAK = np.diag((4.0, 4.0, 10.0))
+POINT = PointToPoint(weight=Weight.INFORMATION)
+VAGUE = PointToPoint(weight=Weight.INFORMATION, first=lambda prior, frame: First(prior.T, WEAK))
+"""Starts at the prediction and hardly weighs it."""
 
 
 def small() -> tuple[point_to_point.New, point_to_point.Reference, First, Array]:
@@ -128,7 +131,7 @@ def trials(scene: Scene, beams: int, off: tuple[float, float], count: int) -> tu
     for _ in range(count):
         T, T_new = place_both(scene, rng, off[0], np.radians(off[1]))
         local, view = map_of([(T, scan_in(scene, T, bearing, rng))]), view_of(scan_in(scene, T_new, bearing, rng))
-        result = match((view, local, prior_at(T, 0.5, 0.3), 50, POINT.matching), First(T, WEAK), POINT)
+        result = VAGUE(view, local, prior_at(T, 0.5, 0.3), 50, MatchSettings())
         assert result.ok
         e = result.T_odom_base - T_new
         e[2] = se2.wrap(e[2])
@@ -159,9 +162,7 @@ def test_a_plain_corridor_is_not_known_along_its_axis() -> None:
         for scan in seen:
             scan.beam[scan.range_m > 15.0] = 0
         told = Prior(T_new + np.array((0.03, 0.0, 0.0)), np.diag((1e4, 1e4, 1e5)))
-        result = match(
-            (view_of(seen[1]), map_of([(T, seen[0])]), told, 50, POINT.matching), First(told.T, told.L), POINT
-        )
+        result = POINT(view_of(seen[1]), map_of([(T, seen[0])]), told, 50, MatchSettings())
         assert result.ok
         np.testing.assert_array_equal(result.known_axes, (0.0, 1.0, 1.0))
         assert abs(result.T_odom_base[0] - told.T[0]) < 0.005
@@ -169,19 +170,19 @@ def test_a_plain_corridor_is_not_known_along_its_axis() -> None:
 
 
 @pytest.mark.jit
-@pytest.mark.parametrize("matcher", [Matcher.POINT, Matcher.PIC])
-def test_bad_input_says_why(matcher: Matcher) -> None:
+@pytest.mark.parametrize("matcher", [VAGUE, PointToPoint(), Pic()], ids=["matrix", "literal", "pic"])
+def test_bad_input_says_why(matcher: ScanMatcher) -> None:
     """A wrong guess of 3 m, three points, identical points: no exception, no confident wrong pose."""
-    rng, bearing, settings = np.random.default_rng(4), bearings(181, 180.0), Settings(matcher=matcher)
+    rng, bearing = np.random.default_rng(4), bearings(181, 180.0)
     T = np.array((1.0, 0.5, 0.2))
     local = map_of([(T, scan_in(paper_room(), T, bearing, rng))])
     view = view_of(scan_in(paper_room(), T, bearing, rng))
     wrong = prior_at(T + np.array((3.0, 0.0, 0.0)), 0.05, 0.05)
-    result = match((view, local, wrong, 50, settings.matching), First(wrong.T, wrong.L), settings)
+    result = matcher(view, local, wrong, 50, MatchSettings())
     assert not result.ok or np.abs(result.T_odom_base - T)[:2].max() < 0.1
     for points in (view.points[:3], np.repeat(view.points[:1], 50, axis=0), view.points[:0]):
         few = replace(view, points=np.ascontiguousarray(points))
-        result = match((few, local, prior_at(T, 0.05, 0.05), 50, settings.matching), First(T, WEAK), settings)
+        result = matcher(few, local, prior_at(T, 0.05, 0.05), 50, MatchSettings())
         assert np.isfinite(result.T_odom_base).all()
         assert np.isfinite(result.information).all()
         assert not result.ok or not result.known_axes.all()

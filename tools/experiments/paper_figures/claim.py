@@ -16,8 +16,11 @@ import numpy as np
 from estimator.mapping.keyframe import keep
 from estimator.measurements import Scan
 from estimator.numerics import se2
-from estimator.pipeline import Settings
-from estimator.scan_matching import local_map, matcher_choice, scan_matcher
+from estimator.paper import registration
+from estimator.paper.first_transform import First
+from estimator.paper.point_to_point import CENTRE
+from estimator.paper.pose_weighting import Weight
+from estimator.scan_matching import local_map, scan_matcher
 from estimator.scan_matching.deskew import oriented, points_of, unturned
 from estimator.scan_matching.distance_axis import build_axis
 from estimator.scan_matching.line_features import lines_of
@@ -61,7 +64,7 @@ LEAST: Final = np.array((0.002, 0.002, 0.001))
 """No idea is said to be better than this (m, m, rad)."""
 STILL: Final = np.zeros(3)
 SETTINGS: Final = MatchSettings()
-PAPER: Final = Settings(matcher=matcher_choice.Matcher.POINT, weight=matcher_choice.Weight.INFORMATION)
+PAPER: Final = registration.PointToPoint(FAR_M, Weight.INFORMATION)
 
 Matcher = Callable[[Pair, Prior], "Asked"]
 
@@ -128,13 +131,13 @@ def by_points(pair: Pair, prior: Prior) -> Asked:
     """The paper's matcher; its axis is built with every match."""
     view = view_of(pair.new, pair.moved[1])
     frame = keep(0, STILL, STILL, pair.reference, points_of(pair.reference, pair.moved[0], FAR_M, QUALITY).turned_rad)
-    xy, first = matcher_choice.points_of(frame, FAR_M), matcher_choice.First(prior.T, prior.L)
+    first = First(prior.T, prior.L)
 
     def make() -> Attempt:
-        return matcher_choice.by_points(view, frame, xy, first, CAP, PAPER)
+        return PAPER.attempt(view, frame, first, CAP, SETTINGS)
 
     def told() -> Effort:
-        axis = build_axis(xy, matcher_choice.CENTRE, sectors=1)
+        axis = build_axis(registration.points_of(frame, FAR_M), CENTRE, sectors=1)
         return effort_of(view.points, (axis.rows, axis.start, axis.rays), make().trace, keeps=False)
 
     return Asked(lambda: make().T, told)

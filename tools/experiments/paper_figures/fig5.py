@@ -20,8 +20,8 @@ from typing import Final
 import numpy as np
 
 from estimator.measurements import Beam, Scan
-from estimator.pipeline import Settings, State
-from estimator.scan_matching.matcher_choice import Matcher, Weight
+from estimator.paper import LUMILOOP
+from estimator.paper.methods import Method
 from tools.ci.figures import Figure
 from tools.experiments.outings import Outing, fresh, outing, play, reckoned
 from tools.experiments.paper_figures.fig5_picture import Panel, draw_maps
@@ -38,22 +38,22 @@ MAP_S: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Method:
-    """An estimator under test. ``lit``: whether it has the photodiode. settings: which matcher, and the rest."""
+class Robot:
+    """A robot under test. lit: whether it has the photodiode. method: its estimator, by name."""
 
     name: str
     lit: bool
-    settings: Settings
+    method: str
 
 
-METHODS: Final = (
-    Method("pIC", False, Settings(matcher=Matcher.PIC)),
-    Method("the paper's matcher, laser alone", False, Settings(matcher=Matcher.POINT)),
-    Method("the paper's matcher, laser and lights", True, Settings(matcher=Matcher.POINT, weight=Weight.PAPER)),
-    Method("ours, laser alone", False, Settings()),
-    Method("ours, laser and lights", True, Settings()),
+ROBOTS: Final = (
+    Robot("pIC", False, "pic"),
+    Robot("the paper's method, laser alone", False, "paper"),
+    Robot("the paper's method, laser and lights", True, "paper"),
+    Robot("ours, laser alone", False, LUMILOOP),
+    Robot("ours, laser and lights", True, LUMILOOP),
 )
-MAIN: Final = METHODS[-1]
+MAIN: Final = ROBOTS[-1]
 ALONE: Final = "lights and wheels, no laser"
 WHEELS: Final = "wheels alone"
 
@@ -63,7 +63,7 @@ class Outcome:
     """What one drive with one seed gave.
 
     Attributes:
-        tracks: by method, scored part only, in the frame of the truth. kept: the same as the keyframes lie at the end.
+        tracks: by robot, scored part only, in the frame of the truth. kept: the same as the keyframes lie at the end.
         sketch: a few scans of both passes, for the picture of a map; empty but for the first seed.
     """
 
@@ -84,35 +84,36 @@ def trial(task: tuple[str, int, float]) -> Outcome:
     tracks, kept = {}, {}
     seen = out.scans(0)
     wheels, light, begin = out.odometry(0), out.light(0), min(FROM_S, 0.4 * out.seconds)
-    state = None
-    for method in METHODS:
-        one = fresh(out.run, method.lit, method.settings)
-        found = play(one, (wheels, seen, light) if method.lit else (wheels, seen)).tracks(one, out.run.truth)
+    main = None
+    for robot in ROBOTS:
+        one = fresh(out.run, robot.lit, robot.method)
+        log = play(one, (wheels, seen, light) if robot.lit else (wheels, seen))
+        found = log.tracks(one.state, out.run.truth)
         live, whole = found["live"], found["kept"]
-        tracks[method.name] = (live if method.lit else started(live)).since(begin)
-        kept[method.name] = whole if method.lit else started(whole)
-        if method is MAIN:
-            state, tracks[ALONE] = one, known(found["lights"].since(begin))
+        tracks[robot.name] = (live if robot.lit else started(live)).since(begin)
+        kept[robot.name] = whole if robot.lit else started(whole)
+        if robot is MAIN:
+            main, tracks[ALONE] = one, known(found["lights"].since(begin))
             tracks[WHEELS] = kept[WHEELS] = reckoned(wheels, live.t, out.run.truth)
     sketch = tuple(sketched(seen)) if seed == SEEDS[0] else ()
     del seen
-    assert state is not None
-    sketch += second(out, state, begin, (tracks, kept))
+    assert main is not None
+    sketch += second(out, main, begin, (tracks, kept))
     return Outcome(where, seed, tracks, kept, sketch)
 
 
 def second(
-    out: Outing, state: State, begin: float, into: tuple[dict[str, Track], dict[str, Track]]
+    out: Outing, main: Method, begin: float, into: tuple[dict[str, Track], dict[str, Track]]
 ) -> tuple[Sketch, ...]:
     """The second pass under lamps of each age, driven on and switched on anew; the sketch of its scans."""
     tracks, kept = into
     seen, wheels, t0 = out.scans(1), out.odometry(1), out.span(1)[0]
     for share in AGEINGS:
-        light, ways = out.light(1, share), [(carried_on(share), copy.deepcopy(state), 0.0)]
+        light, ways = out.light(1, share), [(carried_on(share), copy.deepcopy(main), 0.0)]
         if share == AGEINGS[-1]:
-            ways.append((begun_anew(share), fresh(out.run, True, MAIN.settings), begin))
+            ways.append((begun_anew(share), fresh(out.run, True), begin))
         for name, one, since in ways:
-            found = play(one, (wheels, seen, light)).tracks(one, out.run.truth)
+            found = play(one, (wheels, seen, light)).tracks(one.state, out.run.truth)
             tracks[name], kept[name] = found["live"].since(t0 + since), found["kept"]
             tracks[f"{name}, no laser"] = known(found["lights"].since(t0 + since))
     return tuple(sketched(seen)) if out.run.seed == SEEDS[0] else ()
@@ -181,7 +182,7 @@ NOTES: Final = (
 
 
 def rows_of(done: list[Outcome]) -> list[tuple[Cell, ...]]:
-    """A line of the table for each method: medians and worst over the seeds."""
+    """A line of the table for each robot: medians and worst over the seeds."""
     rows: list[tuple[Cell, ...]] = []
     for name in done[0].tracks:
         both = [judged(one.tracks[name]) for one in done if len(one.tracks[name].t)]
@@ -199,7 +200,7 @@ def rows_of(done: list[Outcome]) -> list[tuple[Cell, ...]]:
 
 
 def figures_of(where: str, done: list[Outcome]) -> list[Figure]:
-    """Median and worst absolute trajectory error of each method."""
+    """Median and worst absolute trajectory error of each robot."""
     out = []
     for name in done[0].tracks:
         values = [100.0 * errors(one.tracks[name]).rmse for one in done if len(one.tracks[name].t)]
@@ -212,7 +213,7 @@ def figures_of(where: str, done: list[Outcome]) -> list[Figure]:
 
 def panels_of(outcome: Outcome) -> list[Panel]:
     """What is drawn: maps of the first pass, and of the second by a robot that is new under the oldest lamps."""
-    names = [WHEELS, *(method.name for method in METHODS if "paper" not in method.name or method.lit)]
+    names = [WHEELS, *(robot.name for robot in ROBOTS if "paper" not in robot.name or robot.lit)]
     names.append(begun_anew(AGEINGS[-1]))
     panels = []
     for name in names:

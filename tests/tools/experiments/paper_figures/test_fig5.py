@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.pipeline import Settings
 from tools.experiments import outings
 from tools.experiments.paper_figures import fig5
 from tools.experiments.report import Work, save
@@ -71,8 +70,8 @@ def test_laser_alone_follows_the_first_metres_and_one_seed_gives_one_result() ->
     seen, wheels = out.scans(0), out.odometry(0)
     ends = []
     for _ in range(2):
-        state = outings.fresh(out.run, False, Settings())
-        tracks = outings.play(state, (wheels, seen)).tracks(state, out.run.truth)
+        robot = outings.fresh(out.run, False)
+        tracks = outings.play(robot, (wheels, seen)).tracks(robot.state, out.run.truth)
         found = errors(started(tracks["live"]))
         assert found.rmse < 0.02
         assert np.hypot(*np.ptp(tracks["live"].pose[:, :2], axis=0)) > 1.0
