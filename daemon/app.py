@@ -44,8 +44,7 @@ from daemon.runtime.worker import ThreadWorker
 from daemon.snapshot import Snapshot, State, Thread
 from daemon.system.realtime import claim, line_up
 from daemon.system.sd_notify import notify
-from estimator.measurements import Command, Limits, Order, Record, no_lap
-from estimator.result import StepResult
+from estimator import Command, Limits, Order, Record, StepResult, no_lap
 from hal.adc import BusStuck, RawSamples
 from hal.lidar import Lidar, RawScan
 from hal.net.inputs import OnImu, OnOdometry
@@ -54,7 +53,7 @@ from hal.replay.recording import Kind
 
 if TYPE_CHECKING:
     from daemon.recording.recorder import Recorder
-    from estimator.state import State as Estimate
+    from estimator import State as Estimate
 
 __all__ = ["Daemon", "World"]
 
@@ -335,9 +334,9 @@ class _Estimator:
 
     def made(self, start: Start) -> Estimate:
         """A state as at a start in a stored map; may be called in another thread."""
-        from estimator import pipeline
+        import estimator
 
-        return new_state(self._lights, pipeline.Settings(), replace(start, localise=self.localise))
+        return new_state(self._lights, estimator.Settings(), replace(start, localise=self.localise))
 
     def take_over(self, switch: Switch) -> None:
         """Go on in another map."""
@@ -346,10 +345,10 @@ class _Estimator:
 
     def load(self) -> Step:
         """Load the estimator, and the map into it."""
-        from estimator import pipeline
+        import estimator
 
-        self.state = new_state(self._lights, pipeline.Settings(localise=self.localise), self.start)
-        self._step = partial(pipeline.step, self.state, lap=self.lap)
+        self.state = new_state(self._lights, estimator.Settings(localise=self.localise), self.start)
+        self._step = partial(estimator.step, self.state, lap=self.lap)
         return self._step
 
     def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:

@@ -22,15 +22,23 @@ from daemon.commissioning.teach_drive import Drive, heard, read_drive, rows_for
 from daemon.config.loader import ConfigError, refuse_overwriting
 from daemon.config.residual_file import ResidualError, write_residuals
 from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside, write_survey
-from estimator.calibration.calibrate import Calibrated, Estimate, TooLittle, calibrate
-from estimator.calibration.lamp_mapping import Heard, survey
-from estimator.calibration.observations import Rows
-from estimator.calibration.parameters import COMMONS, Common, Priors, placed
-from estimator.calibration.residual_map_fit import learn
-from estimator.calibration.survey_alignment import Unaligned, align
-from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator import Array, ResidualMap, Survey
+from estimator.calibration import (
+    COMMONS,
+    Calibrated,
+    Common,
+    Estimate,
+    Heard,
+    Priors,
+    Rows,
+    TooLittle,
+    Unaligned,
+    align,
+    calibrate_lamps,
+    learn,
+    placed,
+    survey,
+)
 from hal.errors import HalError
 
 SURVEY_OUT = Path("lights-calibrated.toml")
@@ -67,7 +75,7 @@ def _lights(args: argparse.Namespace, drive: Drive) -> int:
     if args.start:
         start[2] = math.radians(start[2])
     rows = rows_for(given, strengths, start)
-    found = calibrate(given, rows, FRAME, start)
+    found = calibrate_lamps(given, rows, FRAME, start)
     residuals = learn(found.survey, in_survey(found, found.rows))
     sys.stdout.write(report(found, residuals))
     write_survey(args.out, found.survey, notes(drive, found), remarks(found), force=args.force)

@@ -68,7 +68,7 @@ def _look_at_survey(settings: Config, profile: str | None, file: Path, wrong: li
     """Likewise of the survey; ``profile`` of its lamps, None: not known."""
     from daemon.config.survey_loader import SurveyError, read_survey
     from daemon.runtime.light_setup import read_residuals
-    from estimator.cdma.air_interface import PROFILES
+    from estimator import PROFILES
 
     path = Path(settings.lights.survey)
     try:

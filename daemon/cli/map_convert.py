@@ -21,13 +21,7 @@ from daemon.maps.map_server import BadMapServer, load
 from daemon.maps.png import encode_png
 from daemon.replay.results import Folder, OutputRefused, Trajectory, finest, map_yaml, pgm, tum
 from daemon.system.versions import release
-from estimator.mapping.floorplan_import import image_of_cells
-from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.live_grid import at_once
-from estimator.mapping.map_snapshot import Identity, MapImage, finished
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import Array
-from estimator.numerics import se2
+from estimator import Array, Grid, Identity, Keyframe, MapImage, Submap, at_once, finished, image_of_cells, se2
 
 
 def export(args: argparse.Namespace) -> int:

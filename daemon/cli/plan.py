@@ -22,7 +22,7 @@ from daemon.config.survey_schema import last_code
 from daemon.devices.photodiode import profile_of
 from daemon.replay.results import Folder, OutputRefused
 from daemon.system.extras import how_to_install
-from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator import Lamp, Receiver, Survey
 
 HEADROOM_M: Final = 0.2
 HIGHEST_M: Final = 30.0

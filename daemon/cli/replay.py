@@ -34,8 +34,7 @@ from daemon.replay.trajectories import Ledger
 from daemon.runtime import warmup
 from daemon.runtime.light_setup import Lights, SurveyError, from_header, load_lights, lost_residuals
 from daemon.system.versions import release, versions
-from estimator.mapping.map_snapshot import Identity
-from estimator.mapping.occupancy_grid import Grid
+from estimator import Grid, Identity
 from hal.errors import DataInvalid, HalError
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches

@@ -10,8 +10,7 @@ from daemon.cli.replay import Given
 from daemon.commissioning.fit_plot import draw_survey
 from daemon.commissioning.teach_drive import heard, read_drive
 from daemon.config.survey_loader import SurveyError, write_survey
-from estimator.calibration.calibrate import TooLittle
-from estimator.calibration.lamp_mapping import Surveyed, survey
+from estimator.calibration import Surveyed, TooLittle, survey
 from hal.errors import HalError
 
 

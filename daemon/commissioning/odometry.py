@@ -15,7 +15,7 @@ from daemon.commissioning.fit_plot import draw_wheels
 from daemon.commissioning.teach_drive import Drive, poses_at
 from daemon.config import loader
 from daemon.config.schema import Config
-from estimator.calibration.odometry_calibration import Wheel, WheelFit, fit_wheels, on_base
+from estimator.calibration import Wheel, WheelFit, fit_wheels, on_base
 from hal.errors import DataInvalid
 
 _ODOMETRY: Final = (Wheel.SCALE, Wheel.TURN, Wheel.DRIFT)

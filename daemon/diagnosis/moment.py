@@ -12,7 +12,7 @@ from daemon.integrity.motion_consistency import Told as Wheels
 from daemon.recording.recorder import CycleEntry
 from daemon.runtime.cycle import Cycle, CycleRecord
 from daemon.snapshot import Snapshot, State
-from estimator.result import StepResult
+from estimator import StepResult
 
 SECOND_S: Final = 1.0
 """A time without a fraction, as the journal writes it, is of all that came in this long."""

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from daemon.health.faults import Fault
-from estimator.cdma.epoch import UNUSABLE, BlockFlag
-from estimator.result import Fix, LightsResult, Link, LinkState
+from estimator import UNUSABLE, BlockFlag, Fix, LightsResult, Link, LinkState
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from estimator.measurements import Array, Odometry
-from estimator.numerics import se2
+from estimator import Array, Odometry, se2
 
 WINDOW_S: Final = 2.0
 """Long against stamp jitter, short against odometry drift."""

@@ -11,10 +11,23 @@ import numpy as np
 from daemon.health.reasons import Reason as Cause
 from daemon.integrity.evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
 from daemon.integrity.motion_consistency import Witnesses
-from estimator import result as light
-from estimator.measurements import Array, Command, LightEpoch, Odometry, Order, Record, SampleBlock
-from estimator.numerics import se2
-from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
+from estimator import (
+    SURPRISE,
+    Array,
+    Command,
+    Fix,
+    LightEpoch,
+    LightsResult,
+    LoopReason,
+    MatchResult,
+    Odometry,
+    Order,
+    Reason,
+    Record,
+    SampleBlock,
+    StepResult,
+    se2,
+)
 from hal.lidar import LidarStatus, Link
 
 ENOUGH_INLIERS: Final = 0.4
@@ -138,7 +151,7 @@ class Observer:
         remembered = self._remembered
         if result is None or result.loop is None or result.loop.reason is not LoopReason.PLACED or remembered is None:
             return False
-        from estimator.relocalisation.hypothesis_tracking import near  # the estimator has been loaded, by the warm-up
+        from estimator import near  # the estimator has been loaded, by the warm-up
 
         self._remembered = None
         T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
@@ -247,7 +260,7 @@ def _lit(result: StepResult) -> bool:
     return agrees and result.lights is not None and result.lights.fix is Fix.GOOD
 
 
-def _nearly(lights: light.LightsResult) -> bool:
+def _nearly(lights: LightsResult) -> bool:
     """Whether light has a place that it is not sure of yet, by several lamps and no vaguer than a pose may be."""
     spread = float(lights.covariance[0, 0] + lights.covariance[1, 1])
     return lights.fix is Fix.STARTING and len(lights.accepted) >= SEVERAL and spread < 2.0 * VAGUE_M**2
@@ -258,7 +271,7 @@ def _axes(known: Array) -> tuple[bool, bool, bool]:
     return bool(x), bool(y), bool(yaw)
 
 
-def _contradicts(lights: light.LightsResult) -> bool:
+def _contradicts(lights: LightsResult) -> bool:
     """Whether of the lamps more are received that cannot be so at the place light is held to have told, than fit it."""
     fitting = len(lights.accepted) + sum(link.waiting for link in lights.links)
     return sum(link.against for link in lights.links) > fitting

@@ -27,8 +27,7 @@ from hal.blocking_calls import beside
 from hal.clock import Clock
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
-    from estimator.mapping.map_snapshot import MapImage
-    from estimator.state import State
+    from estimator import MapImage, State
 
 log = logging.getLogger(__name__)
 
@@ -272,7 +271,7 @@ class Keeper:
         return self._map_id(), state.next_key, atlas.closures
 
     def _image(self, state: State) -> MapImage:
-        from estimator.mapping.map_snapshot import Identity, image_of
+        from estimator import Identity, image_of
 
         before = self._start.stored.meta if self._start is not None else None
         who = Identity(

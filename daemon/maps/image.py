@@ -11,12 +11,7 @@ import numpy.typing as npt
 
 from daemon.maps.container import AnyArray, Content, nothing, pack
 from daemon.maps.schema import Meta, Stored, Tables, lamp_tables, lamps_of
-from estimator.mapping.keyframe import Keyframe, Submap, Virtual
-from estimator.mapping.map_snapshot import Identity, MapImage, Piece, finished
-from estimator.mapping.submap import Settled
-from estimator.mapping.submap_graph import Constraints
-from estimator.measurements import Array
-from estimator.numerics import se2
+from estimator import Array, Constraints, Identity, Keyframe, MapImage, Piece, Settled, Submap, Virtual, finished, se2
 
 SLICE: Final = 16
 """Keyframes or submaps handled before others are let in."""

@@ -10,7 +10,7 @@ import struct
 import zlib
 from typing import Final
 
-from estimator.result import LoopReason, StepResult
+from estimator import LoopReason, StepResult
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from daemon.maps.store import Judge, Start, Store, said
 from hal.blocking_calls import beside
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
-    from estimator.state import State
+    from estimator import State
 
 log = logging.getLogger(__name__)
 
@@ -58,8 +58,7 @@ def take_over(state: State, donor: State) -> None:
 
     Answers to what was asked about the old map will mean nothing: job numbers go on counting.
     """
-    from estimator.commands import forget
-    from estimator.numerics import se2
+    from estimator import forget, se2
 
     forget(state)
     atlas = donor.atlas

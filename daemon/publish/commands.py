@@ -17,7 +17,7 @@ import numpy as np
 from daemon.publish.modbus.holding import CommandCode, Outcome, Request
 from daemon.snapshot import Snapshot
 from daemon.system.logging import Sparing
-from estimator.measurements import Command, Order
+from estimator import Command, Order
 from hal.clock import Clock
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from daemon.config.schema import Config, ModbusConfig
 from daemon.health.reasons import REASONS, Reason
 from daemon.publish.allow_list import Access
 from daemon.runtime.cycle import Sink
-from estimator.measurements import Command
+from estimator import Command
 from hal.clock import Clock
 from hal.imu import RawImu
 from hal.odometry import RawOdometry

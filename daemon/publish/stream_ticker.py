@@ -14,7 +14,7 @@ from daemon.runtime.cycle import Cycle
 from daemon.runtime.vitals import process_age_s, resident_mb
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
-    from estimator.state import State
+    from estimator import State
 
 BEAT_S: Final = 1.0
 

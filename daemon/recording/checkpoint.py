@@ -34,12 +34,7 @@ from daemon.recording.restore import (
     piece_of,
     weak_set,
 )
-from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.survey import Survey
-from estimator.mapping.keyframe import Keyframe, Submap
-from estimator.mapping.submap import Settled
-from estimator.mapping.submap_graph import Aside, Atlas
-from estimator.state import State
+from estimator import Aside, Atlas, Keyframe, ResidualMap, Settled, State, Submap, Survey
 
 PROTOCOL: Final = 5
 

@@ -23,13 +23,13 @@ from daemon.recording.disk_writer import CLOCK, SEGMENT_BYTES, SegmentWriter, bo
 from daemon.recording.replay_start import CYCLE_PARTS
 from daemon.recording.retention import ASKED, Begun, Flight, Told
 from daemon.runtime.cycle import Cycle, CycleRecord
-from estimator.measurements import Job
+from estimator import Job
 from hal.clock import Clock
 from hal.replay.recording import Kind, pack_frame
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from daemon.recording.checkpoint import Taken
-    from estimator.state import State
+    from estimator import State
 
 log = logging.getLogger(__name__)
 

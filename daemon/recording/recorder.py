@@ -29,8 +29,7 @@ from daemon.runtime.light_setup import RESIDUALS, Lights
 from daemon.snapshot import Snapshot
 from daemon.system.atomic_file import write_whole
 from daemon.system.versions import versions
-from estimator.measurements import UNLIMITED, Array, Command, Limits, Order
-from estimator.result import StepResult
+from estimator import UNLIMITED, Array, Command, Limits, Order, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
 from hal.imu import RawImu

@@ -15,8 +15,7 @@ from hal.replay.text import unreadable
 if TYPE_CHECKING:  # loads the estimator
     from daemon.recording.restore import Piece
     from daemon.runtime.cycle import Cycle
-    from estimator.measurements import Job
-    from estimator.state import State
+    from estimator import Job, State
 
 
 CYCLE_PARTS: Final = (

@@ -19,8 +19,7 @@ from daemon.maps import map_drawing
 from daemon.maps.map_server import FREE, OCCUPIED
 from daemon.maps.png import encode_png
 from daemon.snapshot import GUESSED, State
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import Array
+from estimator import Array, Grid
 
 RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
 """Metres per cell of an exported map."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+import estimator
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge, ScanBridge
 from daemon.devices.photodiode import BlockWatch
@@ -31,11 +32,7 @@ from daemon.runtime.cycle import Cycle, CycleRecord, Parts
 from daemon.runtime.light_setup import Lights, begun, new_state
 from daemon.runtime.vitals import vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
-from estimator import pipeline
-from estimator.mapping.map_snapshot import Identity, MapImage, image_of
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import UNLIMITED, Array, Limits, Order, Record
-from estimator.result import StepResult
+from estimator import UNLIMITED, Array, Grid, Identity, Limits, MapImage, Order, Record, StepResult, image_of
 from hal.adc import AdcStatus, RawSamples
 from hal.imu import RawImu
 from hal.lidar import Link, RawScan
@@ -43,7 +40,7 @@ from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
     from daemon.replay.match_journal import MatchJournal
-    from estimator.state import State
+    from estimator import State
 
 
 class ReplayClock:
@@ -131,7 +128,7 @@ class Rerun:
         self._source = source
         self._clock = ReplayClock()
         self._lights, self._localise = lights, config.map.localise
-        settings = pipeline.Settings(history=True, localise=config.map.localise)
+        settings = estimator.Settings(history=True, localise=config.map.localise)
         self._state = begun(lights, settings, start) if begin is None else begin.keep_history()
         self._journal = journal
         if journal is not None:
@@ -214,11 +211,11 @@ class Rerun:
 
     def finish(self) -> None:
         """The log has ended: poses take the places their anchors have now."""
-        self.ledger.settle(pipeline.keyframe_poses(self._state))
+        self.ledger.settle(estimator.keyframe_poses(self._state))
 
     def render(self) -> Grid:
         """The map at the finest resolution that its extent allows."""
-        return finest(partial(pipeline.render_map, self._state))
+        return finest(partial(estimator.render_map, self._state))
 
     def image(self, identity: Identity) -> MapImage:
         """The map as it is kept on a disk."""
@@ -274,8 +271,10 @@ class Rerun:
             start = recorded_start(path, sha256, self._lights, self._localise)
         except (OSError, BadMap) as error:
             raise LookupError(f"{path.name}, the map that the run went on in, cannot be used: {error}") from error
-        self.ledger.settle(pipeline.keyframe_poses(self._state))
-        take_over(self._state, new_state(self._lights, pipeline.Settings(history=True, localise=self._localise), start))
+        self.ledger.settle(estimator.keyframe_poses(self._state))
+        take_over(
+            self._state, new_state(self._lights, estimator.Settings(history=True, localise=self._localise), start)
+        )
         return start.stored.meta.map_id, sha256
 
     def _compare(self, entry: CycleEntry, record: CycleRecord) -> None:
@@ -311,9 +310,9 @@ class Rerun:
         if self._journal is not None:
             self._journal.begins(self.t_first)
         if any(getattr(record, "order", None) is Order.RESET for record in records):
-            self.ledger.settle(pipeline.keyframe_poses(self._state))
+            self.ledger.settle(estimator.keyframe_poses(self._state))
         begun = time.perf_counter()
-        result = pipeline.step(self._state, records, limits)
+        result = estimator.step(self._state, records, limits)
         self.timing.steps.append(time.perf_counter() - begun)
         return result
 

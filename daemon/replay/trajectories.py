@@ -12,9 +12,7 @@ import numpy as np
 
 from daemon.replay.results import Trajectory
 from daemon.runtime.cycle import CycleRecord
-from estimator.measurements import Array
-from estimator.numerics import se2
-from estimator.result import Loop, StepResult
+from estimator import Array, Loop, StepResult, se2
 
 _FIELDS: Final = 12
 _STAMP, _ANCHOR, _STATE = 0, 1, 11

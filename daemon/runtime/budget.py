@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 from daemon.runtime.degradation import Ladder
-from estimator.measurements import UNLIMITED, Limits, Rung
-from estimator.result import StepResult
+from estimator import UNLIMITED, Limits, Rung, StepResult
 
 ENOUGH_ITERATIONS: Final = 12
 """Iterations that a match hardly ever exceeds: more are cut first, for they are those of a second opinion; where these

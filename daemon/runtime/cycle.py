@@ -35,8 +35,7 @@ from daemon.runtime.stage_times import Laps, PulseTaker
 from daemon.runtime.worker import Worker
 from daemon.snapshot import Condition, Snapshot, Trust
 from daemon.system.logging import of_state
-from estimator.measurements import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
-from estimator.result import Fix, StepResult
+from estimator import Answer, Command, Fix, LightEpoch, Limits, Order, Record, Rung, SampleBlock, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
 from hal.lidar import LidarStatus, Link

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from estimator.measurements import Rung
+from estimator import Rung
 
 PATIENCE: Final = 20
 """Cycles in a row that must fit a better rung before it is taken."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from daemon.integrity.arrival_monitor import Arrivals
-from estimator.measurements import Command
+from estimator import Command
 from hal.adc import RawSamples
 from hal.imu import RawImu
 from hal.lidar import RawScan

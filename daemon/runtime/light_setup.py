@@ -19,14 +19,11 @@ from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside
 from daemon.devices.photodiode import profile_of
 from daemon.maps.container import Damaged
-from estimator.cdma.air_interface import PROFILES, Profile
-from estimator.light_filter.survey import Survey
+from estimator import PROFILES, Profile, Survey
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from daemon.maps.store import Start
-    from estimator.light_filter.light_channel import LightsSetup
-    from estimator.light_filter.residual_map import ResidualMap
-    from estimator.pipeline import Settings, State
+    from estimator import LightsSetup, ResidualMap, Settings, State
 
 log = logging.getLogger(__name__)
 
@@ -153,19 +150,19 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     Raises:
         CannotBegin: the map is at fault. ValueError: the survey or the stored sample clock is.
     """
-    from estimator import pipeline
+    import estimator
 
     setup = None if lights is None else _setup(lights)
     if start is None:
-        return pipeline.new_state(settings, setup)
+        return estimator.new_state(settings, setup)
     from daemon.maps.image import image_from
-    from estimator.mapping.map_snapshot import restored
+    from estimator import restored
 
-    settings = replace(settings or pipeline.Settings(), localise=start.localise)
+    settings = replace(settings or estimator.Settings(), localise=start.localise)
     try:
         return restored(image_from(start.stored, start.changed), settings, setup)
     except Exception as error:  # what no check has foreseen must not end this start, and the next, and the next
-        pipeline.new_state(settings, setup)  # what is wrong without a map too is not the map's fault
+        estimator.new_state(settings, setup)  # what is wrong without a map too is not the map's fault
         if isinstance(error, MemoryError):
             raise
         raise CannotBegin(f"it passes every check, but cannot be made into a state: {error!r}") from error
@@ -181,7 +178,7 @@ def begun(lights: Lights | None, settings: Settings, start: Start | None) -> Sta
 
 
 def _setup(lights: Lights) -> LightsSetup:
-    from estimator.light_filter.light_channel import LightsSetup
+    from estimator import LightsSetup
 
     return LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights))
 

@@ -11,10 +11,8 @@ import numpy as np
 from daemon.integrity.state_memory import Memory
 from daemon.publish.modbus.lights_block import ROWS
 from daemon.snapshot import Condition, LightFix, LightLink, LightPicture, LinkUse, LoopReason, Pulse, Snapshot, Trust
-from estimator.measurements import Array
-from estimator.numerics import se2
-from estimator.result import Fix, Link, LinkState, Loop, StepResult
-from estimator.result import LoopReason as Why
+from estimator import Array, Fix, Link, LinkState, Loop, StepResult, se2
+from estimator import LoopReason as Why
 
 Triple = tuple[float, float, float]
 
@@ -155,7 +153,7 @@ def _pose(result: StepResult) -> Triple:
 
 def _aged(result: StepResult, facts: Facts) -> Array:
     """The covariance now: a robot that nothing has told of since may have moved, as the next step will reckon."""
-    from estimator.fusion.motion_model import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN  # loaded by the warm-up
+    from estimator import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN  # loaded by the warm-up
 
     unseen = facts.t_mono - result.t_mono - LONGEST_CARRY_S
     if unseen <= 0.0:

@@ -8,7 +8,7 @@ from typing import Final
 
 from daemon.runtime.histogram import HALF_S, Histogram
 from daemon.snapshot import Pulse, Stage
-from estimator.measurements import Rung
+from estimator import Rung
 
 NAMES: Final = {stage.name.lower(): stage for stage in Stage}
 REFRESH_S: Final = 1.0

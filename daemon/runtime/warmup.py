@@ -138,7 +138,7 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
 
 def _import(module: str) -> None:
     """Import a module of kernels that no daemon loads."""
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     with KernelLock(CACHE_DIR) as lock, before_compiling(lock.take):
         import_module(module)
@@ -165,14 +165,14 @@ def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
 
 
 def _compiled() -> set[Path]:
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     return set(CACHE_DIR.rglob("*.nbc"))
 
 
 def mark_of(what: str) -> Path:
     """The file that says that an earlier start has compiled all that this one needs."""
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
     # processor: a disk may be put into another computer
@@ -209,7 +209,7 @@ def is_warm(lights: bool) -> bool:
 
 
 def _load(begun: float, lights: Lights | None) -> Warmth:
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     what = _what(lights is not None)
     with KernelLock(CACHE_DIR) as lock:
@@ -265,8 +265,7 @@ def _exercise() -> None:
     """Two steps with a small scan: what is imported or allocated on first use is so before the first real cycle."""
     import numpy as np
 
-    from estimator.measurements import UNLIMITED, Scan
-    from estimator.pipeline import new_state, step
+    from estimator import UNLIMITED, Scan, new_state, step
 
     state = new_state()
     bearing = np.linspace(-2.0, 2.0, 100)
@@ -281,9 +280,7 @@ def _exercise_lights(lights: Lights) -> float:
     import numpy as np
 
     from daemon.runtime.light_setup import new_state
-    from estimator.cdma.decoder import decode, new_decoder, search
-    from estimator.measurements import UNLIMITED, SampleBlock
-    from estimator.pipeline import step
+    from estimator import UNLIMITED, SampleBlock, decode, new_decoder, search, step
 
     profile, state = lights.profile, new_state(lights)
     words = np.round(2000.0 + 500.0 * np.sin(0.9 * np.arange(round(profile.epoch_s * profile.sample_rate)) ** 1.1))

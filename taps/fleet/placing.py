@@ -24,8 +24,7 @@ from daemon.maps.edit import keep
 from daemon.maps.schema import read
 from daemon.maps.store import Store
 from daemon.system.atomic_file import reason_of, write_whole
-from estimator.cdma.air_interface import PROFILES, Profile
-from estimator.light_filter.survey import Survey
+from estimator import PROFILES, Profile, Survey
 from taps.fleet.messages import SCHEMA, Held, printable
 
 SURVEY, MAP = "survey", "map"

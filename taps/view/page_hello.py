@@ -12,7 +12,7 @@ from daemon.publish import meanings
 from daemon.publish.modbus.timing_block import RUNGS
 from daemon.runtime.light_setup import load_lights
 from daemon.snapshot import Stage
-from estimator.light_filter.survey import Survey
+from estimator import Survey
 from taps.view.orders import NAMES
 
 PROTOCOL: Final = 1
