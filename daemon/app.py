@@ -20,6 +20,7 @@ import numpy as np
 from daemon.config.paths import state_folder
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge, ScanBridge
+from daemon.devices.light_setup import Lights, load_lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.devices.port_tap import tapped
 from daemon.environment import NoLidar, World
@@ -28,15 +29,16 @@ from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
 from daemon.health.thread_watch import COMPUTING_S, DISK_S, Answers
 from daemon.maps.autosave import About, Keeper
+from daemon.maps.initial_state import CannotBegin, new_state
 from daemon.maps.last_pose import LastPose
 from daemon.maps.schema import digest_of
 from daemon.maps.store import NoMap, Start, judge_for
 from daemon.maps.switching import Maps, MapSwitch, Switch, take_over
-from daemon.publish.network import Feeds, Network
+from daemon.publish.feeds import Feeds
+from daemon.publish.network import Network
 from daemon.publish.stream_ticker import StreamBeat
 from daemon.runtime.cycle import Cycle, Parts, Step
 from daemon.runtime.heartbeat import Heartbeat
-from daemon.runtime.light_setup import CannotBegin, Lights, load_lights, new_state
 from daemon.runtime.scheduler import Pacemaker
 from daemon.runtime.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.runtime.warmup import Warmth

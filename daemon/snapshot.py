@@ -151,6 +151,10 @@ class Condition:
 NO_CONDITION: Final = Condition()
 
 
+LISTED_LINKS: Final = 16
+"""Links that a snapshot lists, the strongest."""
+
+
 @dataclass(frozen=True, slots=True)
 class LightLink:
     """One lamp in view.

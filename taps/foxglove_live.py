@@ -13,13 +13,13 @@ from typing import Final
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
-from daemon.cli import parser
 from daemon.config.endpoints import in_url, parse_endpoint
+from daemon.publish.stream_client import Stream
+from daemon.publish.stream_messages import NotTheStream
+from daemon.system import console
 from hal.run_server import work_until_told
 from taps.ros import types
 from taps.ros.messages import TOPICS, Out
-from taps.stream.client import Stream
-from taps.stream.messages import NotTheStream
 from taps.stream.ros_follower import follow
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
@@ -31,18 +31,18 @@ def main(args: argparse.Namespace) -> int:
         host, port = parse_endpoint(args.listen)
         bridge = Bridge(host, port, args.settings.name)
     except ValueError as error:
-        return parser.fail(f"--listen: {error}", parser.USAGE)
+        return console.fail(f"--listen: {error}", console.USAGE)
     except (OSError, RuntimeError) as error:
-        return parser.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
-    parser.say(f"ws://{in_url(host)}:{bridge.port}")
+        return console.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
+    console.say(f"ws://{in_url(host)}:{bridge.port}")
     try:
         stream = Stream(args.stream or args.settings.name, WANTED)
         asyncio.run(work_until_told(follow(stream, args.settings, bridge)))
     except NotTheStream as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     finally:
         bridge.close()
-    return parser.OK
+    return console.OK
 
 
 class Bridge(ServerListener):

@@ -19,8 +19,8 @@ from typing import Any, Final, Protocol
 
 import zenoh
 
-from daemon.cli import parser
 from daemon.config.endpoints import in_url, parse_endpoint
+from daemon.system import console
 from hal.blocking_calls import beside
 
 LEASE_S: Final = 5.0
@@ -114,7 +114,7 @@ def words(error: Exception) -> str:
 
 
 @contextlib.asynccontextmanager
-async def joined(router: str, file: Path | None = None, say: Say = parser.say) -> AsyncIterator[zenoh.Session]:
+async def joined(router: str, file: Path | None = None, say: Say = console.say) -> AsyncIterator[zenoh.Session]:
     """A session with a router, as soon as there is one.
 
     Raises:
@@ -141,7 +141,7 @@ async def joined(router: str, file: Path | None = None, say: Say = parser.say) -
                 await beside(session.close, "zenoh")
 
 
-async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = parser.say) -> None:
+async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = console.say) -> None:
     """Say when the router goes and when it is back, until cancelled; ``on_router`` is told, and at first."""
     there = True
     on_router(True)

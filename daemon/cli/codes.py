@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from daemon.cli.parser import OK, USAGE, fail
+from daemon.system.console import OK, USAGE, fail
 from estimator import PROFILES, Profile, gold_codes
 
 Row = tuple[int, str, str]

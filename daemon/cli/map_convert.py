@@ -6,22 +6,22 @@ import argparse
 import secrets
 import sys
 import time
-from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
-from daemon.cli import parser
 from daemon.maps.carmen import carmen
 from daemon.maps.container import BadMap
 from daemon.maps.edit import LONGEST_NAME, Refused, called, keep, opened, put
+from daemon.maps.grid_files import map_yaml, pgm
 from daemon.maps.image import image_from, meta_of, packed
+from daemon.maps.image_geometry import grid_of, lamps_of, placed
 from daemon.maps.map_drawing import draw
 from daemon.maps.map_server import BadMapServer, load
 from daemon.maps.png import encode_png
-from daemon.replay.results import Folder, OutputRefused, Trajectory, finest, map_yaml, pgm, tum
+from daemon.replay.results import Folder, OutputRefused, Trajectory, tum
+from daemon.system import console
 from daemon.system.versions import release
-from estimator import Array, Grid, Identity, Keyframe, MapImage, Submap, at_once, finished, image_of_cells, se2
+from estimator import Identity, image_of_cells
 
 
 def export(args: argparse.Namespace) -> int:
@@ -46,9 +46,9 @@ def export(args: argparse.Namespace) -> int:
             folder.write("keyframes.clf", carmen(scans))
             written.append("keyframes.clf")
     except (BadMap, OutputRefused, OSError) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     sys.stdout.write(f"{args.out}: {', '.join(written)}\n")
-    return parser.OK
+    return console.OK
 
 
 def render(args: argparse.Namespace) -> int:
@@ -58,9 +58,9 @@ def render(args: argparse.Namespace) -> int:
         pixels = draw(grid_of(image), np.zeros((0, 3)), lamps_of(image))
         Folder(args.out.parent).write(args.out.name, encode_png(pixels))
     except (BadMap, OutputRefused, OSError) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     sys.stdout.write(f"{args.out}: {pixels.shape[1]} x {pixels.shape[0]} pixels\n")
-    return parser.OK
+    return console.OK
 
 
 def take_in(args: argparse.Namespace) -> int:
@@ -74,38 +74,9 @@ def take_in(args: argparse.Namespace) -> int:
         content = packed(image, meta_of(image, time.time(), "", release()))
         path = keep(args.settings, content, identity.map_id) if args.out is None else put(args.out, content)
     except (BadMapServer, BadMap, Refused, OSError) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except ValueError as error:
-        return parser.fail(f"{args.yaml}: {error}")
+        return console.fail(f"{args.yaml}: {error}")
     wide, tall = cells.shape[1] * described.resolution, cells.shape[0] * described.resolution
     sys.stdout.write(f"{path}: map {identity.map_id:08x} of {wide:.1f} x {tall:.1f} m, {len(image.submaps)} submaps\n")
-    return parser.OK
-
-
-def placed(image: MapImage) -> list[tuple[Keyframe, Array]]:
-    """Keyframes with T_map_keyframe, by number."""
-    places = {piece.key: piece.T_map_submap for piece in image.submaps}
-    found = [(hung.frame, se2.compose(places[hung.submap], hung.T_submap_keyframe)) for hung in image.keyframes()]
-    return sorted(found, key=lambda one: one[0].key)
-
-
-def pieces_of(image: MapImage) -> Iterator[tuple[Submap, list[Keyframe]]]:
-    """Submaps, oldest first, with what hangs on each."""
-    hung: dict[int, list[Keyframe]] = {}
-    for one in image.keyframes():
-        hung.setdefault(one.submap, []).append(one.frame)
-    for piece in image.submaps:
-        if piece.key in hung:
-            yield Submap(*piece), hung[piece.key]
-
-
-def grid_of(image: MapImage) -> Grid:
-    """The map at the finest resolution that its extent allows."""
-    return finest(partial(at_once, list(pieces_of(finished(image)))))
-
-
-def lamps_of(image: MapImage) -> Array | None:
-    """(k, 2) places of the lamps; None where the map does not lie in their frame."""
-    if not image.identity.surveyed or not image.lamps:
-        return None
-    return np.array([(lamp.x, lamp.y) for lamp in image.lamps])
+    return console.OK

@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from daemon.cli import parser, replay
+from daemon.cli import replay
 from daemon.maps.container import MAGIC
-from daemon.replay.results import Folder, map_files
+from daemon.maps.grid_files import map_files
+from daemon.replay import log_replay
+from daemon.replay.results import Folder
+from daemon.system import console
 
 
 def main(args: argparse.Namespace) -> int:
@@ -17,7 +20,7 @@ def main(args: argparse.Namespace) -> int:
 
         return map_convert.export(args)
     if args.tum or args.carmen:
-        return parser.fail(
+        return console.fail(
             f"{args.log}: --tum and --carmen are of map files; `lumiloop replay` writes a log's trajectory"
         )
     return replay.command(args, _write)
@@ -32,6 +35,6 @@ def is_map(path: Path) -> bool:
         return path.suffix == ".lumimap"
 
 
-def _write(folder: Folder, outcome: replay.Outcome) -> None:
+def _write(folder: Folder, outcome: log_replay.Outcome) -> None:
     rerun = outcome.rerun
     folder.write_each(map_files(rerun.render(), rerun.ledger.final().poses, rerun.lamps()))

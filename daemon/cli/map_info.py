@@ -12,20 +12,20 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daemon.cli import parser
 from daemon.maps.container import BadMap
 from daemon.maps.schema import Stored, read, summary
 from daemon.maps.store import said
+from daemon.system import console
 
 
 def info(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     stored = _read(args.map)
     if isinstance(stored, str):
-        return parser.fail(stored)
+        return console.fail(stored)
     found = {"file": str(args.map), "bytes": args.map.stat().st_size, **summary(stored)}
     sys.stdout.write(json.dumps(found, indent=2) + "\n" if args.json else _table(found))
-    return parser.OK
+    return console.OK
 
 
 def verify(args: argparse.Namespace) -> int:
@@ -35,11 +35,11 @@ def verify(args: argparse.Namespace) -> int:
         stored = _read(path)
         if isinstance(stored, str):
             bad += 1
-            parser.say(stored)
+            console.say(stored)
         else:
             torn = f", {stored.isolated} submaps joined with the rest by nothing" if stored.isolated else ""
             sys.stdout.write(f"{path}: good, map {stored.meta.map_id:08x}{torn}\n")
-    return parser.FAILED if bad else parser.OK
+    return console.FAILED if bad else console.OK
 
 
 def _read(path: Path) -> Stored | str:

@@ -8,20 +8,17 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
-OK: Final = 0
-FAILED: Final = 1
-USAGE: Final = 2
-INTERRUPTED: Final = 130
+from daemon.cli import tap_parsers
+from daemon.cli.command_body import Body, config_arguments, estimating, later, loaded
+from daemon.system.console import INTERRUPTED, OK, USAGE, fail
+
 LONGEST_RING: Final = 1440.0
 """Minutes; whoever wants more keeps all of it."""
 PICTURES: Final = (".png", ".svg", ".pdf")
 """Endings of files that can be drawn."""
-
-Body = Callable[[argparse.Namespace], int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,18 +38,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return OK
 
 
-def fail(message: str, code: int = FAILED) -> int:
-    """Say on stderr what went wrong and return the exit code."""
-    sys.stderr.write(f"lumiloop: {message}\n")
-    return code
-
-
-def say(text: str) -> None:
-    """One line on stderr, at once."""
-    sys.stderr.write(f"lumiloop: {text}\n")
-    sys.stderr.flush()
-
-
 def parser() -> argparse.ArgumentParser:
     """Every command with its options; ``body`` of what it parses is the :data:`Body` to run."""
     parser = argparse.ArgumentParser(
@@ -64,8 +49,6 @@ def parser() -> argparse.ArgumentParser:
     _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
     _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
     _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
-    from daemon.cli import tap_parsers
-
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
@@ -89,14 +72,6 @@ def _print_option(parser: argparse.ArgumentParser, flag: str, text: Callable[[],
         return OK
 
     parser.add_argument(flag, action="store_const", const=body, dest="body", help=f"print {what}")
-
-
-def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
-    """The options of every command that reads the configuration; see :func:`configured`."""
-    if file:
-        parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
-    parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
 
 
 def _run(parser: argparse.ArgumentParser) -> None:
@@ -239,7 +214,7 @@ def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
             metavar="FILE",
             help="default: beside FILE, as the newest; the daemon there has to be stopped",
         )
-        parser.set_defaults(body=loaded("daemon.maps.edit", verb))
+        parser.set_defaults(body=loaded("daemon.cli.map_edit", verb))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:
@@ -276,57 +251,6 @@ def _codes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
     parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
     parser.set_defaults(body=loaded("daemon.cli.codes", "main"))
-
-
-def later(module: str, name: str) -> Body:
-    """A body that resolves the configuration (``args.settings``, a `Config`) and then loads its module."""
-    return configured(loaded(module, name))
-
-
-def estimating(module: str, name: str, what: str = "warm") -> Body:
-    """As `later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
-
-    def body(args: argparse.Namespace) -> int:
-        from daemon.runtime import warmup
-
-        try:
-            warmup.load_aloud(say, what, warmup.load, module)
-        except warmup.CannotLoad as error:
-            return fail(str(error))
-        return loaded(module, name)(args)
-
-    return configured(body)
-
-
-def loaded(module: str, name: str) -> Body:
-    """A body that loads its module when it runs."""
-
-    def body(args: argparse.Namespace) -> int:
-        run: Body = getattr(import_module(module), name)
-        return run(args)
-
-    return body
-
-
-def configured(body: Body) -> Body:
-    """A body that is run with the resolved configuration as ``args.settings``."""
-
-    def resolve_and_run(args: argparse.Namespace) -> int:
-        from daemon.config import loader
-
-        overrides = list(args.set)
-        if getattr(args, "lidar", None):
-            overrides.append(f"lidar.device={args.lidar}")
-        try:
-            args.settings = loader.load(args.config, overrides)
-        except loader.ConfigError as error:
-            return fail(str(error), USAGE)
-        if args.print_config:
-            sys.stdout.write(loader.dump(args.settings))
-            return OK
-        return body(args)
-
-    return resolve_and_run
 
 
 def _version() -> str:

@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.app import EXTEND_US, Daemon
-from daemon.cli.parser import FAILED, OK, USAGE
 from daemon.config import loader
 from daemon.config.paths import maps_folder, runtime_folder, streams_served
 from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError
+from daemon.devices.light_setup import load_lights
 from daemon.devices.sample_clock import SampleClock
 from daemon.environment import World
 from daemon.maps.store import NoMap, started
-from daemon.runtime.light_setup import SurveyError, load_lights
 from daemon.runtime.stall_watch import StallWatch
 from daemon.runtime.warmup import CannotLoad, warm_up
+from daemon.system.console import FAILED, OK, USAGE
 from daemon.system.logging import start_log
 from daemon.system.realtime import give_back
 from daemon.system.sd_notify import managed, notify

@@ -23,7 +23,7 @@ from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import U16, Value
 from daemon.publish.modbus.requests import BLOCKS
 from daemon.publish.port_owner import Whose, whose
-from daemon.snapshot import GUESSED, LightFix, LinkUse, Stage, State
+from daemon.snapshot import GUESSED, LISTED_LINKS, LightFix, LinkUse, Stage, State
 
 if TYPE_CHECKING:
     from daemon.config.schema import Config
@@ -258,7 +258,7 @@ def _fix(reading: Reading) -> str | None:
 
 def _links(reading: Reading) -> Iterator[dict[str, Any]]:
     """Every link in view, strongest first."""
-    for row in range(1, lights_block.ROWS + 1):
+    for row in range(1, LISTED_LINKS + 1):
         if (code := reading[f"link_{row}_code"]) is not None:
             link = {name: reading[f"link_{row}_{name}"] for name in ("lamp", "use", "strength", "residual")}
             yield {"code": code, **link, "use": _name(LinkUse, link["use"])}

@@ -18,18 +18,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.cli import parser
-from daemon.cli.replay import NOTHING_GIVEN, config_for, lights_for, start_for
 from daemon.config.paths import SERVICE_STATE, recordings_folder
 from daemon.config.schema import Config
 from daemon.diagnosis import moment, moment_plot, moment_report
 from daemon.diagnosis import utc as diagnosis_utc
 from daemon.diagnosis.moment import Moment, chosen
+from daemon.replay.recorded_inputs import NOTHING_GIVEN, config_for, lights_for, start_for
 from daemon.replay.results import Folder, OutputRefused
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import RecordingSource, Turn
 from daemon.runtime import warmup
 from daemon.runtime.cycle import CycleRecord
+from daemon.system import console
 from daemon.system.extras import how_to_install
 from daemon.system.versions import made_elsewhere
 from hal.errors import DataInvalid, DeviceMissing, HalError
@@ -83,7 +83,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         if args.log is None and not _is_folder(folder):
             looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
-            return parser.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
+            return console.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
         span, utc, wide = find(spans(folder), args.time, folder)
         if args.out is not None:
             _try(args.out)
@@ -91,14 +91,14 @@ def main(args: argparse.Namespace) -> int:
         second = whole_second(args.time)
         sys.stdout.write(moment_report.report(told, utc, span.path.name, wide, second, span.remarks))
         if rerun.comparison.differ:
-            parser.say(
+            console.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
             )
         if args.out is not None:
             _draw(args.out, told, max(utc, told[chosen(told, utc, second, wide).cycle].utc), rerun)
     except (HalError, NoMoment, OutputRefused, warmup.CannotLoad) as error:
-        return parser.fail(str(error))
-    return parser.OK
+        return console.fail(str(error))
+    return console.OK
 
 
 def _try(out: Path) -> None:
@@ -132,7 +132,7 @@ def spans(folder: Path) -> list[Span]:
         except (DataInvalid, DeviceMissing) as error:  # a ring that is being written loses segments meanwhile
             if len(runs) == 1:
                 raise
-            parser.say(f"{error}: passed over")
+            console.say(f"{error}: passed over")
     return found
 
 
@@ -298,7 +298,7 @@ def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:
     config = config_for(source, Config(), NOTHING_GIVEN)
     lights = lights_for(source, config, NOTHING_GIVEN)
     if lights is not None:
-        warmup.load_aloud(parser.say, "warm-lights", partial(warmup.load, lights))
+        warmup.load_aloud(console.say, "warm-lights", partial(warmup.load, lights))
     rerun = Rerun(source, config, lights, None, start_for(source, config, lights, NOTHING_GIVEN))
     records: list[CycleRecord] = []
     rerun.watch = records.append
@@ -313,7 +313,7 @@ def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:
             if event.t_mono > t_mono + AFTER_S:
                 break
             if time.monotonic() - shown > 5.0:
-                parser.say(f"replaying, {max(0.0, t_mono - event.t_mono):.0f} s before it")
+                console.say(f"replaying, {max(0.0, t_mono - event.t_mono):.0f} s before it")
                 shown = time.monotonic()
     rerun.finish()
     if not told or math.isinf(told[0].utc):

@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.cli.replay import Given, config_for, lights_for
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge
+from daemon.replay.recorded_inputs import Given, config_for, lights_for
 from daemon.replay.results import Trajectory
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import Source, open_log

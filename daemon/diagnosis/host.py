@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Final
 
 from daemon.health.faults import Fault
+from daemon.publish.stream_client import Stream
+from daemon.publish.stream_messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
 from daemon.snapshot import LinkUse
 from hal.bus import i2c_linux
 from hal.hokuyo import discover
 from hal.photodiode.probe import BusFinding, probe_bus
 from hal.port.opening import open_bus, open_port
 from hal.probe import Finding, identify_at
-from taps.stream.client import Stream
-from taps.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
 
 LISTEN_S: Final = 3.0
 LISTENERS: Final = "lumiloop-stream"

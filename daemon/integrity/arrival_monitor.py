@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-SILENT_S: Final = 1.0
-"""Between two readings: what came before says nothing of now."""
+ODOMETRY_SILENT_S: Final = 1.0
+"""Odometry that has not arrived for this long is silent."""
 WINDOW_S: Final = 2.0
 ENOUGH: Final = 20
 """Readings that a rate is judged by."""
@@ -35,7 +35,7 @@ class Arrivals:
 
     def take(self, t_rx: float) -> None:
         """A reading has arrived; what came before a silence says nothing of the rate now."""
-        if self._at and t_rx - self._at[-1] > SILENT_S:
+        if self._at and t_rx - self._at[-1] > ODOMETRY_SILENT_S:
             self._at.clear()
         self._at.append(t_rx)
 

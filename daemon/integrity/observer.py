@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from daemon.health.reasons import Reason as Cause
+from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.integrity.evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
 from daemon.integrity.motion_consistency import Witnesses
 from estimator import (
@@ -34,8 +35,6 @@ ENOUGH_INLIERS: Final = 0.4
 """Part of the beams that has to find its place in the map for a match to count as good."""
 OPENING_S: Final = 10.0
 """A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
-ODOMETRY_SILENT_S: Final = 1.0
-"""Odometry that has not arrived for this long is silent."""
 LIGHT_SILENT_S: Final = 1.0
 """Samples that have not arrived for this long are missing; blocks come twenty times a second."""
 GUESS_S: Final = 0.5

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final
 from daemon.maps.container import BadMap
 from daemon.maps.start_trial import PROOF_S
 from daemon.maps.store import Start, Store, said
+from daemon.system.callbacks import OnDone
 from daemon.system.versions import release
 from hal.blocking_calls import beside
 from hal.clock import Clock
@@ -51,8 +52,6 @@ FIXED: Final = "the map is used as it is: `map.localise` is true"
 ADRIFT: Final = "the place in the stored map is not known yet, and the map has not changed"
 
 Revision = tuple[int, int, int]
-Told = Callable[[str], None]
-"""Takes the end of a save that was asked for: :data:`DONE`, or why it came to nothing."""
 End = Callable[[Path | None, str], None]
 """Takes the end of a save in the loop's thread: the file, or None and why there is none."""
 
@@ -99,7 +98,7 @@ class Keeper:
         self._proved_at, self._lasted = math.inf, False
         self._due = clock.now() + FIRST_S
         self._look_due = clock.now() + LOOK_S
-        self._waiting: list[Told] = []
+        self._waiting: list[OnDone] = []
         self._over = asyncio.Event()
         self._over.set()
 
@@ -140,12 +139,12 @@ class Keeper:
         if state is not None and self._start is not None:
             self._saved = self._revision(state)
 
-    def ask(self, told: Told) -> None:
+    def ask(self, on_done: OnDone) -> None:
         """Save as soon as possible, and say when it is on the disk, or why not."""
         if reason := self._against():
-            told(reason)
+            on_done(reason)
             return
-        self._waiting.append(told)
+        self._waiting.append(on_done)
         self._go_on()
 
     def _against(self) -> str:
@@ -304,7 +303,7 @@ class Keeper:
         meta = meta_of(image, self._clock.utc(), self._about.robot, release())
         return packed(image, meta, partial(time.sleep, BREATH_S))
 
-    def _end(self, revision: Revision, waiting: list[Told], path: Path | None, error: str) -> None:
+    def _end(self, revision: Revision, waiting: list[OnDone], path: Path | None, error: str) -> None:
         """Back in the loop's thread."""
         self._busy(False)
         self._due = self._clock.now() + (RETRY_S if error else EVERY_S)
@@ -320,8 +319,8 @@ class Keeper:
             again = "" if self._last else ", and it is tried again"
             log.info("the map cannot be saved: %s; what was saved before stays%s", error, again)  # the fault warns
         self.error = error
-        for told in waiting:
-            told(error)
+        for on_done in waiting:
+            on_done(error)
         if self._waiting:
             self._go_on()
 

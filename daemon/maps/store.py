@@ -33,7 +33,7 @@ from daemon.maps.start_trial import LEFT_OUT, MOST, Trial
 from daemon.system.atomic_file import sync_folder, write_whole
 
 if TYPE_CHECKING:
-    from daemon.runtime.light_setup import Lights
+    from daemon.devices.light_setup import Lights
 
 log = logging.getLogger(__name__)
 

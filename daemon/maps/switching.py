@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 from daemon.maps.autosave import ADRIFT, DONE, FIXED, NO_MAP, Keeper
 from daemon.maps.container import BadMap
 from daemon.maps.store import Judge, Start, Store, said
+from daemon.system.callbacks import OnDone
 from hal.blocking_calls import beside
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
@@ -26,7 +27,6 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 
 log = logging.getLogger(__name__)
 
-Told = Callable[[str], None]
 NOTHING_TO_SAVE: Final = (DONE, NO_MAP, FIXED, ADRIFT)
 
 BUSY: Final = "another map is just being loaded"
@@ -102,23 +102,23 @@ class MapSwitch:
         self._maps, self._keeper, self._put = maps, keeper, put
         self._task: asyncio.Task[None] | None = None
 
-    def ask(self, map_id: int, told: Told, patient: bool = False) -> None:
-        """Go on in a stored map; ``told``: empty, or why that came to nothing.
+    def ask(self, map_id: int, on_done: OnDone, patient: bool = False) -> None:
+        """Go on in a stored map; ``on_done``: empty, or why that came to nothing.
 
         ``patient``: wait for a cycle that takes it for as long as it may be; nobody waits for an answer.
         """
         if self._task is not None and not self._task.done():
-            told(BUSY)
+            on_done(BUSY)
             return
-        self._task = asyncio.get_running_loop().create_task(self._switch(map_id, told, patient), name="map switch")
+        self._task = asyncio.get_running_loop().create_task(self._switch(map_id, on_done, patient), name="map switch")
 
-    async def _switch(self, map_id: int, told: Told, patient: bool) -> None:
+    async def _switch(self, map_id: int, on_done: OnDone, patient: bool) -> None:
         try:
             reason = await self._carried_out(map_id, patient)
         except Exception as error:  # a defect must not leave the client waiting, and is told in full
             log.exception("the map cannot be switched")
             reason = repr(error)
-        told(reason)
+        on_done(reason)
 
     async def _carried_out(self, map_id: int, patient: bool) -> str:
         store = self._maps.store

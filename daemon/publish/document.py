@@ -25,7 +25,7 @@ from daemon.publish.modbus import (
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.holding import CommandCode
 from daemon.publish.modbus.rtu import PATIENCE_S, SILENCE_S
-from daemon.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, LoopReason, State
 
 
 def _state_rows() -> list[tuple[str, ...]]:
@@ -165,7 +165,7 @@ def _lights() -> str:
     head = [row for row in every if not row[1].startswith("`link_")]
     one = [row for row in every if row[1].startswith("`link_1_")]
     start, width = block.body + block.offsets[len(head)], lights_block.ROW_WORDS
-    words, links = block.registers, lights_block.ROWS
+    words, links = block.registers, LISTED_LINKS
     return f"""## Lights: input registers {first} to {last}
 
 The lamps in view, strongest first, and the position from lights alone, which the laser never touches. Read

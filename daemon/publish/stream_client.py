@@ -1,232 +1,146 @@
-"""One tap of the local stream: what it wants, what it has not taken yet, and when it is let go.
+"""Client of the daemon's local stream: connects, says what it wants, comes again when the daemon has gone.
 
-What is the latest of its kind replaces what a slow one has not taken (and is counted); what happens once is kept for
-it, up to a bound.
+async for frame in Stream(path, ("pose", "scan")).frames():
+    match frame:
+        case Hello(): ...       # connected, or connected again
+        case Lost(): ...        # the daemon has gone; frames go on when it is back
+        case Pose(): ...
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
-from collections import deque
-from collections.abc import Mapping
-from typing import Any, Final, Protocol
+import contextlib
+import socket
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
-import msgspec
+from daemon.config.paths import SERVICE, daemons_in, stream_path
+from daemon.publish import stream_messages as messages
+from daemon.publish.stream_messages import LONGEST, Frame, NotTheStream, Refused
+from daemon.publish.stream_server import TOPICS
 
-from daemon.maps.tiles import NOTHING_SHOWN
-from hal.net.fair_share import Share
-
-log = logging.getLogger(__name__)
-
-SCHEMA: Final = 1
-"""Version of all that follows. A field never changes its meaning under the same number; readers skip unknown ones."""
-
-LATEST: Final = {
-    "pose": "after each cycle: the whole snapshot, with the state in words",
-    "lights": "after each cycle: what lights alone say, with every link",
-    "scan": "each scan: ranges in m as little-endian float32, not a number where there is none",
-    "statistics": "once a second: counters and times of cycle, devices and process",
-}
-"""Topics of which a slow client gets the latest only."""
-ONCE: Final = {
-    "state": "at first and at a change: state and reason, with meaning and remedy",
-    "loop": "a loop closed: counter, both keyframes, residual, reason",
-    "faults": "at first and at a change: all that are present, with meaning and remedy",
-}
-"""Topics of which a client gets every one, up to :data:`KEPT`."""
-RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}
-"""As those, up to :data:`RAW_KEPT`."""
-MAP: Final = {"map": "the map as tiles: at first all, then those that have changed"}
-"""A client gets every tile as it is when it comes to it."""
-TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE, **RAW, **MAP}
-
-CLIENTS: Final = 32
-KEPT: Final = 64
-RAW_KEPT: Final = 256
-BUFFER_BYTES: Final = 256 << 10
-"""Bytes that may wait in this process for one client, and one frame."""
-LONGEST_REQUEST: Final = 4096
-REQUESTS_PER_TURN: Final = 4
-"""Of one client; each may want the whole map anew."""
-STUCK_S: Final = 60.0
-"""A client that has taken nothing for so long is let go."""
-
-encode: Final = msgspec.msgpack.Encoder().encode
-_request: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
+FIRST_RETRY_S: Final = 0.2
+LAST_RETRY_S: Final = 2.0
+SILENT_S: Final = 10.0
+"""Without a greeting for so long: the daemon stands, or the path leads to another program."""
 
 
-def framed(message: Mapping[str, object]) -> bytes:
-    """One frame."""
-    body = encode(message)
-    return len(body).to_bytes(4, "little") + body
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """There is no connection; ``text`` says why. Told once, not at each try."""
+
+    text: str
 
 
-class Server(Protocol):
-    """What a tap is told, and by whom."""
+class Stream:
+    """What a daemon tells, for as long as somebody asks.
 
-    clients: set[Client]
-    share: Share
+    Args:
+        path: of the socket; or the name of a daemon, whose socket is looked for at each try.
+        topics: that are wanted.
+        patient: whether to go on trying after a loss, and when nobody is there at first.
 
-    def hello(self) -> dict[str, object]:
-        """What it is told first."""
-        ...
-
-    def welcome(self, client: Client, fresh: frozenset[str]) -> None:
-        """It wants these from now on."""
-        ...
-
-    def show(self, client: Client) -> None:
-        """Send the tiles of the map that it has not seen."""
-        ...
-
-
-class Client(asyncio.Protocol):
-    """One tap.
-
-    Attributes:
-        wants: topics. replaced: frames that a newer one has replaced before it took them.
-        shown: the last tile of the map that it was sent.
+    Raises:
+        ValueError: no such topic.
     """
 
-    def __init__(self, server: Server) -> None:
-        self.wants: frozenset[str] = frozenset()
-        self.replaced = 0
-        self._server = server
-        self._transport: asyncio.Transport | None = None
-        self._received = bytearray()
-        self._again: asyncio.TimerHandle | None = None
-        self._latest: dict[str, bytes] = {}
-        self._events: deque[tuple[str, bytes]] = deque(maxlen=KEPT)
-        self._raw: deque[tuple[str, bytes]] = deque(maxlen=RAW_KEPT)
-        self.shown = NOTHING_SHOWN
-        self._stuck: asyncio.TimerHandle | None = None
+    def __init__(self, path: Path | str, topics: Sequence[str], patient: bool = True) -> None:
+        if unknown := sorted(set(topics) - set(TOPICS)):
+            raise ValueError(f"no such topic: {', '.join(unknown)}; there are {', '.join(TOPICS)}")
+        self._of, self.topics, self.patient = path, tuple(topics), patient
 
     @property
-    def stuck(self) -> bool:
-        """Whether it does not take what it has asked for at the moment."""
-        return self._stuck is not None
+    def path(self) -> Path:
+        """Of the socket, as far as is known now."""
+        return stream_path(self._of) if isinstance(self._of, str) else self._of
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Greet, or say that there are too many."""
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        transport.set_write_buffer_limits(high=BUFFER_BYTES)
-        if len(self._server.clients) >= CLIENTS:
-            self._refuse(f"{CLIENTS} clients are being served; close one")
-            return
-        self._server.clients.add(self)
-        transport.write(framed(self._server.hello()))
+    async def frames(self) -> AsyncGenerator[Frame | Lost, None]:
+        """Every frame, from the greeting on; ends after :class:`Lost` where it is not patient. To be closed.
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget it."""
-        self._server.clients.discard(self)
-        for timer in (self._stuck, self._again):
-            if timer is not None:
-                timer.cancel()
-
-    def data_received(self, data: bytes) -> None:
-        """Take requests."""
-        self._received += data
-        if self._again is None:
-            self._serve()
-
-    def _serve(self) -> None:
-        """Take a few requests; the others wait for a turn of their own, and nothing more is read until then."""
-        self._again, share, more = None, self._server.share, True
-        if share.begin():
+        Raises:
+            NotTheStream: what comes cannot be read, or our request was refused; trying again would not help.
+        """
+        retry, told = FIRST_RETRY_S, False
+        while True:
+            path = self.path
             try:
-                more = self._serve_some()
-            finally:
-                share.end()
-        if self._transport is None:
-            return
-        if more:
-            self._transport.pause_reading()
-            self._again = share.later(self._serve)
-        else:
-            self._transport.resume_reading()
+                async with _connected(path) as (reader, writer):
+                    writer.write(messages.request(self.topics))
+                    async with contextlib.aclosing(_frames(reader)) as heard:
+                        async for frame in heard:
+                            retry, told = FIRST_RETRY_S, False
+                            yield frame
+                    lost = f"{path}: the daemon has closed the stream"
+            except OSError as error:
+                lost = f"{path}: {_why(error)}"
+                if not told and _nobody(error):
+                    lost += _others(path)
+            if not told:
+                told = True
+                yield Lost(lost)
+            if not self.patient:
+                return
+            await asyncio.sleep(retry)
+            retry = min(2.0 * retry, LAST_RETRY_S)
 
-    def _serve_some(self) -> bool:
-        """Returns whether there are more."""
-        for _ in range(REQUESTS_PER_TURN):
-            if not self._whole():
-                return False
-            end = 4 + int.from_bytes(self._received[:4], "little")
-            body = bytes(self._received[4:end])
-            del self._received[:end]
-            self._ask(body)
-        return self._whole()
 
-    def _whole(self) -> bool:
-        """Whether a whole request is there."""
-        if len(self._received) < 4:
-            return False
-        length = int.from_bytes(self._received[:4], "little")
-        if length > LONGEST_REQUEST:
-            self._refuse(f"a request of {length} bytes; the longest is {LONGEST_REQUEST}")
-            return False
-        return len(self._received) >= 4 + length
+@contextlib.asynccontextmanager
+async def _connected(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    reader, writer = await asyncio.open_unix_connection(str(path), limit=1 << 20)
+    try:
+        sock: socket.socket | None = writer.get_extra_info("socket")
+        if sock is not None:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        yield reader, writer
+    finally:
+        writer.transport.abort()  # nothing of ours is worth waiting for
 
-    def pause_writing(self) -> None:
-        """It does not take what it has asked for."""
-        self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._let_go)
 
-    def resume_writing(self) -> None:
-        """It has caught up: it gets what has happened, and the latest of the rest."""
-        if self._stuck is not None:
-            self._stuck.cancel()
-            self._stuck = None
-        waiting = [*self._events, *self._latest.items(), *self._raw]
-        self._events.clear()
-        self._raw.clear()
-        self._latest = {}
-        for topic, body in waiting:
-            self.tell(topic, body)
-        if "map" in self.wants:
-            self._server.show(self)
+async def _frames(reader: asyncio.StreamReader) -> AsyncGenerator[Frame, None]:
+    """Frames until the daemon closes; what this version does not know is left out."""
+    greeted = False
+    while (body := await _body(reader, None if greeted else SILENT_S)) is not None:
+        frame = messages.decode(body)
+        if not greeted and not isinstance(frame, (messages.Hello, Refused)):
+            raise NotTheStream("who answers does not greet; is this the stream of a lumiloop?")
+        greeted = True
+        if isinstance(frame, Refused):
+            raise NotTheStream(f"the daemon refuses: {frame.text}")
+        if frame is not None:
+            yield frame
 
-    def tell(self, topic: str, body: bytes) -> None:
-        """Send, or keep for when it has caught up."""
-        if self._stuck is None and self._transport is not None:
-            head = encode({"topic": topic, "replaced": self.replaced})
-            # a map of three with the data's bytes as they are: encoded once, whoever wants it
-            joined = b"\x83" + head[1:] + b"\xa4data" + body
-            self._transport.write(len(joined).to_bytes(4, "little") + joined)
-        elif topic in ONCE or topic in RAW:
-            kept = self._events if topic in ONCE else self._raw
-            self.replaced += len(kept) == kept.maxlen
-            kept.append((topic, body))
-        else:
-            self.replaced += topic in self._latest
-            self._latest[topic] = body
 
-    def drop(self) -> None:
-        """Close without waiting for it."""
-        if self._transport is not None:
-            self._transport.abort()
+async def _body(reader: asyncio.StreamReader, patience_s: float | None) -> bytes | None:
+    """The next frame without its length; None: closed, also in the middle of one."""
+    try:
+        async with asyncio.timeout(patience_s):
+            length = int.from_bytes(await reader.readexactly(4), "little")
+            if length > LONGEST:
+                raise NotTheStream(f"a frame of {length} bytes; is this the stream of a lumiloop?")
+            return await reader.readexactly(length)
+    except asyncio.IncompleteReadError:
+        return None
+    except TimeoutError:
+        raise OSError(f"nothing is said for {SILENT_S:.0f} s: the daemon stands") from None
 
-    def _ask(self, body: bytes) -> None:
-        try:
-            wanted = _request(body).get("want")
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # a key that is no text; too deep
-            self._refuse(f"a request that is no msgpack map: {error}")
-            return
-        if not isinstance(wanted, list) or not all(isinstance(topic, str) for topic in wanted):
-            self._refuse("a request without `want`, a list of topics")
-        elif unknown := sorted(set(wanted) - set(TOPICS)):
-            self._refuse(f"no such topic: {', '.join(unknown)[:100]}; there are {', '.join(TOPICS)}")
-        else:
-            before, self.wants = self.wants, frozenset(wanted)
-            self._server.welcome(self, self.wants - before)
 
-    def _refuse(self, text: str) -> None:
-        self.wants = frozenset()
-        self._received.clear()
-        if self._transport is not None:
-            self._transport.write(framed({"topic": "error", "text": text}))
-            self._transport.close()
+def _nobody(error: OSError) -> bool:
+    return isinstance(error, (FileNotFoundError, ConnectionRefusedError))
 
-    def _let_go(self) -> None:
-        log.info("a client of the stream has taken nothing for %.0f s and is let go", STUCK_S)
-        self.drop()
+
+def _others(path: Path) -> str:
+    """Daemons that may be meant: who forgets `--config` asks for the one of the default name."""
+    names = sorted({name for folder in {path.parent, SERVICE} for name in daemons_in(folder)} - {path.stem})
+    runs = "runs" if len(names) == 1 else "run"
+    return f"; {', '.join(names)} {runs} here: `--set name={names[0]}`, or `--config`" if names else ""
+
+
+def _why(error: OSError) -> str:
+    if _nobody(error):
+        return "nobody listens there; is the daemon running? its log names its stream"
+    if isinstance(error, PermissionError):
+        return "you may not open it; who may reach its folder may listen"
+    return error.strerror or str(error)

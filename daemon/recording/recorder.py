@@ -20,12 +20,12 @@ import msgspec
 import numpy as np
 
 from daemon.config.schema import Config
+from daemon.devices.light_setup import RESIDUALS, Lights
 from daemon.devices.port_tap import tapped
 from daemon.maps.store import START, Start
 from daemon.recording.disk_writer import SegmentWriter, both
 from daemon.recording.flight_recorder import BlackBox
 from daemon.runtime.cycle import CycleRecord
-from daemon.runtime.light_setup import RESIDUALS, Lights
 from daemon.snapshot import Snapshot
 from daemon.system.atomic_file import write_whole
 from daemon.system.versions import versions

@@ -16,20 +16,21 @@ import numpy as np
 import estimator
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge, ScanBridge
+from daemon.devices.light_setup import Lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.health.assessment import REPLAYED, assess
 from daemon.health.faults import Fault
 from daemon.maps.container import BadMap
+from daemon.maps.grid_files import finest
+from daemon.maps.initial_state import begun, new_state
 from daemon.maps.store import Start, recorded_start
 from daemon.maps.switching import take_over
 from daemon.recording.recorder import CycleEntry, light_of, switch_name
 from daemon.recording.replay_start import Restored
-from daemon.replay.results import finest
 from daemon.replay.sources import Event, Source, Turn
 from daemon.replay.trajectories import Ledger
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle import Cycle, CycleRecord, Parts
-from daemon.runtime.light_setup import Lights, begun, new_state
 from daemon.runtime.vitals import vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
 from estimator import UNLIMITED, Array, Grid, Identity, Limits, MapImage, Order, Record, StepResult, image_of

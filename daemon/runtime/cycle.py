@@ -16,6 +16,7 @@ from typing import Final
 
 from daemon.devices.conversion import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
 from daemon.devices.photodiode import BlockWatch
+from daemon.health.journal_fields import of_state
 from daemon.health.reasons import REASONS
 from daemon.health.reasons import Reason as Cause
 from daemon.integrity.evidence import SILENT_PERIODS, Evidence
@@ -34,7 +35,6 @@ from daemon.runtime.snapshot_builder import Facts, Painter
 from daemon.runtime.stage_times import Laps, PulseTaker
 from daemon.runtime.worker import Worker
 from daemon.snapshot import Condition, Snapshot, Trust
-from daemon.system.logging import of_state
 from estimator import Answer, Command, Fix, LightEpoch, Limits, Order, Record, Rung, SampleBlock, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock

@@ -11,7 +11,7 @@ from typing import Final
 
 from daemon.health.assessment import STALLED_PERIODS, WINDOW_S, Vitals, assess, describe
 from daemon.health.faults import Fault, describe_over
-from daemon.system.logging import of_fault
+from daemon.health.journal_fields import of_fault
 from daemon.system.sd_notify import notify
 
 log = logging.getLogger(__name__)

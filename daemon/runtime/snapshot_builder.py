@@ -9,8 +9,18 @@ from typing import Final
 import numpy as np
 
 from daemon.integrity.state_memory import Memory
-from daemon.publish.modbus.lights_block import ROWS
-from daemon.snapshot import Condition, LightFix, LightLink, LightPicture, LinkUse, LoopReason, Pulse, Snapshot, Trust
+from daemon.snapshot import (
+    LISTED_LINKS,
+    Condition,
+    LightFix,
+    LightLink,
+    LightPicture,
+    LinkUse,
+    LoopReason,
+    Pulse,
+    Snapshot,
+    Trust,
+)
 from estimator import Array, Fix, Link, LinkState, Loop, StepResult, se2
 from estimator import LoopReason as Why
 
@@ -111,7 +121,7 @@ class Painter:
         """The first links as they are published; every other cycle brings no new ones."""
         links = () if result is None or result.lights is None else result.lights.links
         if links is not self._links[0]:
-            self._links = links, tuple([_link(link) for link in links[:ROWS]])
+            self._links = links, tuple([_link(link) for link in links[:LISTED_LINKS]])
         return self._links[1]
 
 

@@ -27,7 +27,7 @@ from daemon.system.kernel_lock import KernelLock, before_compiling, waits
 from hal.blocking_calls import beside
 
 if TYPE_CHECKING:
-    from daemon.runtime.light_setup import Lights
+    from daemon.devices.light_setup import Lights
 
 log = logging.getLogger(__name__)
 
@@ -279,7 +279,7 @@ def _exercise_lights(lights: Lights) -> float:
     """Steps with light in them; returns the microseconds that the search for one code takes on this computer."""
     import numpy as np
 
-    from daemon.runtime.light_setup import new_state
+    from daemon.maps.initial_state import new_state
     from estimator import UNLIMITED, SampleBlock, decode, new_decoder, search, step
 
     profile, state = lights.profile, new_state(lights)

@@ -13,7 +13,7 @@ from typing import Final
 
 import zenoh
 
-from daemon.cli import parser
+from daemon.system import console
 from taps.fleet import messages
 from taps.zenoh_session import BEAT_S, Say, listed, withdraw
 
@@ -36,7 +36,7 @@ class Claim:
     """
 
     def __init__(
-        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = parser.say
+        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = console.say
     ) -> None:
         self.mine = False
         self._session, self._robot, self._host, self._on_change, self._say = session, robot, host, on_change, say

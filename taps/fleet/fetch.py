@@ -12,8 +12,8 @@ from typing import Final
 
 import zenoh
 
-from daemon.cli import parser
 from daemon.cli.status import NoAnswer, address_of
+from daemon.system import console
 from daemon.system.atomic_file import reason_of
 from hal.run_server import work_until_told
 from taps.fleet import messages
@@ -39,10 +39,10 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(work_until_told(fetcher.run()) if args.follow else fetcher.run())
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except NoAnswer as error:
-        return parser.fail(f"--switch: {error}", parser.USAGE)
-    return parser.FAILED if fetcher.failed else parser.OK
+        return console.fail(f"--switch: {error}", console.USAGE)
+    return console.FAILED if fetcher.failed else console.OK
 
 
 class Fetcher:
@@ -97,7 +97,7 @@ class Fetcher:
                 said, self.failed = str(error), True
             if said != self._said.get(kind):
                 self._said[kind] = said
-                parser.say(printable(said))  # who shares has chosen some of the words
+                console.say(printable(said))  # who shares has chosen some of the words
 
     async def _fetch(self, session: zenoh.Session, kind: str, modbus: tuple[str, int] | None) -> str:
         """What came of it.
@@ -149,7 +149,7 @@ class Fetcher:
                 try:
                     offers.append(messages.read(content, Offer))
                 except Unreadable as error:
-                    parser.say(printable(f"what is offered as {kind} is not one: {error}"))
+                    console.say(printable(f"what is offered as {kind} is not one: {error}"))
             if offers or not left:
                 break
             await asyncio.sleep(PAUSE_S)

@@ -17,19 +17,19 @@ from typing import Final
 import msgspec
 import zenoh
 
-from daemon.cli import parser
 from daemon.config.paths import maps_folder
 from daemon.maps.container import BadMap
 from daemon.maps.schema import read
 from daemon.maps.store import Store
+from daemon.publish.stream_client import Lost, Stream
+from daemon.publish.stream_messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
+from daemon.system import console
 from hal.run_server import work_until_told
 from taps.fleet import messages
 from taps.fleet.claim import Claim
 from taps.fleet.messages import MapHead, PoseTold, StateTold
 from taps.fleet.placing import Records
 from taps.metrics.vda5050 import position_v2
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
 from taps.stream.tiles import Tiles, trinary
 from taps.zenoh_session import BadEndpoint, joined, watched, withdraw
 
@@ -50,10 +50,10 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(work_until_told(tell(args, stream)))
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except NotTheStream as error:
-        return parser.fail(str(error))
-    return parser.OK
+        return console.fail(str(error))
+    return console.OK
 
 
 async def tell(args: argparse.Namespace, stream: Stream) -> None:
@@ -243,5 +243,5 @@ async def follow(stream: Stream, robot: Robot) -> None:
     async with contextlib.aclosing(stream.frames()) as frames:
         async for frame in frames:
             if isinstance(frame, Lost):
-                parser.say(f"{frame.text}; waiting")
+                console.say(f"{frame.text}; waiting")
             robot.take(frame)

@@ -8,7 +8,7 @@ import socket
 
 import zenoh
 
-from daemon.cli import parser
+from daemon.system import console
 from hal.run_server import until_told, work_until_told
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, encode
@@ -20,15 +20,15 @@ def main(args: argparse.Namespace) -> int:
     """Share until stopped; returns the exit code."""
     asked = [(kind, path) for kind, path in ((SURVEY, args.survey), (MAP, args.map)) if path is not None]
     if not asked:
-        return parser.fail("say what to share: --survey FILE, --map FILE", parser.USAGE)
+        return console.fail("say what to share: --survey FILE, --map FILE", console.USAGE)
     try:
         offers = [offer_of(kind, path, args.version) for kind, path in asked]
         asyncio.run(work_until_told(share(args, offers)))
     except Refused as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
-    return parser.OK
+        return console.fail(str(error), console.USAGE)
+    return console.OK
 
 
 async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> None:
@@ -54,7 +54,7 @@ async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> 
         token = session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots ask when they see it
         try:
             for offer, _ in offers:
-                parser.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
+                console.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
             await watched(session, args.router, lambda there: None)
         finally:
             withdraw(token)  # one to which no name leads any more is withdrawn by the library, unasked
@@ -69,10 +69,10 @@ def router(args: argparse.Namespace) -> int:
     """Be a router until stopped; returns the exit code."""
     try:
         with zenoh.open(config("router", args.listen, args.zenoh)):
-            parser.say(f"router at {args.listen}")
+            console.say(f"router at {args.listen}")
             asyncio.run(until_told())
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except zenoh.ZError as error:
-        return parser.fail(f"cannot listen on {args.listen}: {words(error)}; free it, or name another with --listen")
-    return parser.OK
+        return console.fail(f"cannot listen on {args.listen}: {words(error)}; free it, or name another with --listen")
+    return console.OK

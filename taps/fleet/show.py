@@ -14,8 +14,8 @@ from typing import Final
 import msgspec
 import zenoh
 
-from daemon.cli import parser
 from daemon.maps.png import encode_png
+from daemon.system import console
 from daemon.system.atomic_file import reason_of, write_whole
 from hal.run_server import work_until_told
 from taps.fleet import drawing, messages
@@ -48,12 +48,12 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(work_until_told(show(args, roster), seconds=0.0) if args.watch else show(args, roster))
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except NoRouter as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except OSError as error:
-        return parser.fail(f"{args.picture}: {reason_of(error)}; name another file")
-    return parser.OK if roster.members else parser.fail(f"no robot tells anything by way of {args.router}")
+        return console.fail(f"{args.picture}: {reason_of(error)}; name another file")
+    return console.OK if roster.members else console.fail(f"no robot tells anything by way of {args.router}")
 
 
 async def show(args: argparse.Namespace, roster: Roster) -> None:

@@ -16,10 +16,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from daemon.cli import parser
-from daemon.cli.replay import Given
+from daemon.replay.recorded_inputs import Given
 from daemon.replay.results import OutputRefused, kitti, tum
 from daemon.runtime import warmup
+from daemon.system import console
 from daemon.system.atomic_file import write_whole
 from daemon.system.extras import how_to_install
 from daemon.system.versions import made_elsewhere
@@ -45,20 +45,20 @@ class WouldLose(Exception):
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.mcap is None and args.tum is None and args.kitti is None:
-        return parser.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", parser.USAGE)
+        return console.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", console.USAGE)
     try:
         with _stoppable():
             return _save(args) if _is_mcap(args.log) else _export(args)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
             raise
-        return parser.fail(f"MCAP files need {error.name}, which is not installed: {how_to_install('mcap')}")
+        return console.fail(f"MCAP files need {error.name}, which is not installed: {how_to_install('mcap')}")
     except WouldLose as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except OSError as error:
-        return parser.fail(f"{error.filename or args.log}: {error.strerror}; free space or name another file")
+        return console.fail(f"{error.filename or args.log}: {error.strerror}; free space or name another file")
 
 
 def _is_mcap(path: Path) -> bool:
@@ -74,14 +74,14 @@ def _save(args: argparse.Namespace) -> int:
 
     if args.tum or args.kitti:
         told = f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole"
-        return parser.fail(f"{told}; trajectories are made of the recording itself", parser.USAGE)
+        return console.fail(f"{told}; trajectories are made of the recording itself", console.USAGE)
     _refuse_to_write_over((args.log,), args)
     try:
         found = recover(args.log, args.mcap)
     except NotMcap as error:
-        return parser.fail(str(error))
-    parser.say(f"{args.mcap}: {found.sentence()}")
-    return parser.OK
+        return console.fail(str(error))
+    console.say(f"{args.mcap}: {found.sentence()}")
+    return console.OK
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -89,7 +89,7 @@ def _export(args: argparse.Namespace) -> int:
     told = Retold(args.log, args.settings, Given(args.config is not None, keys))
     _refuse_to_write_over(told.source.files, args)
     if made := made_elsewhere(told.source.header):
-        parser.say(f"{args.log}: {made}")
+        console.say(f"{args.log}: {made}")
     stopped = ""
     if args.mcap is None:
         stopped = _run(told, None, None)
@@ -101,7 +101,7 @@ def _export(args: argparse.Namespace) -> int:
             translator = Translator(told.config.lidar.mount, told.source.utc)
             stopped = _run(told, translator, file)
             _draw(told, translator, file)
-        parser.say(f"{args.mcap}: {file.messages} messages")
+        console.say(f"{args.mcap}: {file.messages} messages")
     final = told.rerun.ledger.online() if args.online else told.rerun.ledger.final()
     guesses = sum(map(bool, final.guesses()))
     guessed = f", and {guesses} guesses that are none" if guesses else ""
@@ -109,15 +109,15 @@ def _export(args: argparse.Namespace) -> int:
         if path is not None:
             write_whole(path, text(final))
             none = "" if len(final.stamps) else "; no cycle in the recording had a pose"
-            parser.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}{none}")
+            console.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}{none}")
     for sentence in told.source.report.sentences():
-        parser.say(f"{args.log}: {sentence}")
+        console.say(f"{args.log}: {sentence}")
     if told.rerun.comparison.differ:
         count, first = told.rerun.comparison.differ, told.rerun.comparison.first
-        parser.say(
+        console.say(
             f"the replay is not the recorded run in {count} cycles: other software, or records lost; first {first}"
         )
-    return parser.fail(f"{stopped}; what was read until then is written") if stopped else parser.OK
+    return console.fail(f"{stopped}; what was read until then is written") if stopped else console.OK
 
 
 def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> None:

@@ -13,13 +13,13 @@ import contextlib
 from pathlib import Path
 from typing import Final
 
-from daemon.cli import parser
 from daemon.config.schema import Config
+from daemon.publish.stream_client import Lost, Stream
+from daemon.publish.stream_messages import Hello, NotTheStream
+from daemon.system import console
 from hal.run_server import work_until_told
 from taps.mcap.writer import FLUSH_S, McapFile, NoRoom
 from taps.ros.messages import Translator
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Hello, NotTheStream
 
 TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -27,10 +27,12 @@ TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistic
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.out.exists() and not args.force:
-        return parser.fail(f"{args.out} is there already; name another file, or replace it with --force", parser.USAGE)
+        return console.fail(
+            f"{args.out} is there already; name another file, or replace it with --force", console.USAGE
+        )
     if not args.out.parent.is_dir():
-        return parser.fail(
-            f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", parser.USAGE
+        return console.fail(
+            f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", console.USAGE
         )
     stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
     file = None
@@ -38,19 +40,19 @@ def main(args: argparse.Namespace) -> int:
         with McapFile(args.out, reserve=round(args.reserve * (1 << 20))) as file:
             asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))
     except NotTheStream as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except NoRoom as error:
         whole = "the file is whole up to here; " if file is not None and file.messages else ""
-        return parser.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
+        return console.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
     except OSError as error:
-        return parser.fail(f"{args.out}: {error.strerror}; free space or name another file")
+        return console.fail(f"{args.out}: {error.strerror}; free space or name another file")
     finally:
         if file is not None and not file.messages:
             _leave_none(args.out)
     if not file.messages:
-        return parser.fail("nothing was told, and no file is left; is the daemon running?")
-    parser.say(f"{args.out}: {file.messages} messages")
-    return parser.OK
+        return console.fail("nothing was told, and no file is left; is the daemon running?")
+    console.say(f"{args.out}: {file.messages} messages")
+    return console.OK
 
 
 def _leave_none(path: Path) -> None:
@@ -74,9 +76,9 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
         async with contextlib.aclosing(stream.frames()) as frames:
             async for frame in frames:
                 if isinstance(frame, Lost):
-                    parser.say(f"{frame.text}; waiting")
+                    console.say(f"{frame.text}; waiting")
                 elif isinstance(frame, Hello):
-                    parser.say(f"recording {frame.name} into {file.path}")
+                    console.say(f"recording {frame.name} into {file.path}")
                     translator = Translator(settings.lidar.mount)
                 else:
                     for out in translator.take(frame):

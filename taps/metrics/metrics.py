@@ -9,9 +9,9 @@ from typing import Final
 
 import msgspec
 
+from daemon.publish.stream_client import Lost
+from daemon.publish.stream_messages import Faults, Frame, Hello, Lights, Pose, Statistics
 from daemon.snapshot import LinkUse, Part, Stage, State
-from taps.stream.client import Lost
-from taps.stream.messages import Faults, Frame, Hello, Lights, Pose, Statistics
 
 OLD_S: Final = 3.0
 """A daemon that has told no pose for so long does not know where the robot is; without any word it stands."""

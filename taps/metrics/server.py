@@ -12,13 +12,13 @@ import json
 import time
 from typing import Final
 
-from daemon.cli import parser
 from daemon.config.endpoints import in_url, parse_endpoint
+from daemon.publish.stream_client import Stream
+from daemon.publish.stream_messages import NotTheStream
+from daemon.system import console
 from hal.run_server import work_until_told
 from taps.metrics import vda5050
 from taps.metrics.metrics import CONTENT_TYPE, Told, exposition
-from taps.stream.client import Stream
-from taps.stream.messages import NotTheStream
 from taps.view.access_guard import Guard
 
 LONGEST_REQUEST: Final = 8192
@@ -44,12 +44,12 @@ def main(args: argparse.Namespace) -> int:
         stream = Stream(args.stream or args.settings.name, TOPICS)
         asyncio.run(work_until_told(serve(stream, host, port)))
     except ValueError as error:
-        return parser.fail(f"--listen: {error}", parser.USAGE)
+        return console.fail(f"--listen: {error}", console.USAGE)
     except NotTheStream as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except OSError as error:
-        return parser.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
-    return parser.OK
+        return console.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
+    return console.OK
 
 
 async def serve(stream: Stream, host: str, port: int) -> None:
@@ -61,7 +61,7 @@ async def serve(stream: Stream, host: str, port: int) -> None:
     told = Told()
     answering = Answering(told, Guard(bind=host))
     server = await asyncio.start_server(answering, host, port, limit=LONGEST_REQUEST)
-    parser.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
+    console.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
     try:
         async with contextlib.aclosing(stream.frames()) as frames:
             async for frame in frames:

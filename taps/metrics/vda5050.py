@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
+from daemon.publish.stream_messages import Pose
 from daemon.snapshot import State
-from taps.stream.messages import Pose
 
 LOCALISED = (State.TRACKING, State.MAPPING, State.DEGRADED)
 

@@ -14,9 +14,21 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.config.schema import Mount
+from daemon.publish.stream_messages import (
+    Faults,
+    Frame,
+    Lights,
+    Loop,
+    MapTiles,
+    Pose,
+    Raw,
+    Scan,
+    StateChange,
+    Statistics,
+    Triple,
+)
 from daemon.snapshot import GUESSED, State
 from taps.ros import types as ros
-from taps.stream.messages import Faults, Frame, Lights, Loop, MapTiles, Pose, Raw, Scan, StateChange, Statistics, Triple
 from taps.stream.tiles import Tiles, trinary
 
 MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"

@@ -14,12 +14,12 @@ from typing import Final
 
 import zenoh
 
-from daemon.cli import parser
+from daemon.publish.stream_client import Stream
+from daemon.publish.stream_messages import NotTheStream
+from daemon.system import console
 from hal.run_server import work_until_told
 from taps.ros import rmw_zenoh, types
 from taps.ros.messages import TOPICS, Out
-from taps.stream.client import Stream
-from taps.stream.messages import NotTheStream
 from taps.stream.ros_follower import follow
 from taps.zenoh_session import BadEndpoint, joined, listed, watched, withdraw
 
@@ -40,12 +40,12 @@ def main(args: argparse.Namespace) -> int:
         stream = Stream(args.stream or args.settings.name, WANTED)
         asyncio.run(work_until_told(serve(args, namespace, stream)))
     except ValueError as error:
-        return parser.fail(f"--namespace: {error}", parser.USAGE)
+        return console.fail(f"--namespace: {error}", console.USAGE)
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except (NotTheStream, NameTaken) as error:
-        return parser.fail(str(error))
-    return parser.OK
+        return console.fail(str(error))
+    return console.OK
 
 
 async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> None:
@@ -63,7 +63,7 @@ async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> Non
         watching = asyncio.create_task(watched(session, args.router, lambda there: None))
         work = [asyncio.create_task(rivalled(session, node))]
         try:
-            parser.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
+            console.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
             work.append(asyncio.create_task(follow(stream, args.settings, talker)))
             ended, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
             for task in ended:

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from daemon.cli.replay import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.config.schema import Config
 from daemon.health.reasons import REASONS, Reason
+from daemon.publish import stream_messages as messages
 from daemon.publish import stream_server
+from daemon.publish.stream_messages import Frame, Raw
 from daemon.publish.stream_server import Client, StreamServer
 from daemon.publish.stream_ticker import BEAT_S, in_words
+from daemon.replay.recorded_inputs import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import Source, open_log
 from hal.adc import RawSamples
 from hal.lidar import RawScan
 from hal.replay.recording import Kind, open_recording
 from hal.replay.report import LogReport
-from taps.stream import messages
-from taps.stream.messages import Frame, Raw
 
 PASSED = {Kind.RX: "rx", Kind.TX: "tx", Kind.OPEN: "open", Kind.LOST: "lost", Kind.BAUD: "baud"}
 

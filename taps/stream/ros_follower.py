@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 from typing import Protocol
 
-from daemon.cli import parser
 from daemon.config.schema import Config
+from daemon.publish.stream_client import Lost, Stream
+from daemon.publish.stream_messages import Hello
+from daemon.system import console
 from taps.ros.messages import Out, Translator
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Hello
 
 
 class Sender(Protocol):
@@ -29,7 +29,7 @@ async def follow(stream: Stream, settings: Config, sender: Sender) -> None:
     async with contextlib.aclosing(stream.frames()) as frames:
         async for frame in frames:
             if isinstance(frame, Lost):
-                parser.say(f"{frame.text}; waiting")
+                console.say(f"{frame.text}; waiting")
             elif isinstance(frame, Hello):
                 translator = Translator(settings.lidar.mount)
             else:

@@ -20,15 +20,15 @@ from typing import Final
 
 from aiohttp import web
 
-from daemon.cli import parser
 from daemon.cli.status import NoAnswer, address_of
 from daemon.config import loader
 from daemon.config.endpoints import in_url
 from daemon.config.schema import Config
-from daemon.runtime.light_setup import SurveyError
+from daemon.config.survey_loader import SurveyError
+from daemon.publish.stream_client import Stream
+from daemon.system import console
 from daemon.system.logging import to_journal
 from hal.run_server import stopping
-from taps.stream.client import Stream
 from taps.view.access_guard import Guard, TokenRefused, token_for
 from taps.view.page_hello import CannotLook, Scene, scene_of
 from taps.view.replay_file import Film
@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
             raise CannotServe("nobody could read a fresh token but in the log: name a file with one, --token FILE")
         return _show(args, Guard(args.bind, token, args.write))
     except (TokenRefused, SurveyError, NoAnswer, CannotServe) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
 
 
 class CannotServe(Exception):
@@ -66,9 +66,9 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
         )
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:
-        return parser.fail("a recording takes no orders: leave --write out", parser.USAGE)
+        return console.fail("a recording takes no orders: leave --write out", console.USAGE)
     if not args.log.exists():
-        return parser.fail(f"{args.log}: there is no such recording")
+        return console.fail(f"{args.log}: there is no such recording")
     with _film(args) as film:
         return _serve(View(guard, Scene(settings.name), film=film), guard, args.port, f"recording {args.log}")
 
@@ -116,19 +116,19 @@ def _shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out
     from daemon.runtime import warmup
 
     try:
-        warmup.load_aloud(parser.say, "warm", warmup.load, "taps.view.replay_recorder")
+        warmup.load_aloud(console.say, "warm", warmup.load, "taps.view.replay_recorder")
     except warmup.CannotLoad as error:
-        parser.fail(str(error))
+        console.fail(str(error))
         return
     try:
         import_module("taps.view.replay_recorder").shoot(log, settings, given, out)
     except OSError as error:
-        parser.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
+        console.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
 
 
 def _wait(film: Film) -> None:
     """Until the recording is known to be one."""
-    parser.say("replaying the recording; it can be watched meanwhile")
+    console.say("replaying the recording; it can be watched meanwhile")
     while film.scene is None and not film.done:
         time.sleep(0.05)
         film.look()
@@ -145,7 +145,7 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
         taken = error.errno == errno.EADDRINUSE
         remedy = "name another with --port" if taken else "name an address of this computer with --bind"
         raise CannotServe(f"{guard.bind} port {port}: {error.strerror or error}; {remedy}") from None
-    return parser.OK
+    return console.OK
 
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
@@ -155,7 +155,7 @@ async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
     try:
         site = web.TCPSite(runner, guard.bind, port)
         await site.start()
-        parser.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
+        console.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
         await stop.wait()
     finally:
         await runner.cleanup()

@@ -16,8 +16,8 @@ from typing import Any, Final, cast
 
 from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.publish.port_owner import whose
+from daemon.publish.stream_client import Stream
 from hal.blocking_calls import beside
-from taps.stream.client import Stream
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
 TRIES: Final = 4

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.config.schema import Config
+from daemon.devices.light_setup import load_lights
 from daemon.publish import meanings
 from daemon.publish.modbus.timing_block import RUNGS
-from daemon.runtime.light_setup import load_lights
 from daemon.snapshot import Stage
 from estimator import Survey
 from taps.view.orders import NAMES

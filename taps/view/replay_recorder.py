@@ -17,19 +17,19 @@ from typing import BinaryIO, Final
 
 import msgspec
 
-from daemon.cli.replay import Given, config_for, lights_for, start_for
 from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError
 from daemon.health.reasons import REASONS, Reason
 from daemon.maps.tiles import MapTiles
+from daemon.publish import stream_messages as messages
 from daemon.publish.stream_server import Client, StreamServer
 from daemon.publish.stream_ticker import in_words, place_of
+from daemon.replay.recorded_inputs import Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import open_log
 from daemon.runtime import warmup
-from daemon.runtime.light_setup import SurveyError
 from hal.errors import HalError
 from hal.lidar import RawScan
-from taps.stream import messages
 from taps.view.page_hello import scene_of
 from taps.view.replay_file import HEAD, KINDS
 from taps.view.viewers import History, about_of, encode, frame
@@ -107,7 +107,7 @@ def shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out:
 
 
 def make(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
-    """Make the film. ``given``: as of `daemon.cli.replay.Given`. What goes wrong with the recording is said at its end.
+    """Make the film. ``given``: see `daemon.replay.recorded_inputs.Given`. An error in the recording ends the film.
 
     Raises:
         OSError: the film cannot be written; it lasts as far as it came.

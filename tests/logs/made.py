@@ -20,8 +20,8 @@ from typing import Final
 from daemon.app import Daemon
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.devices.light_setup import Lights
 from daemon.recording.recorder import Recorder
-from daemon.runtime.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo

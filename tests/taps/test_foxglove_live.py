@@ -15,11 +15,11 @@ pytest.importorskip("foxglove", reason="pip install 'lumiloop[foxglove]'")
 import aiohttp
 
 from daemon.config.schema import Config
+from daemon.publish.stream_client import Stream
 from taps import foxglove_live
 from taps.foxglove_live import Bridge
 from taps.ros import types
 from taps.ros.messages import TOPICS
-from taps.stream.client import Stream
 from taps.stream.ros_follower import follow
 from tests.taps.serving import served
 

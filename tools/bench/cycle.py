@@ -27,7 +27,7 @@ import numpy as np
 
 from daemon.app import Daemon, World
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from daemon.runtime.snapshot_builder import Painter
 from daemon.runtime.warmup import load
 from estimator import pipeline

@@ -15,12 +15,13 @@ import yaml
 from PIL import Image
 
 from daemon.cli import parser
-from daemon.cli.map_convert import grid_of, placed
-from daemon.cli.replay import replay
 from daemon.config.schema import Config
 from daemon.maps.edit import LONGEST_NAME, fitted, opened
 from daemon.maps.image import image_from, meta_of, packed
+from daemon.maps.image_geometry import grid_of, placed
 from daemon.maps.store import Store
+from daemon.replay.log_replay import replay
+from daemon.system import console
 from estimator.mapping.keyframe import Keyframe
 from estimator.mapping.map_snapshot import Identity, MapImage, image_of
 from estimator.mapping.occupancy_grid import Grid
@@ -64,7 +65,7 @@ def by_map_server(folder: Path) -> tuple[np.ndarray, dict[str, object]]:
 
 
 def test_map_server_reads_what_the_map_says(file: Path, made: MapImage, tmp_path: Path) -> None:
-    assert run("export", file, "--out", tmp_path / "out") == parser.OK
+    assert run("export", file, "--out", tmp_path / "out") == console.OK
     cells, facts = by_map_server(tmp_path / "out")
     grid = grid_of(image_from(opened(file)))
     assert facts["mode"] == "trinary"
@@ -84,7 +85,7 @@ def keyframes_of(file: Path) -> list[tuple[Keyframe, Array]]:
 
 
 def test_tum_has_every_keyframe_where_it_lies(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("export", file, "--tum", "--out", tmp_path / "out") == parser.OK
+    assert run("export", file, "--tum", "--out", tmp_path / "out") == console.OK
     assert capsys.readouterr().out == f"{tmp_path / 'out'}: keyframes.tum\n"
     rows = np.loadtxt(tmp_path / "out" / "keyframes.tum")
     frames = keyframes_of(file)
@@ -96,7 +97,7 @@ def test_tum_has_every_keyframe_where_it_lies(file: Path, tmp_path: Path, capsys
 
 
 def test_our_replay_finds_the_same_room_in_the_carmen_log(file: Path, tmp_path: Path) -> None:
-    assert run("export", file, "--carmen", "--out", tmp_path / "out") == parser.OK
+    assert run("export", file, "--carmen", "--out", tmp_path / "out") == console.OK
     outcome = replay(tmp_path / "out" / "keyframes.clf", Config())
     assert outcome.stopped == ""
     frames = keyframes_of(file)
@@ -130,7 +131,7 @@ def test_carmen_keeps_beams_mount_and_bearings(made: MapImage) -> None:
 
 
 def test_a_picture(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("render", file, tmp_path / "hall.png") == parser.OK
+    assert run("render", file, tmp_path / "hall.png") == console.OK
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'hall.png'}: ")
     with Image.open(tmp_path / "hall.png") as picture:
         dark = (np.array(picture).sum(axis=2) < 300).mean()
@@ -140,7 +141,7 @@ def test_a_picture(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_what_we_export_we_import(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("export", file, "--out", tmp_path / "out")
     told = run("import", tmp_path / "out" / "map.yaml", "--name", "from nav2", "--out", tmp_path / "new.lumimap")
-    assert told == parser.OK
+    assert told == console.OK
     assert "submaps" in capsys.readouterr().out
     stored = opened(tmp_path / "new.lumimap")
     assert stored.meta.name == "from nav2"
@@ -162,7 +163,7 @@ def agreement(a: Grid, b: Grid) -> float:
 def test_import_into_the_configured_folder(file: Path, tmp_path: Path) -> None:
     run("export", file, "--out", tmp_path / "out")
     folder = tmp_path / "kept"
-    assert run("import", tmp_path / "out" / "map.yaml", "--set", f"map.folder={folder}") == parser.OK
+    assert run("import", tmp_path / "out" / "map.yaml", "--set", f"map.folder={folder}") == console.OK
     start = Store(folder).load()
     assert start is not None
     assert start.stored.meta.name == "map"
@@ -174,7 +175,7 @@ def test_align_moves_everything_and_begins_a_frame_of_its_own(file: Path, capsys
     moved = se2.apply(T, np.array(points))
     words = [f"--point={x},{y}={u + 0.01},{v}" for (x, y), (u, v) in zip(points, moved.tolist(), strict=True)]
     before = keyframes_of(file)
-    assert run("align", file, *words) == parser.OK
+    assert run("align", file, *words) == console.OK
     said = capsys.readouterr().out
     assert "yaw 28.65 deg" in said
     assert "points are off by" in said
@@ -205,7 +206,7 @@ def test_points_that_do_not_fit_are_refused(
     file: Path, points: list[str], says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [f"--point={text}" for text in points]
-    assert run("align", file, *words) == parser.FAILED
+    assert run("align", file, *words) == console.FAILED
     assert re.search(says, capsys.readouterr().err)
     assert [path.name for path in file.parent.glob("*.lumimap")] == [file.name]
 
@@ -219,7 +220,7 @@ def test_the_fit_reports_scale_and_residuals() -> None:
 
 def test_covariances_turn_with_the_map(file: Path) -> None:
     before = opened(file).tables["pose.P"]
-    assert run("align", file, "--point=0,0=0,0", "--point=10,0=0,10") == parser.OK
+    assert run("align", file, "--point=0,0=0,0", "--point=10,0=0,10") == console.OK
     start = Store(file.parent).load()
     assert start is not None
     after = start.stored.tables["pose.P"]
@@ -230,20 +231,20 @@ def test_a_map_in_the_surveys_frame_is_not_moved(tmp_path: Path, capsys: pytest.
     path = tmp_path / "a.lumimap"
     lit = replace(image(Shape()), identity=Identity(MAP, surveyed=True))
     path.write_bytes(packed(lit, meta_of(lit, 1.0, "robot", "1")))
-    assert run("align", path, "--point=0,0=1,1", "--point=5,0=6,1", "--out", tmp_path / "b.lumimap") == parser.FAILED
+    assert run("align", path, "--point=0,0=1,1", "--point=5,0=6,1", "--out", tmp_path / "b.lumimap") == console.FAILED
     assert "move the lamps in the survey" in capsys.readouterr().err
 
 
 def test_a_name_stays_with_the_map(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("name", file, "2nd floor, east") == parser.OK
+    assert run("name", file, "2nd floor, east") == console.OK
     start = Store(file.parent).load()
     assert start is not None
     assert (start.stored.meta.name, start.stored.meta.map_id) == ("2nd floor, east", MAP)
     newest = max(file.parent.glob("*.lumimap"))
     capsys.readouterr()
-    assert run("info", newest) == parser.OK
+    assert run("info", newest) == console.OK
     assert "2nd floor, east" in capsys.readouterr().out
-    assert run("name", file, "x" * (LONGEST_NAME + 1)) == parser.FAILED
+    assert run("name", file, "x" * (LONGEST_NAME + 1)) == console.FAILED
 
 
 @pytest.mark.parametrize("verb", ["export", "render", "align", "name"])
@@ -253,7 +254,7 @@ def test_files_that_are_no_maps(verb: str, tmp_path: Path, capsys: pytest.Captur
     more: dict[str, list[object]] = {"export": ["--out", tmp_path / "o"], "render": [tmp_path / "o.png"]}
     for path in (bad, tmp_path / "none.lumimap"):
         words = more.get(verb, ["--point=0,0=0,0"] if verb == "align" else ["hall"])
-        assert run(verb, path, *words) == parser.FAILED
+        assert run(verb, path, *words) == console.FAILED
         assert str(path) in capsys.readouterr().err
 
 
@@ -262,7 +263,7 @@ def test_while_a_daemon_keeps_its_maps_there_nothing_is_written(
 ) -> None:
     daemon = Store(file.parent)
     daemon.save(packed(made, meta_of(made, 2.0, "robot", "1")), MAP)
-    assert run("name", file, "hall") == parser.FAILED
+    assert run("name", file, "hall") == console.FAILED
     assert "stop the daemon, or name --out" in capsys.readouterr().err
     daemon.close()
 
@@ -276,6 +277,6 @@ def test_a_place_that_cannot_be_written_is_named(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "none" / "b.lumimap"
-    assert parser.main(["map", "name", str(file), "hall", "--out", str(out)]) == parser.FAILED
+    assert parser.main(["map", "name", str(file), "hall", "--out", str(out)]) == console.FAILED
     said = capsys.readouterr().err
     assert f"{out}: cannot be written: No such file or directory; name another place with --out FILE" in said

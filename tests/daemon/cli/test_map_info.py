@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.cli import parser
+from daemon.system import console
 from tests.daemon.mapmaker import Shape, content
 
 ROOT = Path(__file__).parents[3]
@@ -18,11 +19,11 @@ ROOT = Path(__file__).parents[3]
 def test_info_says_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.lumimap"
     path.write_bytes(content(Shape(lit=True, submaps=7, loose=1)))
-    assert parser.main(["map", "info", str(path)]) == parser.OK
+    assert parser.main(["map", "info", str(path)]) == console.OK
     said = capsys.readouterr().out
     for words in ("map id            00001234", "second floor, Süd", "the light survey's", "2017-07-14 02:40:00 UTC"):
         assert words in said
-    assert parser.main(["map", "info", str(path), "--json"]) == parser.OK
+    assert parser.main(["map", "info", str(path), "--json"]) == console.OK
     found = json.loads(capsys.readouterr().out)
     assert (found["submaps"], found["isolated_submaps"], found["lamps"]) == (6, 1, 6)
     assert found["bytes"] == path.stat().st_size
@@ -33,16 +34,16 @@ def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, capsys: pyt
     good.write_bytes(content())
     bad.write_bytes(content()[:-1])
     torn.write_bytes(content(Shape(submaps=8, loose=2)))
-    assert parser.main(["map", "verify", str(good), str(torn)]) == parser.OK
+    assert parser.main(["map", "verify", str(good), str(torn)]) == console.OK
     said = capsys.readouterr().out
     assert f"{good}: good, map 00001234\n" in said
     assert "2 submaps joined with the rest by nothing" in said
-    assert parser.main(["map", "verify", str(good), str(bad), str(tmp_path / "none")]) == parser.FAILED
+    assert parser.main(["map", "verify", str(good), str(bad), str(tmp_path / "none")]) == console.FAILED
     said = capsys.readouterr().err
     assert f"{bad}: it is" in said
     assert "cut off" in said
     assert "none: cannot be read: No such file or directory" in said
-    assert parser.main(["map", "info", str(bad)]) == parser.FAILED
+    assert parser.main(["map", "info", str(bad)]) == console.FAILED
 
 
 def test_no_compiler_is_loaded_for_it(tmp_path: Path) -> None:

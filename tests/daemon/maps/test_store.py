@@ -12,11 +12,12 @@ import pytest
 
 from daemon.config.paths import maps_folder
 from daemon.config.schema import MapConfig
+from daemon.devices.light_setup import Lights
 from daemon.maps import store as module
 from daemon.maps.container import Damaged
+from daemon.maps.initial_state import new_state
 from daemon.maps.schema import digest_of
 from daemon.maps.store import NEWEST, OTHERS, NoMap, Store, recorded_start, started
-from daemon.runtime.light_setup import Lights, new_state
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
 from tests.daemon.mapmaker import LAMPS, SURVEY, Shape, content

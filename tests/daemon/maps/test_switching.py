@@ -27,6 +27,7 @@ from daemon.recording.recorder import Recorder
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
+from daemon.system import console
 from estimator.mapping.map_snapshot import MapImage, restored
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
@@ -49,13 +50,13 @@ def folder_of_two(folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Pat
     ids = []
     for moved in (False, True):
         before = set(maps.glob("*.lumimap"))
-        assert parser.main(["map", "import", drawing, "--set", setting]) == parser.OK
+        assert parser.main(["map", "import", drawing, "--set", setting]) == console.OK
         (path,) = set(maps.glob("*.lumimap")) - before
         ids.append(int(path.name.split("-")[1], 16))
         if moved:
             points = se2.apply(MOVED, np.array([(0.0, 0.0), (7.0, 3.5)]))
             words = [f"--point=0,0={points[0, 0]},{points[0, 1]}", f"--point=7,3.5={points[1, 0]},{points[1, 1]}"]
-            assert parser.main(["map", "align", str(path), *words]) == parser.OK
+            assert parser.main(["map", "align", str(path), *words]) == console.OK
             ids[1] = int(capsys.readouterr().out.split()[-1], 16)
     return maps, ids[0], ids[1]
 
@@ -144,7 +145,7 @@ def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
     assert posed[-1].jumps > posed[at - 1].jumps
     saved = [one for one in Store(maps).generations() if one.map_id == second]
     assert (len(saved) == 2) is not localise, "the map in use is saved before it is left"
-    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert_the_same(summary, bench.daemon.cycle.cycles)
 
@@ -202,7 +203,7 @@ def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_
     else:
         assert len(ids) == 1
         assert ids.isdisjoint({first}), "the new map does not take its ID"
-    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert_the_same(summary, bench.daemon.cycle.cycles)
 

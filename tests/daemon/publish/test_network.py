@@ -19,9 +19,10 @@ from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig, O
 from daemon.health.faults import Fault
 from daemon.health.reasons import Reason
 from daemon.publish import udp_subscriptions
+from daemon.publish.feeds import Feeds
 from daemon.publish.modbus import registers
 from daemon.publish.modbus.holding import COMMAND_ADDRESS, CommandCode, Outcome
-from daemon.publish.network import Feeds, Network
+from daemon.publish.network import Network
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.publish import stream_client, stream_server
+from daemon.publish import stream_server, stream_session
 from daemon.publish.stream_server import Client, StreamServer, scan_message
 from daemon.snapshot import Snapshot, State
 from hal.clock import run_virtual
@@ -184,7 +184,7 @@ def test_a_slow_client_gets_the_latest_and_every_event_and_others_all(tmp_path: 
 
 
 def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_client, "STUCK_S", 0.05)
+    monkeypatch.setattr(stream_session, "STUCK_S", 0.05)
 
     async def body(server: StreamServer) -> None:
         tap = await wanting(server, "pose")
@@ -244,20 +244,20 @@ def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.Mon
         client.connection_made(wire)
         for turn in (1, 2):
             client.data_received((stream_server.framed({"want": []}) + stream_server.framed({"want": ["map"]})) * 50)
-            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_client.REQUESTS_PER_TURN, False)
+            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_session.REQUESTS_PER_TURN, False)
             await asyncio.sleep(2.0)
             assert (len(asked), wire.reading) == (100 * turn, True)
         assert asked == [frozenset(), frozenset({"map"})] * 100
         client.data_received(stream_server.framed({"want": []}) * 50)
         wire.close()
         await asyncio.sleep(2.0)
-        assert len(asked) == 200 + stream_client.REQUESTS_PER_TURN, "who has gone asks no more"
+        assert len(asked) == 200 + stream_session.REQUESTS_PER_TURN, "who has gone asks no more"
 
     run_virtual(body())
 
 
 def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_client, "CLIENTS", 2)
+    monkeypatch.setattr(stream_session, "CLIENTS", 2)
 
     async def body(server: StreamServer) -> None:
         taps = [await connected(server) for _ in range(2)]
@@ -310,7 +310,7 @@ def test_any_bytes_from_a_client_do_no_harm(chunks: list[bytes]) -> None:
     for chunk in chunks:
         client.data_received(chunk)
     assert client.wants <= set(stream_server.TOPICS)
-    assert len(client._received) <= stream_client.LONGEST_REQUEST + 4 or client.wants == frozenset()
+    assert len(client._received) <= stream_session.LONGEST_REQUEST + 4 or client.wants == frozenset()
 
 
 def test_a_scan_message_names_everything_a_reader_needs() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from daemon.maps import tiles as maps_tiles
 from daemon.maps.tiles import MapTiles
-from daemon.publish import stream_client, stream_server, stream_ticker
+from daemon.publish import stream_server, stream_session, stream_ticker
 from daemon.publish.stream_server import StreamServer
 from estimator import pipeline
 from estimator.mapping import grid_patches, live_grid
@@ -42,7 +42,7 @@ def test_faults_are_told_at_first_and_when_they_change(tmp_path: Path) -> None:
 def test_raw_bytes_are_told_as_they_pass_and_a_stuck_client_gets_the_latest_and_a_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream_client, "BUFFER_BYTES", 4096)
+    monkeypatch.setattr(stream_session, "BUFFER_BYTES", 4096)
 
     async def body(server: StreamServer) -> None:
         tap = await wanting(server, "raw", "state")
@@ -206,7 +206,7 @@ def test_drawing_that_has_failed_is_tried_again(
 
 
 def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_client, "BUFFER_BYTES", 1024)
+    monkeypatch.setattr(stream_session, "BUFFER_BYTES", 1024)
     monkeypatch.setattr(stream_server, "TILE_BYTES", 1)
 
     async def body(server: StreamServer) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.replay import replay
 from daemon.config.schema import Config
 from daemon.health.faults import Fault
 from daemon.recording import checkpoint, disk_writer, flight_recorder
@@ -19,6 +18,8 @@ from daemon.recording.disk_writer import CLOCK, SegmentWriter
 from daemon.recording.replay_start import CYCLE_PARTS
 from daemon.recording.retention import ABOUT, DUMP, Flight
 from daemon.recording.state_file import read_header
+from daemon.replay.log_replay import replay
+from daemon.system import console
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
 from hal.replay.recording import Kind, frames_in, open_recording
@@ -43,7 +44,7 @@ def let_write(seconds: float) -> None:
 
 
 def replayed(folder: Path, out: Path) -> dict[str, dict[str, Any]]:
-    assert parser.main(["replay", str(folder), "--out", str(out)]) == parser.OK
+    assert parser.main(["replay", str(folder), "--out", str(out)]) == console.OK
     summary: dict[str, dict[str, Any]] = json.loads((out / "summary.json").read_text())
     return summary
 

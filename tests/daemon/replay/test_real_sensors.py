@@ -17,8 +17,9 @@ import numpy.typing as npt
 import pytest
 
 from daemon.app import Daemon, World
-from daemon.cli.replay import Given, replay
 from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
+from daemon.replay.log_replay import replay
+from daemon.replay.recorded_inputs import Given
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle import CycleRecord
 from daemon.runtime.worker import CycleWorker

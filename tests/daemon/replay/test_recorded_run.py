@@ -25,6 +25,7 @@ from daemon.recording.recorder import CycleEntry, Recorder, decode_cycle
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
+from daemon.system import console
 from estimator.measurements import Command, Limits, Order
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
@@ -134,7 +135,7 @@ def record(
 
 
 def replay(folder: Path, out: Path) -> dict[str, dict[str, object]]:
-    assert parser.main(["replay", str(folder), "--out", str(out)]) == parser.OK
+    assert parser.main(["replay", str(folder), "--out", str(out)]) == console.OK
     summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -327,7 +328,7 @@ def test_a_recording_with_a_hole_says_where_it_is_not_the_same_run_any_more(
 def test_a_person_may_replay_with_another_configuration(tmp_path: Path) -> None:
     record(tmp_path / "rec", calm)
     arguments = ["--out", str(tmp_path / "out"), "--set", "lidar.mount.yaw=29"]
-    assert parser.main(["replay", str(tmp_path / "rec"), *arguments]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), *arguments]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["config"]["lidar"]["mount"] == {"x": 0.1, "y": -0.02, "yaw": 29.0, "inverted": False}
     assert summary["config"]["lidar"]["device"] == USB  # what nobody asked for is as recorded

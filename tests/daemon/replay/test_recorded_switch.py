@@ -11,10 +11,10 @@ from msgspec.structs import replace
 
 from daemon.app import Daemon
 from daemon.config.schema import MapConfig
+from daemon.devices.light_setup import Lights
 from daemon.maps.store import started
 from daemon.recording import disk_writer, flight_recorder, retention
 from daemon.recording.recorder import Recorder
-from daemon.runtime.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.measurements import Command, Order
 from hal.clock import run_virtual

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 
+from daemon.devices.light_setup import Lights
 from daemon.runtime import warmup
-from daemon.runtime.light_setup import Lights
 from daemon.runtime.warmup import Warmth, kernel_count, warm_up
 from daemon.system.kernel_lock import KernelLock, waits
 from estimator.cdma.air_interface import PROFILE_A
@@ -188,7 +188,7 @@ def test_a_start_loads_nothing_it_does_not_use(lit: bool) -> None:
     overrides = ("photodiode.bus=/dev/i2c-1",) if lit else ()
     code = (
         "import sys; import daemon.app; from daemon.runtime import warmup\n"
-        "from daemon.config.loader import load; from daemon.runtime.light_setup import load_lights\n"
+        "from daemon.config.loader import load; from daemon.devices.light_setup import load_lights\n"
         f"warmth = warmup.load(load_lights(load(None, {overrides}))); assert (warmth.code_us > 0) is {lit}\n"
         "print(warmth.compiled)\n"
         "heavy = {'scipy.linalg', 'scipy.sparse', 'scipy.spatial', 'pymodbus.server', 'serial', 'matplotlib'}\n"

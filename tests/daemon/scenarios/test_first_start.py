@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.config.survey_loader import write_survey
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
 from daemon.snapshot import State
 from estimator.cdma.air_interface import PROFILE_A
@@ -61,7 +61,7 @@ from importlib import import_module
 from pathlib import Path
 import daemon.recording.recorder, daemon.cli.run
 from daemon.runtime import warmup
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
 

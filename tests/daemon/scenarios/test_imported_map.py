@@ -16,6 +16,7 @@ from daemon.maps.store import started
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
+from daemon.system import console
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
@@ -84,11 +85,11 @@ def test_a_robot_in_an_imported_and_moved_map_is_where_it_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     maps = tmp_path / "maps"
-    assert parser.main(["map", "import", str(draw(tmp_path)), "--set", f"map.folder={maps}"]) == parser.OK
+    assert parser.main(["map", "import", str(draw(tmp_path)), "--set", f"map.folder={maps}"]) == console.OK
     (first,) = maps.glob("*.lumimap")
     points = se2.apply(MOVED, np.array([(0.0, 0.0), (7.0, 3.5)]))
     words = [f"--point=0,0={points[0, 0]},{points[0, 1]}", f"--point=7,3.5={points[1, 0]},{points[1, 1]}"]
-    assert parser.main(["map", "align", str(first), *words]) == parser.OK
+    assert parser.main(["map", "align", str(first), *words]) == console.OK
     map_id = int(capsys.readouterr().out.split()[-1], 16)
     snapshots, room = published(MapConfig(folder=str(maps), localise=True), 30.0)
     posed = [one for one in snapshots if one.pose is not None]

@@ -15,9 +15,10 @@ import pytest
 from daemon.app import Daemon, World
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, LightsConfig, ModbusConfig, PhotodiodeConfig
+from daemon.config.survey_loader import SurveyError
+from daemon.devices.light_setup import Lights, load_lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.light_setup import Lights, SurveyError, load_lights
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import LightPicture, Snapshot
 from estimator.cdma.air_interface import PROFILE_A, PROFILE_B

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 from daemon.config.survey_loader import write_survey
+from daemon.devices.light_setup import Lights
 from daemon.devices.sample_clock import FILE
 from daemon.health.faults import Fault
 from daemon.publish.modbus import registers
-from daemon.runtime.light_setup import Lights
 from daemon.runtime.warmup import load
 from estimator.cdma.air_interface import PROFILE_A
 from hal.bus.i2c_server import BusServer

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from daemon.devices.light_setup import Lights
 from daemon.publish.modbus.points import Value
-from daemon.runtime.light_setup import Lights
 from daemon.runtime.warmup import load
 from daemon.snapshot import State
 from estimator.cdma.air_interface import PROFILE_A

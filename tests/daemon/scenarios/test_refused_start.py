@@ -17,6 +17,7 @@ import pytest
 from daemon import app
 from daemon.app import Daemon, World
 from daemon.cli import parser, run
+from daemon.system import console
 from hal.clock import LoopClock, run_virtual
 from hal.fake.transport import FakeOpener
 from tests.daemon.driven import during
@@ -44,7 +45,7 @@ def test_it_is_not_started_again_at_once(
 ) -> None:
     monkeypatch.setattr(run, "ANEW_S", 0.5)
     begun = time.monotonic()
-    assert parser.main(refused(tmp_path / "maps")) == parser.FAILED
+    assert parser.main(refused(tmp_path / "maps")) == console.FAILED
     assert time.monotonic() - begun >= 0.5
     assert b"STATUS=cannot start" in manager.recv(1000)
 
@@ -52,7 +53,7 @@ def test_it_is_not_started_again_at_once(
 def test_at_a_terminal_the_answer_comes_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     begun = time.monotonic()
-    assert parser.main(refused(tmp_path / "maps")) == parser.FAILED
+    assert parser.main(refused(tmp_path / "maps")) == console.FAILED
     assert time.monotonic() - begun < run.ANEW_S / 2
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from daemon.cli import parser
 from daemon.config.paths import streams_served
+from daemon.system import console
 
 REFUSED = ("run", "--set", "map.localise=true", "--set", "modbus.port=0")
 """A run that ends at once: it needs a map, and there is none."""
@@ -31,12 +32,12 @@ def test_one_of_the_same_name_runs_already(
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
         other.bind(str(tmp_path / where / "bay3.stream"))
         other.listen()
-        assert parser.main([*command, "name=bay4"]) == parser.FAILED
+        assert parser.main([*command, "name=bay4"]) == console.FAILED
         assert "already" not in caplog.text
-        assert parser.main([*command, "name=bay3"]) == parser.FAILED
+        assert parser.main([*command, "name=bay3"]) == console.FAILED
         assert f"a daemon named bay3 runs on this computer already ({tmp_path / where / 'bay3.stream'})" in caplog.text
     caplog.clear()
-    assert parser.main([*command, "name=bay3"]) == parser.FAILED  # what a dead one has left is none
+    assert parser.main([*command, "name=bay3"]) == console.FAILED  # what a dead one has left is none
     assert "already" not in caplog.text
 
 

@@ -16,13 +16,14 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
 from daemon.cli import parser
+from daemon.publish.stream_client import Stream
+from daemon.system import console
 from taps import zenoh_session
 from taps.fleet import messages, robot, show
 from taps.fleet.claim import SURE_S, Claim
 from taps.fleet.messages import LoopTold, StateTold
 from taps.fleet.robot import tell
 from taps.fleet.roster import MOST_ROBOTS, Roster
-from taps.stream.client import Stream
 from taps.zenoh_session import config, joined
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 from tests.taps.serving import served
@@ -292,7 +293,7 @@ def in_a_loop_of_its_own(words: list[str]) -> int:
 def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def body(made: Router, words: list[str]) -> None:
         await asyncio.sleep(1.0)
-        assert await asyncio.to_thread(in_a_loop_of_its_own, ["fleet", "--router", made.address, *words]) == parser.OK
+        assert await asyncio.to_thread(in_a_loop_of_its_own, ["fleet", "--router", made.address, *words]) == console.OK
 
     picture = tmp_path / "fleet.png"
     with served(tmp_path / "s"), served(tmp_path / "t", place=(3.0, -4.0, 1.0)), router() as made:
@@ -315,7 +316,7 @@ def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.
             assert any("2" in line and "#" in line for line in drawn)
             assert said == f"{picture}: agv2 red"  # agv1 is beyond the tile that there is
             assert picture.read_bytes()[:4] == b"\x89PNG"
-        assert parser.main(["fleet", "--router", made.address]) == parser.FAILED
+        assert parser.main(["fleet", "--router", made.address]) == console.FAILED
         assert "no robot tells anything" in capsys.readouterr().err
 
 
@@ -381,7 +382,7 @@ def test_who_asks_once_does_not_wait_for_ever(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("taps.fleet.show.ROUTER_S", 0.3)
-    assert parser.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == parser.FAILED
+    assert parser.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == console.FAILED
     told = capsys.readouterr()
     assert told.out == ""
     assert "no router answers at tcp/127.0.0.1:1 within 0.3 s: start one (`lumiloop fleet router`)" in told.err

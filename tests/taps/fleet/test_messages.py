@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daemon.publish.stream_messages import Fault, Pose, Trust
 from taps.fleet import drawing, messages
 from taps.fleet.messages import Held, MapHead, PoseTold, StateTold, Unreadable
 from taps.fleet.roster import Roster
 from taps.metrics.vda5050 import position_v2
-from taps.stream.messages import Fault, Pose, Trust
 from taps.stream.tiles import FREE, UNSEEN, WALL
 
 POSE = Pose(

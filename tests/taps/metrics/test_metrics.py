@@ -14,13 +14,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from daemon.publish.stream_client import Lost, Stream
+from daemon.publish.stream_messages import Fault, Faults, Hello, Pose, Statistics
 from daemon.snapshot import State
 from taps.metrics import server
 from taps.metrics.metrics import Told, exposition
 from taps.metrics.server import serve
 from taps.metrics.vda5050 import position, position_v2
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Fault, Faults, Hello, Pose, Statistics
 from taps.view.access_guard import Guard
 from tests.taps.serving import served
 

@@ -15,9 +15,9 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
+from daemon.publish.stream_client import Stream
 from taps.ros import node, rmw_zenoh, types
 from taps.ros.messages import TOPICS
-from taps.stream.client import Stream
 from taps.zenoh_session import config
 from tests.taps.routers import beside, router, told_to, until
 from tests.taps.serving import served

@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 from aiohttp import ClientSession, ClientWebSocketResponse, web
 
+from daemon.publish.stream_client import Stream
 from daemon.publish.stream_server import StreamServer
 from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
-from taps.stream.client import Stream
 from taps.view.access_guard import Guard
 from taps.view.page_hello import Scene
 from taps.view.replay_file import Film

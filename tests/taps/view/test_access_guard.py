@@ -87,7 +87,7 @@ def test_the_journal_is_told_no_token(
     said: list[str] = []
     monkeypatch.setattr(command, "to_journal", lambda: True)
     monkeypatch.setattr(command, "stopping", stopped)
-    monkeypatch.setattr("daemon.cli.parser.say", said.append)
+    monkeypatch.setattr("daemon.system.console.say", said.append)
     assert main(["view", "--write", "--port", "0"]) == 1
     assert "--token FILE" in capsys.readouterr().err
     file = tmp_path / "token"

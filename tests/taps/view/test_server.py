@@ -17,8 +17,8 @@ import pytest
 from aiohttp import WSServerHandshakeError
 
 from daemon.publish import stream_server as daemon_stream
+from daemon.publish.stream_messages import Loop, MapTiles, Scan
 from daemon.snapshot import State
-from taps.stream.messages import Loop, MapTiles, Scan
 from taps.view import server, viewers
 from taps.view.access_guard import Guard
 from tests.daemon.publish.test_stream_server import raw_scan, until

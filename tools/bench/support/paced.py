@@ -28,7 +28,7 @@ import numpy as np
 
 from daemon.app import Daemon, World
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from daemon.runtime.stall_watch import StallWatch
 from daemon.runtime.warmup import warm_up
 from daemon.runtime.worker import ThreadWorker

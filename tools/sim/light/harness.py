@@ -11,7 +11,7 @@ import numpy as np
 from daemon.app import World
 from daemon.config.schema import PhotodiodeConfig
 from daemon.devices.conversion import SampleBridge
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.cdma.epoch import LightEpoch
 from hal.adc import AdcStatus, Blemish, RawSamples

@@ -8,47 +8,21 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside
 from daemon.devices.photodiode import profile_of
-from daemon.maps.container import Damaged
 from estimator import PROFILES, Profile, Survey
-
-if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
-    from daemon.maps.store import Start
-    from estimator import LightsSetup, ResidualMap, Settings, State
-
-log = logging.getLogger(__name__)
-
-__all__ = [
-    "CannotBegin",
-    "Lights",
-    "SurveyError",
-    "begun",
-    "from_header",
-    "load_lights",
-    "lost_residuals",
-    "new_state",
-    "read_residuals",
-]
 
 HEADER: Final = "lights"
 """Key of a recording's head."""
 RESIDUALS: Final = "lights.residuals.npz"
 """File of a recording's folder."""
-
-
-class CannotBegin(Damaged):
-    """A map that passes every check of its file, and yet the estimator cannot be begun with it."""
-
-    remedy = "it is kept, the generation before it is used; please report it, with the file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,59 +114,3 @@ def _kept_residuals(folder: Path | None, digest: str) -> bytes:
 
 def _digest(residuals: bytes) -> str:
     return hashlib.sha256(residuals).hexdigest() if residuals else ""
-
-
-def new_state(lights: Lights | None, settings: Settings | None = None, start: Start | None = None) -> State:
-    """The estimator's state for a robot just switched on, and the map it begins with; loads the estimator.
-
-    A residual map that cannot be used is named in the log, and the robot drives without.
-
-    Raises:
-        CannotBegin: the map is at fault. ValueError: the survey or the stored sample clock is.
-    """
-    import estimator
-
-    setup = None if lights is None else _setup(lights)
-    if start is None:
-        return estimator.new_state(settings, setup)
-    from daemon.maps.image import image_from
-    from estimator import restored
-
-    settings = replace(settings or estimator.Settings(), localise=start.localise)
-    try:
-        return restored(image_from(start.stored, start.changed), settings, setup)
-    except Exception as error:  # what no check has foreseen must not end this start, and the next, and the next
-        estimator.new_state(settings, setup)  # what is wrong without a map too is not the map's fault
-        if isinstance(error, MemoryError):
-            raise
-        raise CannotBegin(f"it passes every check, but cannot be made into a state: {error!r}") from error
-
-
-def begun(lights: Lights | None, settings: Settings, start: Start | None) -> State:
-    """The same for a replay: the run that began without a map that it could not be begun with is repeated so."""
-    try:
-        return new_state(lights, settings, start)
-    except CannotBegin as error:
-        log.error("the stored map is not used: %s", error)
-        return new_state(lights, settings)
-
-
-def _setup(lights: Lights) -> LightsSetup:
-    from estimator import LightsSetup
-
-    return LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights))
-
-
-def _learned(lights: Lights) -> ResidualMap | None:
-    """The residual map, None where there is none or it is of no use."""
-    if not lights.residuals:
-        return None
-    from daemon.config.residual_file import ResidualError, unpack
-
-    try:
-        residuals = unpack(lights.residuals, lights.survey, "the residual map beside the survey")
-    except ResidualError as error:
-        log.warning("%s; driving without it", error)
-        return None
-    log.info("residual map of %d lamps", len(residuals.lamp_ids))
-    return residuals
