@@ -29,10 +29,10 @@ from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
 from daemon.health.thread_watch import COMPUTING_S, DISK_S, Answers
 from daemon.maps.autosave import About, Keeper
-from daemon.maps.initial_state import CannotBegin, new_state
+from daemon.maps.initial_state import CannotBegin, NoMap, new_state
 from daemon.maps.last_pose import LastPose
 from daemon.maps.schema import digest_of
-from daemon.maps.store import NoMap, Start, judge_for
+from daemon.maps.store import Start, judge_for
 from daemon.maps.switching import Maps, MapSwitch, Switch, take_over
 from daemon.publish.feeds import Feeds
 from daemon.publish.network import Network

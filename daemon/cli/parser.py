@@ -170,7 +170,7 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
     export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
     config_arguments(export)
-    export.set_defaults(body=estimating("daemon.cli.map_export", "main"))
+    export.set_defaults(body=estimating("daemon.cli.maps.export", "main"))
     taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
     taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
     taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
@@ -178,20 +178,20 @@ def _map(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE", help="default: the configured folder of maps; the next start takes it"
     )
     config_arguments(taken)
-    taken.set_defaults(body=estimating("daemon.cli.map_convert", "take_in", "warm-plan"))
+    taken.set_defaults(body=estimating("daemon.cli.maps.convert", "take_in", "warm-plan"))
     render = verbs.add_parser("render", help="draw a map file as a picture")
     render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
     config_arguments(render)
-    render.set_defaults(body=estimating("daemon.cli.map_convert", "render", "warm-plan"))
+    render.set_defaults(body=estimating("daemon.cli.maps.convert", "render", "warm-plan"))
     _map_changes(verbs)
     info = verbs.add_parser("info", help="say what a map file holds")
     info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     info.add_argument("--json", action="store_true", help="machine-readable output")
-    info.set_defaults(body=loaded("daemon.cli.map_info", "info"))
+    info.set_defaults(body=loaded("daemon.cli.maps.info", "info"))
     verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
     verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
-    verify.set_defaults(body=loaded("daemon.cli.map_info", "verify"))
+    verify.set_defaults(body=loaded("daemon.cli.maps.info", "verify"))
 
 
 def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -214,7 +214,7 @@ def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
             metavar="FILE",
             help="default: beside FILE, as the newest; the daemon there has to be stopped",
         )
-        parser.set_defaults(body=loaded("daemon.cli.map_edit", verb))
+        parser.set_defaults(body=loaded("daemon.cli.maps.edit", verb))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ from daemon.config.survey_loader import SurveyError
 from daemon.devices.light_setup import load_lights
 from daemon.devices.sample_clock import SampleClock
 from daemon.environment import World
-from daemon.maps.store import NoMap, started
+from daemon.maps.initial_state import NoMap, started
 from daemon.runtime.stall_watch import StallWatch
 from daemon.runtime.warmup import CannotLoad, warm_up
 from daemon.system.console import FAILED, OK, USAGE

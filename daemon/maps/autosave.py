@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.maps.container import BadMap
+from daemon.maps.generations import said
 from daemon.maps.start_trial import PROOF_S
-from daemon.maps.store import Start, Store, said
+from daemon.maps.store import Start, Store
 from daemon.system.callbacks import OnDone
 from daemon.system.versions import release
 from hal.blocking_calls import beside

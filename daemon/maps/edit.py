@@ -18,8 +18,9 @@ import numpy.typing as npt
 from daemon.config.paths import maps_folder
 from daemon.config.schema import Config
 from daemon.maps.container import BadMap, pack
+from daemon.maps.generations import said
 from daemon.maps.schema import Meta, Stored, Tables, read
-from daemon.maps.store import Store, said
+from daemon.maps.store import Store
 from daemon.system.atomic_file import write_whole
 
 Array = npt.NDArray[np.float64]

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daemon.config.paths import maps_folder
+from daemon.config.schema import MapConfig
 from daemon.devices.light_setup import Lights
 from daemon.maps.container import Damaged
-from daemon.maps.store import Start
+from daemon.maps.schema import read
+from daemon.maps.store import Start, Store, judge_for
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from estimator import LightsSetup, ResidualMap, Settings, State
@@ -76,3 +81,48 @@ def _learned(lights: Lights) -> ResidualMap | None:
         return None
     log.info("residual map of %d lamps", len(residuals.lamp_ids))
     return residuals
+
+
+class NoMap(Exception):
+    """There is no map, and nothing can be done without one; names the folder and the remedy."""
+
+
+def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tuple[Store | None, Start | None]:
+    """The folder of maps and the map that a run begins with, as far as there are such.
+
+    Raises:
+        NoMap: a map is to be used as it is, and there is none that can be.
+    """
+    if not config.kept:
+        return None, None
+    store = Store(maps_folder(config.folder), mend)
+    if mend and not config.localise:
+        store.claim()
+    start = store.load(judge_for(lights))
+    if start is None and config.localise:
+        raise NoMap(
+            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
+            "one, or import one: lumiloop map import"
+        )
+    if start is None and store.refused:
+        log.error("no map in %s can be used; a new one is begun", store.folder)
+    if start is not None:
+        start = replace(start, localise=config.localise)
+        meta = start.stored.meta
+        named = f" ({meta.name})" if meta.name else ""
+        count = len(start.stored.tables["submap.key"])
+        log.info("map %08x%s of %d submaps loaded from %s", meta.map_id, named, count, store.folder)
+    return store, start
+
+
+def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
+    """The map in a recording's folder.
+
+    Raises:
+        OSError: it cannot be read. BadMap: it is not the one that the run began with, or not good.
+    """
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise Damaged(f"{path.name} is not the map that the recorded run began with")
+    stored = read(content)
+    return Start(content, stored, judge_for(lights)(stored)[1], localise)

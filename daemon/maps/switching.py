@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Final
 
 from daemon.maps.autosave import ADRIFT, DONE, FIXED, NO_MAP, Keeper
 from daemon.maps.container import BadMap
-from daemon.maps.store import Judge, Start, Store, said
+from daemon.maps.generations import said
+from daemon.maps.store import Judge, Start, Store
 from daemon.system.callbacks import OnDone
 from hal.blocking_calls import beside
 

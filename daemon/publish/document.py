@@ -13,13 +13,14 @@ from daemon.publish.document_tables import NOT_KNOWN, NOTICE, bit_rows, holding_
 from daemon.publish.document_udp import udp_page
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import (
+    counts,
     holding,
     integrity_block,
     lights_block,
     parts_block,
     registers,
     requests,
-    server,
+    tcp_endpoint,
     timing_block,
 )
 from daemon.publish.modbus.block import Block
@@ -275,11 +276,11 @@ def _limits() -> str:
         ("address outside the tables", "", "exception 2"),
         ("any other function", "", "exception 1"),
         ("an error of the daemon's own, which its log tells", "", "exception 4"),
-        ("TCP connections", str(server.MAX_CONNECTIONS),
-         f"the longest idle is dropped if idle for {server.EVICT_S:g} s, else the new one"),
-        ("TCP without a request", f"{server.IDLE_S:g} s", "closed"),
-        ("TCP request not completed", f"{server.PARTIAL_S:g} s", "closed"),
-        ("TCP answers not read", f"{server.STUCK_S:g} s", "closed"),
+        ("TCP connections", str(counts.MAX_CONNECTIONS),
+         f"the longest idle is dropped if idle for {tcp_endpoint.EVICT_S:g} s, else the new one"),
+        ("TCP without a request", f"{tcp_endpoint.IDLE_S:g} s", "closed"),
+        ("TCP request not completed", f"{tcp_endpoint.PARTIAL_S:g} s", "closed"),
+        ("TCP answers not read", f"{tcp_endpoint.STUCK_S:g} s", "closed"),
         ("what is not Modbus", "", "UDP: ignored; TCP: closed; the log names who sends it, once a minute"),
     ]  # fmt: skip
     return table(("what", "limit", "beyond it"), rows)

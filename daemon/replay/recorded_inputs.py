@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
@@ -13,13 +13,11 @@ from daemon.config.schema import Config, Mount
 from daemon.config.survey_loader import SurveyError
 from daemon.devices.light_setup import Lights, from_header, load_lights, lost_residuals
 from daemon.maps.container import BadMap
-from daemon.maps.store import START, NoMap, Start, recorded_start, started
+from daemon.maps.initial_state import NoMap, recorded_start, started
+from daemon.maps.store import START, Start
 from daemon.recording.recorder import MAP
 from daemon.replay.sources import Source
 from hal.errors import DataInvalid
-
-if TYPE_CHECKING:  # loaded only where somebody asks for matches
-    pass
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import json
 import time
 import zlib
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
@@ -18,9 +18,6 @@ from daemon.replay.sources import sha256_of
 from daemon.replay.trajectories import Ledger
 from daemon.system.versions import release, versions
 from estimator import Grid, Identity
-
-if TYPE_CHECKING:  # loaded only where somebody asks for matches
-    pass
 
 LONGEST_NAME: Final = 64
 """Of a map."""

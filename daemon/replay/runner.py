@@ -22,8 +22,8 @@ from daemon.health.assessment import REPLAYED, assess
 from daemon.health.faults import Fault
 from daemon.maps.container import BadMap
 from daemon.maps.grid_files import finest
-from daemon.maps.initial_state import begun, new_state
-from daemon.maps.store import Start, recorded_start
+from daemon.maps.initial_state import begun, new_state, recorded_start
+from daemon.maps.store import Start
 from daemon.maps.switching import take_over
 from daemon.recording.recorder import CycleEntry, light_of, switch_name
 from daemon.recording.replay_start import Restored

@@ -12,7 +12,8 @@ from typing import Final
 
 import zenoh
 
-from daemon.cli.status import NoAnswer, address_of
+from daemon.cli.status import address_of
+from daemon.publish.modbus.client import NoAnswer
 from daemon.system import console
 from daemon.system.atomic_file import reason_of
 from hal.run_server import work_until_told

@@ -20,11 +20,12 @@ from typing import Final
 
 from aiohttp import web
 
-from daemon.cli.status import NoAnswer, address_of
+from daemon.cli.status import address_of
 from daemon.config import loader
 from daemon.config.endpoints import in_url
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError
+from daemon.publish.modbus.client import NoAnswer
 from daemon.publish.stream_client import Stream
 from daemon.system import console
 from daemon.system.logging import to_journal

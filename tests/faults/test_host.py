@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.status import NoAnswer, Reader
 from daemon.health.faults import Fault
+from daemon.publish.modbus.client import NoAnswer, Reader
 from daemon.publish.modbus.holding import CommandCode, Outcome
 from daemon.publish.modbus.parts_block import FAULTS
 from daemon.runtime.heartbeat import BEAT_S, OVER_S

@@ -18,8 +18,9 @@ from typing import Any
 import pytest
 
 from daemon.cli import status as cli_status
+from daemon.cli import status_table
 from daemon.config.schema import Config, ModbusConfig
-from daemon.publish.modbus import lights_block, registers
+from daemon.publish.modbus import client, lights_block, registers
 from daemon.snapshot import Snapshot, State
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -341,16 +342,16 @@ def test_watching_shows_when_the_daemon_is_away(
 
 
 def test_watching_says_anew_what_is_new(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    away, refused = cli_status.NoAnswer("away"), cli_status.NoAnswer("refused")
+    away, refused = client.NoAnswer("away"), client.NoAnswer("refused")
     looks = iter([away, away, refused, {"seq": 1}, refused])
 
-    def read(_: cli_status.Reader) -> Any:
+    def read(_: client.Reader) -> Any:
         look = next(looks, KeyboardInterrupt())
         if isinstance(look, BaseException):
             raise look
         return look
 
-    monkeypatch.setattr(cli_status.Reader, "read", read)
+    monkeypatch.setattr(client.Reader, "read", read)
     monkeypatch.setattr("daemon.cli.status.time.sleep", lambda _: None)
     monkeypatch.setattr("daemon.cli.status._show", lambda *_: None)
     with pytest.raises(KeyboardInterrupt):
@@ -390,17 +391,17 @@ def test_on_a_terminal_watching_repaints(capsys: pytest.CaptureFixture[str], mon
 
 def test_a_time_that_is_none_is_not_made_up() -> None:
     reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0)))
-    assert "no time" in cli_status.as_table(reading | {"t_utc": None}, stalled=False)
-    assert cli_status.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
+    assert "no time" in status_table.as_table(reading | {"t_utc": None}, stalled=False)
+    assert status_table.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
 
 
 def test_an_age_or_a_sigma_at_the_end_of_its_register_may_be_any_larger() -> None:
     old = snapshot(reason=0, fault=0, t_sent=1300.0, covariance=(100.0, 0.0, 1e-4, 0.0, 0.0, 1e-4))
-    shown = cli_status.as_table(registers.decode_block(registers.encode_block(old)), stalled=False)
+    shown = status_table.as_table(registers.decode_block(registers.encode_block(old)), stalled=False)
     assert "age        > 6.5 s\n" in shown
     assert "sigma      > 6.5 m, 0.0100 m, 0.57 deg\n" in shown
 
 
 def test_a_state_of_a_newer_daemon_is_shown_by_number() -> None:
     reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0))) | {"state": 99}
-    assert "unknown to this reader (99)" in cli_status.as_table(reading, stalled=False)
+    assert "unknown to this reader (99)" in status_table.as_table(reading, stalled=False)

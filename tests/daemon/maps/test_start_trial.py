@@ -15,8 +15,9 @@ from daemon import app
 from daemon.app import Daemon, Pacemaker, World
 from daemon.config.schema import MapConfig
 from daemon.maps import autosave, start_trial
+from daemon.maps.initial_state import started
 from daemon.maps.start_trial import MOST, NAME, PROOF_S
-from daemon.maps.store import Start, started
+from daemon.maps.store import Start
 from daemon.runtime.warmup import CannotLoad
 from hal.clock import LoopClock, run_virtual
 from hal.fake.transport import FakeOpener

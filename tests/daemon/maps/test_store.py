@@ -13,11 +13,12 @@ import pytest
 from daemon.config.paths import maps_folder
 from daemon.config.schema import MapConfig
 from daemon.devices.light_setup import Lights
+from daemon.maps import generations
 from daemon.maps import store as module
 from daemon.maps.container import Damaged
-from daemon.maps.initial_state import new_state
+from daemon.maps.initial_state import NoMap, new_state, recorded_start, started
 from daemon.maps.schema import digest_of
-from daemon.maps.store import NEWEST, OTHERS, NoMap, Store, recorded_start, started
+from daemon.maps.store import NEWEST, OTHERS, Store
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
 from tests.daemon.mapmaker import LAMPS, SURVEY, Shape, content
@@ -208,7 +209,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     first = store_with(tmp_path, 1)
     with pytest.raises(BlockingIOError) as caught:
         Store(tmp_path).save(content(), MAP)
-    assert "another process" in module.said(caught.value)
+    assert "another process" in generations.said(caught.value)
     first.close()
     Store(tmp_path).save(content(), MAP)
 

@@ -20,8 +20,9 @@ from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig
 from daemon.maps import switching
 from daemon.maps.autosave import About, Keeper
 from daemon.maps.container import pack, unpack
+from daemon.maps.initial_state import started
 from daemon.maps.schema import read
-from daemon.maps.store import Store, started, unjudged
+from daemon.maps.store import Store, unjudged
 from daemon.maps.switching import Maps, MapSwitch
 from daemon.recording.recorder import Recorder
 from daemon.runtime.budget import FixedBudget

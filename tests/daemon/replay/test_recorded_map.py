@@ -11,7 +11,8 @@ import pytest
 from daemon.cli import parser
 from daemon.config.schema import Config, MapConfig
 from daemon.maps.image import meta_of, packed
-from daemon.maps.store import START, Start, Store, started
+from daemon.maps.initial_state import started
+from daemon.maps.store import START, Start, Store
 from daemon.replay.recorded_inputs import Given, start_for
 from daemon.replay.sources import open_log
 from daemon.snapshot import State

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from daemon.app import Daemon
 from daemon.config.schema import MapConfig
 from daemon.devices.light_setup import Lights
-from daemon.maps.store import started
+from daemon.maps.initial_state import started
 from daemon.recording import disk_writer, flight_recorder, retention
 from daemon.recording.recorder import Recorder
 from estimator.cdma.air_interface import PROFILE_A

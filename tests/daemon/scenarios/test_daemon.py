@@ -18,7 +18,7 @@ from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig, M
 from daemon.health.faults import Fault
 from daemon.health.reasons import Reason
 from daemon.integrity.evidence import SILENT_PERIODS
-from daemon.maps.store import started
+from daemon.maps.initial_state import started
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State

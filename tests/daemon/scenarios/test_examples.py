@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from daemon.app import Daemon, World
-from daemon.cli.status import Reader
 from daemon.config import loader
 from daemon.config.schema import Config
+from daemon.publish.modbus.client import Reader
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from hal.clock import LoopClock, run_virtual

@@ -74,7 +74,7 @@ new = [sys.modules[name] for name in sorted(set(sys.modules) - before) if name.s
 print([one.__name__ for one in new if "\\n@kernel(" in Path(one.__file__).read_text()])
 """
 OF_LIGHT = "loaded by the warm-up where there is a photodiode, and needed nowhere else"
-OFFLINE = {"daemon.cli.map_convert": "of `lumiloop export` and `lumiloop plan`, which are no daemons"}
+OFFLINE = {"daemon.cli.maps.convert": "of `lumiloop export` and `lumiloop plan`, which are no daemons"}
 EXCEPT = {
     "laser": OFFLINE | {"estimator.cdma.decoder": OF_LIGHT, "estimator.light_filter.light_channel": OF_LIGHT},
     "lit": OFFLINE,

@@ -12,7 +12,7 @@ from PIL import Image
 from daemon.app import Daemon, World
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig
-from daemon.maps.store import started
+from daemon.maps.initial_state import started
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from daemon.cli import status
+from daemon.cli import status_table
 from daemon.publish import document
 from daemon.publish.modbus import integrity_block, lights_block, registers, timing_block
 from daemon.publish.modbus.requests import Responder
@@ -111,11 +111,11 @@ def test_the_page_says_where_everything_is() -> None:
 def test_status_tells_what_is_left_out_and_when_it_stood_still() -> None:
     reading = registers.decode_block(registers.encode_block(snapshot()))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
-    calm = status.as_table(
+    calm = status_table.as_table(
         reading | timing_block.BLOCK.decode(timing_block.BLOCK.encode(snapshot(pulse=Pulse()))), stalled=False
     )
     assert "over budget\n" in calm
-    table = status.as_table(
+    table = status_table.as_table(
         reading | timing_block.BLOCK.decode(timing_block.BLOCK.encode(snapshot(pulse=PULSE))), stalled=False
     )
     assert "99 of 100 within 0.00800 s; no map work either; stood still 4 times, latest 0.123 s in MATCH" in table

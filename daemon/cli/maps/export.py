@@ -16,9 +16,9 @@ from daemon.system import console
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if is_map(args.log):
-        from daemon.cli import map_convert
+        from daemon.cli.maps import convert
 
-        return map_convert.export(args)
+        return convert.export(args)
     if args.tum or args.carmen:
         return console.fail(
             f"{args.log}: --tum and --carmen are of map files; `lumiloop replay` writes a log's trajectory"

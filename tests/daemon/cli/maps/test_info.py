@@ -13,7 +13,7 @@ from daemon.cli import parser
 from daemon.system import console
 from tests.daemon.mapmaker import Shape, content
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def test_info_says_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.maps.container import BadMap
+from daemon.maps.generations import said
 from daemon.maps.schema import Stored, read, summary
-from daemon.maps.store import said
 from daemon.system import console
 
 
