@@ -23,12 +23,12 @@ from daemon.devices.conversion import SampleBridge, ScanBridge
 from daemon.devices.light_setup import Lights, load_lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.devices.port_tap import tapped
-from daemon.environment import NoLidar, World
+from daemon.environment import Environment, NoLidar
 from daemon.health.assessment import Vitals
 from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
-from daemon.health.thread_watch import COMPUTING_S, DISK_S, Answers
-from daemon.maps.autosave import About, Keeper
+from daemon.health.thread_watch import COMPUTING_S, DISK_S, ThreadWatch
+from daemon.maps.autosave import About, MapAutosaver
 from daemon.maps.initial_state import CannotBegin, NoMap, new_state
 from daemon.maps.last_pose import LastPose
 from daemon.maps.schema import digest_of
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from daemon.recording.recorder import Recorder
     from estimator import State as Estimate
 
-__all__ = ["Daemon", "World"]
+__all__ = ["Daemon", "Environment"]
 
 log = logging.getLogger(__name__)
 
@@ -79,54 +79,56 @@ class Daemon:
         SurveyError: the survey of the lamps cannot be used.
     """
 
-    def __init__(self, settings: Config, world: World, recorder: Recorder | None = None) -> None:
+    def __init__(self, settings: Config, environment: Environment, recorder: Recorder | None = None) -> None:
         self.supervisor = Supervisor()
-        self._world = world
-        self._begun = world.clock.now()
+        self._environment = environment
+        self._begun = environment.clock.now()
         self._recorder = recorder
-        lights = world.lights or load_lights(settings)
-        opener = world.opener if recorder is None else recorder.tap(world.opener)
-        opener = opener if world.stream is None else tapped(opener, self._on_raw, world.clock)
+        lights = environment.lights or load_lights(settings)
+        opener = environment.opener if recorder is None else recorder.tap(environment.opener)
+        opener = opener if environment.stream is None else tapped(opener, self._on_raw, environment.clock)
         fitted = settings.lidar.fitted
-        self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
-        self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
-        self._estimator = _Estimator(lights, world.start, settings.map.localise)
+        self.lidar: Lidar = environment.make_lidar(settings.lidar, environment.clock, opener) if fitted else NoLidar()
+        self.adc = (
+            None if lights is None else environment.make_adc(settings.photodiode, environment.clock, environment.buses)
+        )
+        self._estimator = _Estimator(lights, environment.start, settings.map.localise)
         self.cycle = Cycle(
             Parts(
-                clock=world.clock,
+                clock=environment.clock,
                 step=self._estimator,
                 scans=ScanBridge(settings.lidar),
-                budget=world.make_budget(),
-                worker=world.make_worker(),
+                budget=environment.make_budget(),
+                worker=environment.make_worker(),
                 status=self.lidar.status,
                 lidar=fitted,
                 odometry=settings.odometry.port > 0,
                 samples=None if lights is None else SampleBridge(lights.profile),
                 blocks=None if lights is None or self.adc is None else BlockWatch(self.adc.status, lights.profile),
                 budget_us=1e3 * settings.cycle.budget_ms,
-                stopwatch=world.stopwatch,
+                stopwatch=environment.stopwatch,
                 tap=None if recorder is None else recorder.on_cycle,
-                map_id=world.draw_map_id() if world.start is None else world.start.stored.meta.map_id,
+                map_id=environment.draw_map_id() if environment.start is None else environment.start.stored.meta.map_id,
                 alert_m=settings.integrity.alert_m,
                 t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay begins at the same instant
             )
         )
-        self._estimator.lap = self.cycle.laps.lap
-        self.keeper = self._keeper(settings, lights)
-        self.last_pose = None if world.store is None else LastPose(world.store.folder, state_folder())
+        self._estimator.lap = self.cycle.stage_timer.lap
+        self.autosaver = self._autosaver(settings, lights)
+        self.last_pose = None if environment.store is None else LastPose(environment.store.folder, state_folder())
         self.maps = self._map_switch(lights)
         self.pacemaker = Pacemaker(self.cycle)
         self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
         on_samples = self.pacemaker.on_samples
         self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
-        self.network = Network(settings, world.clock, self._feeds(), world.stream)
-        kept = [] if self.last_pose is None else [self.last_pose.take]
-        self.cycle.parts.sinks += [*self.network.sinks, *kept, *world.sinks, _FirstPose()]
-        self.answers = self._answers()
-        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle), lambda: self.answers.alive)
+        self.network = Network(settings, environment.clock, self._feeds(), environment.stream)
+        kept = [] if self.last_pose is None else [self.last_pose.on_snapshot]
+        self.cycle.parts.sinks += [*self.network.sinks, *kept, *environment.sinks, _FirstPose()]
+        self.threads = self._watched_threads()
+        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle), lambda: self.threads.alive)
         self.cycle.parts.fault = self.heartbeat.fault
         drivers = self.lidar.status, None if self.adc is None else self.adc.status
-        reporter = Reporter(world.clock, self.supervisor, self.answers, lambda: self.heartbeat.faults, drivers)
+        reporter = Reporter(environment.clock, self.supervisor, self.threads, lambda: self.heartbeat.faults, drivers)
         self.cycle.parts.condition = reporter
         if recorder is not None:
             recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults)
@@ -154,13 +156,13 @@ class Daemon:
             log.info("stopping")
             self._keep_sample_clock()
             await _stop(tasks.get("cycle"))
-            saving = asyncio.create_task(self.keeper.finish(stop.is_set()), name="map at the stop")
+            saving = asyncio.create_task(self.autosaver.finish(stop.is_set()), name="map at the stop")
             for name in ("lidar", *tasks):  # the lidar before what only listens: its laser is to go off
                 await _stop(tasks.get(name))
             for task in (stopped, warming):
                 await _stop(task)
             self.cycle.parts.worker.close()
-            for kept in (self.last_pose, self._world.sample_clock):
+            for kept in (self.last_pose, self._environment.sample_clock):
                 if kept is not None:
                     kept.close()
             await saving
@@ -168,16 +170,16 @@ class Daemon:
                 self._recorder.close(ended=stop.is_set())
 
     async def _warm_up(self) -> None:
-        warmth = await self._world.warm_up()
+        warmth = await self._environment.warm_up()
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
-        if self._world.store is not None:
-            self._world.store.trial.begin()
-        if self._world.start is not None:
-            self._begin(self._world.start.stored.meta.map_id)
+        if self._environment.store is not None:
+            self._environment.store.trial.begin()
+        if self._environment.start is not None:
+            self._begin(self._environment.start.stored.meta.map_id)
             gc.freeze()  # the map stays
             self._remember()
-        self.keeper.loaded()
+        self.autosaver.loaded()
 
     def _begin(self, map_id: int) -> None:
         """Load the map that is stored; without it, and under another identity, where nothing can be begun with it.
@@ -187,7 +189,7 @@ class Daemon:
         Raises:
             NoMap: there is none that can be used, and `map.localise` asks for one.
         """
-        store = self._world.store
+        store = self._environment.store
         try:
             self._estimator.load()
         except CannotBegin as error:
@@ -197,8 +199,8 @@ class Daemon:
                 raise NoMap(f"map {map_id:08x} cannot be used, and `map.localise` is true; start again") from error
             self._estimator.start = None
             self._estimator.load()
-            self.cycle.map_id = self._world.draw_map_id()
-            self.keeper.without_start()
+            self.cycle.map_id = self._environment.draw_map_id()
+            self.autosaver.without_start()
             self.maps.ask(map_id, lambda why: log.warning("a new map is begun: %s", why) if why else None, patient=True)
 
     def _remember(self) -> None:
@@ -206,18 +208,25 @@ class Daemon:
         pose = None if self.last_pose is None else self.last_pose.of_map(self.cycle.map_id)
         if pose is not None:
             log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
-            self.cycle.inbox.put_command(Command(self._world.clock.now(), Order.REMEMBERED, np.array(pose)))
+            self.cycle.inbox.put_command(Command(self._environment.clock.now(), Order.REMEMBERED, np.array(pose)))
 
-    def _keeper(self, settings: Config, lights: Lights | None) -> Keeper:
+    def _autosaver(self, settings: Config, lights: Lights | None) -> MapAutosaver:
         survey = "" if lights is None else digest_of(lights.survey)
         about = About(settings.name, survey, settings.map.localise)
-        world, cycle = self._world, self.cycle
-        return Keeper(world.store, world.start, lambda: self._estimator.state, lambda: cycle.map_id, about, world.clock)
+        environment, cycle = self._environment, self.cycle
+        return MapAutosaver(
+            environment.store,
+            environment.start,
+            lambda: self._estimator.state,
+            lambda: cycle.map_id,
+            about,
+            environment.clock,
+        )
 
     def _map_switch(self, lights: Lights | None) -> MapSwitch:
         keep = None if self._recorder is None else self._recorder.keep_switch
-        maps = Maps(self._world.store, judge_for(lights), self._estimator.made, keep)
-        return MapSwitch(maps, self.keeper, self._put_switch)
+        maps = Maps(self._environment.store, judge_for(lights), self._estimator.made, keep)
+        return MapSwitch(maps, self.autosaver, self._put_switch)
 
     def _put_switch(self, switch: Switch | None, taken: Callable[[], None]) -> None:
         """The cycle takes it over (None: does not after all); what is kept of maps knows it in the same instant."""
@@ -227,7 +236,7 @@ class Daemon:
 
         def take_over() -> tuple[int, str]:
             self._estimator.take_over(switch)
-            self.keeper.switched(switch.map_id, switch.start)
+            self.autosaver.switched(switch.map_id, switch.start)
             taken()
             return switch.map_id, switch.sha256
 
@@ -236,8 +245,8 @@ class Daemon:
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
         parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._take_scan)}
-        if self._world.store is not None:
-            parts["map"] = self.keeper.run
+        if self._environment.store is not None:
+            parts["map"] = self.autosaver.run
         if (adc := self.adc) is not None:
             parts["photodiode"] = lambda: adc.run(self._take_samples)
         if self.network.stream is not None:
@@ -248,10 +257,10 @@ class Daemon:
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
-    def _answers(self) -> Answers:
+    def _watched_threads(self) -> ThreadWatch:
         """The threads that are watched."""
-        answers, keeper, worker = Answers(), self.keeper, self.cycle.parts.worker
-        answers.watch(Thread.MAP, lambda: keeper.busy_since, DISK_S)
+        answers, autosaver, worker = ThreadWatch(), self.autosaver, self.cycle.parts.worker
+        answers.watch(Thread.MAP, lambda: autosaver.busy_since, DISK_S)
         if isinstance(worker, ThreadWorker):
             answers.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
             answers.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
@@ -287,14 +296,14 @@ class Daemon:
             on_odometry,
             on_imu,
             on_command=cycle.inbox.put_command,
-            on_save=self.keeper.ask,
+            on_save=self.autosaver.ask,
             on_dump=None if recorder is None else recorder.box.dump,
             on_switch=self.maps.ask,
             on_loop_seen=cycle.loops_seen,
         )
 
     def _keep_sample_clock(self) -> None:
-        result, store = self.cycle.result, self._world.sample_clock
+        result, store = self.cycle.result, self._environment.sample_clock
         if store is not None and result is not None and result.lights is not None:
             store.learn(result.lights.clock_ppm)
 
@@ -303,17 +312,17 @@ class Daemon:
         line_up()
         if self.cycle.cycles == 0:
             self.cycle.announce()
-            if self._world.clock.now() - self._begun < STARTING_S:
+            if self._environment.clock.now() - self._begun < STARTING_S:
                 notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
         failed = self.supervisor.failed | self.network.failing
         failed |= set() if self._recorder is None else self._recorder.failing
-        if self.keeper.error:
+        if self.autosaver.error:
             failed.add("map")
         if self.last_pose is not None and self.last_pose.error:
             failed.add("last pose")
-        if self.keeper.refused:
+        if self.autosaver.refused:
             failed.add("stored map")
-        if self.answers.look() - {Thread.I2C}:  # a bus has faults of its own
+        if self.threads.look() - {Thread.I2C}:  # a bus has faults of its own
             failed.add("thread")
         return vitals(self.cycle, failed, max(lateness, self.pacemaker.latest()))
 

@@ -72,7 +72,7 @@ class NoLidar:
 
 
 @dataclass(slots=True)
-class World:
+class Environment:
     """What the daemon meets outside itself. A test replaces any of it; the defaults are the real thing.
 
     Attributes:

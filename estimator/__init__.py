@@ -57,13 +57,13 @@ if TYPE_CHECKING:
     from estimator.measurements import Array as Array
     from estimator.measurements import Beam as Beam
     from estimator.measurements import Command as Command
+    from estimator.measurements import DegradationLevel as DegradationLevel
     from estimator.measurements import Imu as Imu
     from estimator.measurements import Job as Job
     from estimator.measurements import Limits as Limits
     from estimator.measurements import Odometry as Odometry
     from estimator.measurements import Order as Order
     from estimator.measurements import Record as Record
-    from estimator.measurements import Rung as Rung
     from estimator.measurements import SampleBlock as SampleBlock
     from estimator.measurements import Scan as Scan
     from estimator.measurements import no_lap as no_lap
@@ -105,7 +105,8 @@ NAMES_OF: Final = {
     "commands": "forget",
     # records that a step consumes, and what it may spend
     "measurements": (
-        "Answer Array Beam Command Imu Job Limits Odometry Order Record Rung SampleBlock Scan UNLIMITED no_lap"
+        "Answer Array Beam Command DegradationLevel Imu Job "
+        "Limits Odometry Order Record SampleBlock Scan UNLIMITED no_lap"
     ),
     # results of a step
     "result": "Fix LightsResult Link LinkState Loop LoopReason MatchResult Reason StepResult SURPRISE",

@@ -20,13 +20,13 @@ from estimator.measurements import (
     Answer,
     Array,
     Command,
+    DegradationLevel,
     Imu,
     Lap,
     LightEpoch,
     Limits,
     Odometry,
     Record,
-    Rung,
     SampleBlock,
     Scan,
     no_lap,
@@ -98,7 +98,7 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
     lap("match")
     if match.ok and kidnap_detection.waits(state):
         return match, -1
-    if not (limits.update_map and limits.rung < Rung.NO_MAP and keyframe_due(state, points, match)):
+    if not (limits.update_map and limits.level < DegradationLevel.NO_MAP and keyframe_due(state, points, match)):
         return match, -1
     if match.ok:
         learn_alike(state, oriented(points, limits.points))
@@ -110,7 +110,7 @@ def see(state: State, scan: Scan, limits: Limits, why: Reason | None, lap: Lap) 
 
 def passed_over(state: State, scan: Scan, limits: Limits) -> Reason | None:
     """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose, or it is too old."""
-    if limits.rung >= Rung.CARRIED:
+    if limits.level >= DegradationLevel.CARRIED:
         return Reason.PASSED_OVER
     return Reason.LATE if out_of_sequence.too_old(state, scan) else None
 
@@ -259,7 +259,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         aside=state.atlas.aside is not None,
         let_go=state.let_go,
         lag=state.lag.told,
-        jobs=state.atlas.take_jobs() if limits.rung < Rung.NO_MAP else (),
+        jobs=state.atlas.take_jobs() if limits.level < DegradationLevel.NO_MAP else (),
         anew=state.anew,
         protection=protection_level.bound(state, P),
     )

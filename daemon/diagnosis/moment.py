@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from daemon.health.reasons import Reason
-from daemon.integrity.motion_consistency import Told as Wheels
+from daemon.integrity.motion_consistency import MotionComparison as Wheels
 from daemon.recording.recorder import CycleEntry
 from daemon.runtime.cycle import Cycle, CycleRecord
 from daemon.snapshot import Snapshot, State
@@ -62,7 +62,7 @@ def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle:
         result=record.result,
         scan=record.scan,
         fresh=record.limits is not None,
-        wheels=cycle.observer.witnesses.told(),
+        wheels=cycle.observer.motion_consistency.compared(),
         dropped=len(record.dropped),
         orders=tuple(command.order for command in entry.commands),
         told=entry.reason,

@@ -7,7 +7,7 @@ from typing import Final
 
 from daemon.health.faults import Fault
 from daemon.health.supervisor import Supervisor
-from daemon.health.thread_watch import Answers
+from daemon.health.thread_watch import ThreadWatch
 from daemon.snapshot import Condition, Part
 from hal.adc import AdcStatus
 from hal.clock import Clock
@@ -40,7 +40,7 @@ class Reporter:
         self,
         clock: Clock,
         supervisor: Supervisor,
-        answers: Answers,
+        answers: ThreadWatch,
         faults: Callable[[], tuple[Fault, ...]],
         drivers: tuple[LidarStatus, AdcStatus | None],
     ) -> None:

@@ -34,7 +34,7 @@ class _Watched:
     limit_s: float
 
 
-class Answers:
+class ThreadWatch:
     """Watches threads; :meth:`look` once per heartbeat.
 
     Attributes:

@@ -33,7 +33,7 @@ class Arrivals:
         """When the latest one arrived; None: none has."""
         return self._at[-1] if self._at else None
 
-    def take(self, t_rx: float) -> None:
+    def on_reading(self, t_rx: float) -> None:
         """A reading has arrived; what came before a silence says nothing of the rate now."""
         if self._at and t_rx - self._at[-1] > ODOMETRY_SILENT_S:
             self._at.clear()

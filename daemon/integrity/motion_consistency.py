@@ -27,7 +27,7 @@ itself: on the recorded drive through the Intel Research Lab half of all windows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class MotionComparison:
     """The motion over some ``seconds`` as the ``laser`` and as the ``wheels`` tell it: T_then_now, (x, y, yaw)."""
 
     seconds: float
@@ -59,7 +59,7 @@ class _Seen:
     wheels: Array | None = None
 
 
-class Witnesses:
+class MotionConsistency:
     """Compares both motions; holds a few seconds of poses and nothing else."""
 
     def __init__(self) -> None:
@@ -92,10 +92,10 @@ class Witnesses:
 
     def agree(self) -> bool | None:
         """Whether both told the same motion over the window; None while that cannot be said."""
-        told = self.told()
+        told = self.compared()
         return None if told is None else told.agree
 
-    def told(self) -> Told | None:
+    def compared(self) -> MotionComparison | None:
         """What both told over the window; None while that cannot be said."""
         span = self._span()
         if span is None:
@@ -103,7 +103,7 @@ class Witnesses:
         old, new = span
         laser = se2.between(old.T_odom_base, new.T_odom_base)
         wheels = se2.between(self._wheels_at(old), self._wheels_at(new))
-        return Told(new.t_mono - old.t_mono, laser, wheels)
+        return MotionComparison(new.t_mono - old.t_mono, laser, wheels)
 
     def _span(self) -> tuple[_Seen, _Seen] | None:
         """Oldest and newest laser pose inside the window for which the wheels have spoken too."""

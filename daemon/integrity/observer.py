@@ -11,7 +11,7 @@ import numpy as np
 from daemon.health.reasons import Reason as Cause
 from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.integrity.evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
-from daemon.integrity.motion_consistency import Witnesses
+from daemon.integrity.motion_consistency import MotionConsistency
 from estimator import (
     SURPRISE,
     Array,
@@ -56,7 +56,7 @@ class Observer:
 
     def __init__(self, t_mono: float, odometry: bool, lidar: bool = True, lights: bool = False) -> None:
         """Start watching; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
-        self.witnesses = Witnesses()
+        self.motion_consistency = MotionConsistency()
         self.unused: Cause | None = None
         self._lidar, self._lights = lidar, lights
         self._t_samples = t_mono
@@ -105,7 +105,7 @@ class Observer:
         """What one cycle adds; call it once per cycle with everything the cycle consumed."""
         for record in records:
             if isinstance(record, Odometry):
-                self.witnesses.on_odometry(record)
+                self.motion_consistency.on_odometry(record)
             elif isinstance(record, SampleBlock | LightEpoch):
                 self._t_samples = t_mono
         ordered = self._take_orders(records)
@@ -128,7 +128,7 @@ class Observer:
             sigma_m=sigma_m,
             sigma_rad=sigma_rad,
             odometry=self.odometry_ok(t_mono),
-            agree=self.witnesses.agree(),
+            agree=self.motion_consistency.agree(),
             guessed=any(self._guessed),
             places=_places(result),
             ordered=ordered,
@@ -200,7 +200,7 @@ class Observer:
         off_m, off_rad = math.hypot(*found.correction[:2].tolist()), abs(float(found.correction[2]))
         match = Match(good(found), _axes(result.known_axes), off_m, off_rad)
         laser = found.known_axes if result.placed else result.known_axes  # what light has shown is no echo of the laser
-        self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
+        self.motion_consistency.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
         return match
 
     def _without_guesses(self, match: Match, result: StepResult, t_mono: float, ordered: bool) -> Match:

@@ -70,7 +70,7 @@ class About:
     localise: bool = False
 
 
-class Keeper:
+class MapAutosaver:
     """Keeps the map of a running estimator.
 
     Attributes:

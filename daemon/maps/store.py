@@ -27,7 +27,7 @@ from daemon.devices.light_setup import Lights
 from daemon.maps.container import BadMap, Damaged, Foreign
 from daemon.maps.generations import BROKEN, BROKEN_NAME, NAME, Generation, newest_number, said, verify
 from daemon.maps.schema import OtherBuilding, Stored, against_survey, read
-from daemon.maps.start_trial import LEFT_OUT, MOST, Trial
+from daemon.maps.start_trial import LEFT_OUT, MOST, StartTrial
 from daemon.system.atomic_file import sync_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ class Store:
         self._good: dict[Path, bool] = {}
         self._lock: int | None = None
         self.trouble = ""
-        self.trial: Final = Trial(folder)
+        self.trial: Final = StartTrial(folder)
 
     @property
     def refused(self) -> bool:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from daemon.maps.autosave import ADRIFT, DONE, FIXED, NO_MAP, Keeper
+from daemon.maps.autosave import ADRIFT, DONE, FIXED, NO_MAP, MapAutosaver
 from daemon.maps.container import BadMap
 from daemon.maps.generations import said
 from daemon.maps.store import Judge, Start, Store
@@ -94,13 +94,15 @@ class MapSwitch:
     """Carries out one switch after the other.
 
     Args:
-        keeper: saves the map in use.
+        autosaver: saves the map in use.
         put: hands a switch to the cycle; its second argument is called once the cycle has taken it. None takes back
             what has been handed over and not been taken.
     """
 
-    def __init__(self, maps: Maps, keeper: Keeper, put: Callable[[Switch | None, Callable[[], None]], None]) -> None:
-        self._maps, self._keeper, self._put = maps, keeper, put
+    def __init__(
+        self, maps: Maps, autosaver: MapAutosaver, put: Callable[[Switch | None, Callable[[], None]], None]
+    ) -> None:
+        self._maps, self._autosaver, self._put = maps, autosaver, put
         self._task: asyncio.Task[None] | None = None
 
     def ask(self, map_id: int, on_done: OnDone, patient: bool = False) -> None:
@@ -125,9 +127,9 @@ class MapSwitch:
         store = self._maps.store
         if store is None:
             return NO_FOLDER
-        if not self._keeper.ready:
+        if not self._autosaver.ready:
             return NOT_LOADED
-        if map_id == self._keeper.map_id:
+        if map_id == self._autosaver.map_id:
             return IN_USE
         try:
             there = {one.map_id for one in await beside(store.generations, "switch") if one.map_id >= 0}
@@ -157,7 +159,7 @@ class MapSwitch:
     async def _saved(self) -> str:
         """The end of a save of the map in use."""
         ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._keeper.ask(lambda reason: None if ended.done() else ended.set_result(reason))
+        self._autosaver.ask(lambda reason: None if ended.done() else ended.set_result(reason))
         return await ended
 
     def _load(self, store: Store, map_id: int) -> Switch:

@@ -53,7 +53,7 @@ class Orders:
         self._asked: list[_Asked] = []
         self._lines = Sparing(log)
 
-    def take(self, request: Request) -> None:
+    def handle(self, request: Request) -> None:
         """An order as it was written; whatever goes wrong with it, the client hears of its end."""
         self._lines.say(self._clock.now(), logging.INFO, f"Modbus: {_said(request)}")
         on_done = partial(self._ended, request)

@@ -45,7 +45,7 @@ class OneSender:
         self._sender = ""
         self._heard = 0.0
 
-    def take(self, sender: str, reading: RawOdometry) -> None:
+    def receive(self, sender: str, reading: RawOdometry) -> None:
         """Pass a reading on if its sender has the floor."""
         if sender != self._sender and self._sender and reading.t_rx - self._heard <= ODOMETRY_SILENT_S:
             self.refused += 1
@@ -97,7 +97,7 @@ class Network:
             self._clock,
             write=settings.write,
             allowed=self._access,
-            on_command=lambda request: orders.take(request),
+            on_command=lambda request: orders.handle(request),
             on_odometry=self._from("Modbus"),
             on_loop_seen=self._feeds.on_loop_seen,
         )
@@ -142,7 +142,7 @@ class Network:
 
     def _from(self, sender: str) -> OnOdometry:
         """A callback for one sender's readings."""
-        return lambda reading: self._odometry.take(sender, reading)
+        return lambda reading: self._odometry.receive(sender, reading)
 
 
 async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:

@@ -53,8 +53,8 @@ class Trust(msgspec.Struct, frozen=True, kw_only=True):
     places: int | None = None
 
 
-class Pulse(msgspec.Struct, frozen=True, kw_only=True):
-    """How the cycle is doing; see `daemon.snapshot.Pulse`. Spreads: median, 99 of 100, largest, us."""
+class CycleTiming(msgspec.Struct, frozen=True, kw_only=True):
+    """How the cycle is doing; see `daemon.snapshot.CycleTiming`. Spreads: median, 99 of 100, largest, us."""
 
     rung: int = 0
     thinned: int = 0
@@ -110,7 +110,7 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     odometry_ok: bool | None = None
     fault: int = 0
     trust: Trust = Trust()
-    pulse: Pulse | None = None
+    pulse: CycleTiming | None = None
     condition: Condition | None = None
 
     def utc(self, t_mono: float) -> float:

@@ -139,7 +139,7 @@ def _fields_of(piece: object) -> dict[str, Any]:
     return {name: getattr(piece, name) for name in field_names(kind)}
 
 
-def take(state: State, rest: dict[str, object]) -> Taken:
+def capture(state: State, rest: dict[str, object]) -> Taken:
     """Take the estimator's state and the ``rest``, which may refer to the same things.
 
     It takes longer the more submaps and keyframes there are; docs/replay.md has figures.

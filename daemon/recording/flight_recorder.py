@@ -1,7 +1,7 @@
 """The flight recorder: when a recording gets a state to be replayed from, and when a dump of it is made.
 
-All of it runs in the loop's thread, at the end of a cycle: it takes what is there (`daemon.recording.checkpoint.take`)
-and hands it to the threads that write.
+All of it runs in the loop's thread, at the end of a cycle: it captures the state
+(`daemon.recording.checkpoint.capture`) and hands it to the threads that write.
 """
 
 from __future__ import annotations
@@ -279,11 +279,11 @@ class BlackBox:
             "samples": None if samples is None else dict(vars(samples)),
             "blocks": None if blocks is None else {**vars(blocks), "status": None},
         }
-        from daemon.recording.checkpoint import CannotTake, take
+        from daemon.recording.checkpoint import CannotTake, capture
 
         begun = time.perf_counter()
         try:
-            taken = take(state, rest)
+            taken = capture(state, rest)
         except CannotTake as error:
             if not self.error:
                 log.error("flight recorder: %s; what is recorded replays from an older state", error)

@@ -67,7 +67,7 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
         odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
         codes: `Limits.codes`, None where nothing was stepped or before there were lights.
         samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
-        rung: `Limits.rung`. switched: `CycleRecord.switched`; the map is in a file of its own, see :func:`switch_name`.
+        rung: `Limits.level`. switched: `CycleRecord.switched`; the map is in a file of its own (:func:`switch_name`).
         reason: published with the state, None in recordings of before it was kept; they know of no ``faults`` either.
         faults: numbers of all that were published, gravest first. In every cycle, for a recording may begin with any.
         waiting: `CycleRecord.waiting`, all that state and reason take from a driver.
@@ -137,7 +137,7 @@ def _entry(record: CycleRecord) -> CycleEntry:
         codes=None if limits is None else limits.codes,
         samples=record.samples,
         light=light_of(result),
-        rung=0 if limits is None else limits.rung,
+        rung=0 if limits is None else limits.level,
         switched=record.switched,
         reason=record.snapshot.reason,
         faults=_faults(record.snapshot),

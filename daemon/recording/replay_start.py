@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # loads the estimator
 
 
 CYCLE_PARTS: Final = (
-    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
+    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_builder", "blocks", "lamps",
     "alarm", "trust", "inbox", "paused", "watch", "_left_out",
 )  # fmt: skip
 """What a cycle remembers."""

@@ -322,6 +322,6 @@ class Rerun:
         if self.watch is not None:
             self.watch(record)
         rows = len(self.ledger)
-        self.ledger.take(record, *self._latest)
+        self.ledger.add(record, *self._latest)
         if self._journal is not None:
             self._journal.gave(rows if len(self.ledger) > rows else None)

@@ -49,7 +49,7 @@ class Ledger:
         """Rows: what gave a pose."""
         return len(self._rows) // _FIELDS
 
-    def take(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
+    def add(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
         """Take in one cycle; ``stamp`` is the log's for the latest scan or block, which was true at ``t_mono``."""
         self.cycles += 1
         self.dropped += len(record.dropped)

@@ -31,11 +31,11 @@ from daemon.maps.map_fallback import another, let_go
 from daemon.runtime.budget import Budget, Spent
 from daemon.runtime.inbox import Inbox, Taken
 from daemon.runtime.scan_period import ScanPeriod
-from daemon.runtime.snapshot_builder import Facts, Painter
-from daemon.runtime.stage_times import Laps, PulseTaker
+from daemon.runtime.snapshot_builder import Facts, SnapshotBuilder
+from daemon.runtime.stage_times import StageTimer, TimingStatistics
 from daemon.runtime.worker import Worker
 from daemon.snapshot import Condition, Snapshot, Trust
-from estimator import Answer, Command, Fix, LightEpoch, Limits, Order, Record, Rung, SampleBlock, StepResult
+from estimator import Answer, Command, DegradationLevel, Fix, LightEpoch, Limits, Order, Record, SampleBlock, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
 from hal.lidar import LidarStatus, Link
@@ -146,7 +146,7 @@ class Cycle:
         self.result: StepResult | None = None
         begun = parts.t_begun or parts.clock.now()
         self.observer = Observer(begun, parts.odometry, parts.lidar, parts.samples is not None)
-        self._painter = Painter(parts.map_id)
+        self._builder = SnapshotBuilder(parts.map_id)
         self.cycle_us: int | None = None
         self.failing: set[int] = set()
         self.blocks = 0
@@ -158,16 +158,16 @@ class Cycle:
         self._switched = ""
         self._held: list[Answer] = []
         self._left_out = LeftOut()
-        self.laps = Laps(parts.stopwatch)
-        self.taker = PulseTaker()
+        self.stage_timer = StageTimer(parts.stopwatch)
+        self.timing = TimingStatistics()
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
-        laps = self.laps
+        laps = self.stage_timer
         laps.begin()
         self.cycles += 1
         t_mono = self.parts.clock.now()
-        taken = self.inbox.take()
+        taken = self.inbox.drain()
         self._obey(taken.commands)
         answers = self._answers(t_mono)
         orders = [command for command in taken.commands if command.order not in (Order.PAUSE, Order.RESUME)]
@@ -176,7 +176,7 @@ class Cycle:
         limits = self._step(records)
         self._watch_lamps(t_mono, records, limits)
         verdict = self._judge(t_mono, records, None if limits is None else self.result)
-        snapshot = self._painter.paint(self.result, verdict, self._facts(self.parts.clock.now()))
+        snapshot = self._builder.build(self.result, verdict, self._facts(self.parts.clock.now()))
         laps.lap("judge")
         self._publish(snapshot)
         laps.lap("publish")
@@ -224,20 +224,20 @@ class Cycle:
 
     def loops_seen(self, counter: int) -> None:
         """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
-        self._painter.loop_seen = counter
+        self._builder.loop_seen = counter
 
     def announce(self) -> None:
         """Publish where we stand without running a cycle: while the estimator is still being loaded."""
-        self._publish(self._painter.paint(None, self.verdict, self._facts(self.parts.clock.now())))
+        self._publish(self._builder.build(None, self.verdict, self._facts(self.parts.clock.now())))
 
     @property
     def map_id(self) -> int:
         """Identity of the map frame, another one after every RESET, and once a stored map was let go of."""
-        return self._painter.map_id
+        return self._builder.map_id
 
     @map_id.setter
     def map_id(self, map_id: int) -> None:
-        self._painter.map_id = map_id
+        self._builder.map_id = map_id
 
     @property
     def budget_us(self) -> float:
@@ -252,7 +252,7 @@ class Cycle:
             if (increment := self.odometry.increment(reading)) is not None:
                 records.append(increment)
             if self.odometry.jumps > jumps:
-                self.observer.witnesses.restart()
+                self.observer.motion_consistency.restart()
             self.observer.on_odometry(reading.t_rx)
             self.watch.on_odometry(reading)
         records += [turn for reading in taken.imu if (turn := self.imu.turn(reading)) is not None]
@@ -301,19 +301,19 @@ class Cycle:
             return None
         if (switch := self._switch) is not None:
             self._switch = None
-            self._painter.map_id, self._switched = switch()
+            self._builder.map_id, self._switched = switch()
         parts = self.parts
         light = any(isinstance(record, SampleBlock) for record in records)
         limits = parts.budget.limits(self.budget_us, light, self._carrier())
         if self.paused:
-            limits = replace(limits, update_map=False, rung=Rung.CARRIED)
+            limits = replace(limits, update_map=False, level=DegradationLevel.CARRIED)
         before, self.result = self.result, parts.step(records, limits)
-        self.laps.lap("step")
+        self.stage_timer.lap("step")
         self._tell_unused(limits)
         parts.worker.submit(self.result.jobs)
         reset = any(isinstance(record, Command) and record.order is Order.RESET for record in records)
         if let_go(before, self.result, self.map_id) or reset:
-            self._painter.map_id = another(self.map_id, self.result.t_mono)
+            self._builder.map_id = another(self.map_id, self.result.t_mono)
         return limits
 
     def _carrier(self) -> bool:
@@ -327,9 +327,9 @@ class Cycle:
         """Tell the judge that the laser is left out, and why."""
         if self.paused or self.observer.unused is Cause.PAUSED:
             self._left_out.clear()
-        overloaded = not self.paused and self._left_out.on_step(limits.rung >= Rung.CARRIED)
+        overloaded = not self.paused and self._left_out.on_step(limits.level >= DegradationLevel.CARRIED)
         self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED if overloaded else None
-        self.taker.on_rung(limits.rung, self.paused)
+        self.timing.on_level(limits.level, self.paused)
 
     def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
         if limits is not None and self.result is not None:
@@ -355,12 +355,12 @@ class Cycle:
         gap = None if result is None else result.gap
         protection = None if result is None else result.protection
         if protection is None or not bounded(self.verdict, evidence):
-            return Trust(limit_m=limit_m, alert=self.alarm.take(t_mono, None), gap=gap, places=evidence.places)
+            return Trust(limit_m=limit_m, alert=self.alarm.update(t_mono, None), gap=gap, places=evidence.places)
         return Trust(
             horizontal_m=protection.horizontal_m,
             yaw_rad=protection.yaw_rad,
             limit_m=limit_m,
-            alert=self.alarm.take(t_mono, protection.horizontal_m),
+            alert=self.alarm.update(t_mono, protection.horizontal_m),
             laser=protection.laser,
             light=protection.light,
             wheels=protection.wheels,
@@ -388,7 +388,7 @@ class Cycle:
             fault=parts.fault(),
             condition=parts.condition(),
             trust=self.trust,
-            pulse=self.taker.pulse,
+            pulse=self.timing.latest,
         )
 
     def _publish(self, snapshot: Snapshot) -> None:
@@ -406,10 +406,10 @@ class Cycle:
     def _account(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
         if self.parts.stopwatch is None:
             return
-        us, budget_us = self.laps.us, self.budget_us
+        us, budget_us = self.stage_timer.us, self.budget_us
         self.cycle_us = sum(us.values())
         self.overruns += self.cycle_us > budget_us
-        self.taker.on_cycle(t_mono, us)
+        self.timing.on_cycle(t_mono, us)
         if limits is not None and self.result is not None and not self.paused:
             light = any(isinstance(record, SampleBlock) for record in records)
             self.parts.budget.learn(Spent(us, budget_us, light), limits, self.result)

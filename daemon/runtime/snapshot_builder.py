@@ -12,12 +12,12 @@ from daemon.integrity.state_memory import Memory
 from daemon.snapshot import (
     LISTED_LINKS,
     Condition,
+    CycleTiming,
     LightFix,
     LightLink,
     LightPicture,
     LinkUse,
     LoopReason,
-    Pulse,
     Snapshot,
     Trust,
 )
@@ -54,11 +54,11 @@ class Facts:
     fault: int = 0
     trust: Trust = NO_TRUST
     condition: Condition | None = None
-    pulse: Pulse | None = None
+    pulse: CycleTiming | None = None
 
 
 @dataclass(slots=True)
-class Painter:
+class SnapshotBuilder:
     """Numbers the snapshots and remembers the latest loop.
 
     Attributes:
@@ -71,7 +71,7 @@ class Painter:
     _loop: Loop | None = None
     _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
 
-    def paint(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
+    def build(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
         """One snapshot of this moment."""
         self._seq += 1
         if result is not None and result.loop is not None:

@@ -38,7 +38,7 @@ def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
         **_photodiode(cycle, t_mono),
         cycles=cycle.cycles,
         overruns=cycle.overruns,
-        short=cycle.taker.short,
+        short=cycle.timing.short,
         jobs_failed=parts.worker.failed,
         lateness=lateness,
         alert=cycle.alarm.said,
@@ -77,7 +77,7 @@ def statistics(cycle: Cycle) -> str:
 
 def _cycle_statistics(cycle: Cycle) -> str:
     """How long cycles take and how late they begin, over the last minute, and what they leave out."""
-    pulse = cycle.taker.pulse
+    pulse = cycle.timing.latest
     said = [f"rung {pulse.rung} stalls {pulse.stalls}"]
     for name, spread in (("cycle", pulse.cycle), ("late", pulse.late)):
         if spread is not None:

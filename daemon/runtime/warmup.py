@@ -140,7 +140,7 @@ def _import(module: str) -> None:
     """Import a module of kernels that no daemon loads."""
     from estimator import CACHE_DIR
 
-    with KernelLock(CACHE_DIR) as lock, before_compiling(lock.take):
+    with KernelLock(CACHE_DIR) as lock, before_compiling(lock.acquire):
         import_module(module)
 
 
@@ -215,7 +215,7 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
     with KernelLock(CACHE_DIR) as lock:
         compiled = False
         if not is_marked(what):
-            lock.take()
+            lock.acquire()
             compiled = not is_marked(what)  # who had the lock may have compiled them all
         cold = compiled
         if cold:
@@ -228,7 +228,7 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
         def missing() -> None:
             """A kernel is not there, whatever the mark says."""
             nonlocal compiled
-            lock.take()
+            lock.acquire()
             compiled = True
 
         with _uncollected(not cold), before_compiling(missing):

@@ -40,7 +40,7 @@ class KernelLock:
             self._file.close()
             self._file = None
 
-    def take(self) -> None:
+    def acquire(self) -> None:
         """Have it from now on; says so where another process has it, and waits.
 
         Raises:

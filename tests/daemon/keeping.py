@@ -1,4 +1,4 @@
-"""The keeper of maps with its clock, its folder and its robot in hand."""
+"""The autosaver of maps with its clock, its folder and its robot in hand."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.maps.autosave import About, Keeper
+from daemon.maps.autosave import About, MapAutosaver
 from daemon.maps.store import Start, Store
 from estimator.mapping.map_snapshot import restored
 from estimator.state import State
@@ -26,7 +26,7 @@ class Clock:
 
 @dataclass
 class Bench:
-    """A keeper with everything around it in hand."""
+    """A autosaver with everything around it in hand."""
 
     folder: Path
     state: State | None = field(default_factory=lambda: restored(image(Shape())))
@@ -39,13 +39,15 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.store = Store(self.folder) if self.kept else None
-        self.keeper = Keeper(self.store, self.start, lambda: self.state, lambda: self.map_id, self.about, self.clock)
+        self.autosaver = MapAutosaver(
+            self.store, self.start, lambda: self.state, lambda: self.map_id, self.about, self.clock
+        )
 
     async def turn(self, seconds: float = 0.0) -> None:
         """Let so much time go by, one beat, and whatever save it has begun."""
         self.clock.t += seconds
-        self.keeper._go_on()
-        await asyncio.wait_for(self.keeper._over.wait(), 20.0)
+        self.autosaver._go_on()
+        await asyncio.wait_for(self.autosaver._over.wait(), 20.0)
 
     def drive(self) -> None:
         assert self.state is not None

@@ -183,7 +183,7 @@ class House:
 
     def drawn(self) -> bytes:
         """The map as it is now, as a file."""
-        state, lights = self.daemon.keeper._state(), self.world.lights
+        state, lights = self.daemon.autosaver._state(), self.world.lights
         assert state is not None
         assert lights is not None
         who = Identity(map_id=1, name="", surveyed=True, survey=digest_of(lights.survey), session=1)

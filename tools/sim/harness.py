@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
 from daemon.runtime.budget import FixedBudget
@@ -176,7 +176,7 @@ async def _main(settings: Config, scene: Scene, log: _Log, order: _Order) -> int
     return device.scans_sent
 
 
-def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
+def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> Environment:
     """What the daemon meets in virtual time: no thread, no stopwatch, no chance."""
 
     async def warm() -> None:
@@ -184,7 +184,7 @@ def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
 
         load()
 
-    return World(
+    return Environment(
         clock=clock,
         opener=opener,
         make_worker=CycleWorker,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, ModbusConfig
 from daemon.runtime import warmup
@@ -132,7 +132,7 @@ def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: 
             warmup.load()
 
         clock = LoopClock(asyncio.get_running_loop())
-        world = World(
+        world = Environment(
             clock, make_lidar=lambda config, clock, opener: player.lidar, make_worker=CycleWorker,
             make_budget=FixedBudget, stopwatch=None, warm_up=warm, draw_map_id=lambda: 1,
         )  # fmt: skip

@@ -13,7 +13,7 @@ import pytest
 from daemon.cli import parser
 from daemon.config import paths
 from daemon.diagnosis.moment import Moment
-from daemon.integrity.motion_consistency import Told
+from daemon.integrity.motion_consistency import MotionComparison
 from daemon.recording import disk_writer, flight_recorder
 from daemon.recording.disk_writer import SegmentWriter
 from daemon.recording.retention import DUMP
@@ -68,7 +68,7 @@ def test_a_recording_that_is_not_open_to_this_user_is_said_to_be_so(
 
 @pytest.mark.parametrize(("wheels_m", "turn", "agree"), [(1.0, 0.0, True), (0.65, 0.0, False), (1.0, 0.4, False)])
 def test_witnesses_agree_within_slip(wheels_m: float, turn: float, agree: bool) -> None:
-    told = Told(2.0, np.array((1.0, 0.0, 0.0)), np.array((wheels_m, 0.0, turn)))
+    told = MotionComparison(2.0, np.array((1.0, 0.0, 0.0)), np.array((wheels_m, 0.0, turn)))
     assert told.agree is agree
     assert told.apart == pytest.approx((abs(1.0 - wheels_m), turn))
 

@@ -69,17 +69,17 @@ def test_a_map_put_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its
         assert state is not None
         first = max(state.atlas.submaps)
         state.atlas.adrift, since = first, state.atlas.submaps[first].first
-        bench.keeper.loaded()
+        bench.autosaver.loaded()
         unaligned_map.put_aside(state, first, since, 0.0)
         state.next_key += 30
         await bench.turn(FIRST_S)
         await bench.turn(2.0 * EVERY_S)
-        assert bench.keeper.saves == 0
-        bench.keeper.ask(bench.told.append)
+        assert bench.autosaver.saves == 0
+        bench.autosaver.ask(bench.told.append)
         assert bench.told == [ADRIFT]
         state.atlas.aside, bench.map_id = None, 0x78
         await bench.turn(1.0)
-        assert bench.keeper.saves == 1
+        assert bench.autosaver.saves == 1
         assert old.read_bytes() == stored
         ids = sorted(one.map_id for one in Store(tmp_path).generations())
         assert ids == [0x77, 0x78]

@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig
 from daemon.maps import switching
-from daemon.maps.autosave import About, Keeper
+from daemon.maps.autosave import About, MapAutosaver
 from daemon.maps.container import pack, unpack
 from daemon.maps.initial_state import started
 from daemon.maps.schema import read
@@ -77,7 +77,7 @@ class Bench:
         opener.plug(DEVICE, FakeHokuyo(URG_04LX_UG01, Room(URG_04LX_UG01)))
         store, start = started(self.settings.map, None)
         recorder = Recorder(self.recording, self.settings, clock, start=start)
-        world = World(
+        world = Environment(
             clock,
             opener=opener,
             make_worker=CycleWorker,
@@ -210,7 +210,7 @@ def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_
 
 
 class Quiet:
-    """A keeper that has nothing to save, or cannot."""
+    """A autosaver that has nothing to save, or cannot."""
 
     def __init__(self, reason: str = "", ready: bool = True) -> None:
         self.ready, self.map_id, self._reason = ready, FIRST, reason
@@ -219,15 +219,15 @@ class Quiet:
         told(self._reason)
 
 
-def asked(store: Store | None, keeper: Quiet, **maps: Any) -> str:
+def asked(store: Store | None, autosaver: Quiet, **maps: Any) -> str:
     """The end of one order, without a daemon."""
 
     async def go() -> str:
         made = Maps(store, unjudged, maps.pop("make", lambda start: start), **maps)
-        switch = MapSwitch(made, keeper, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
+        switch = MapSwitch(made, autosaver, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
         ended: list[str] = []
         switch.ask(SECOND, ended.append)
-        if store is not None and keeper.ready:
+        if store is not None and autosaver.ready:
             switch.ask(SECOND, ended.append)
             assert ended.pop() == switching.BUSY
         while not ended:  # noqa: ASYNC110 - a thread ends it
@@ -261,11 +261,11 @@ def test_a_defect_and_a_full_disk_change_nothing_and_are_told(tmp_path: Path, ca
     data = content()
     map_id = read(data).meta.map_id
     (tmp_path / f"map-{map_id:08x}-00000001.lumimap").write_bytes(data)
-    keeper = Quiet()
+    autosaver = Quiet()
 
     async def go(**maps: Any) -> str:
         made = Maps(Store(tmp_path), unjudged, maps.pop("make", lambda start: start), **maps)
-        switch = MapSwitch(made, keeper, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
+        switch = MapSwitch(made, autosaver, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
         ended: list[str] = []
         switch.ask(map_id, ended.append)
         while not ended:  # noqa: ASYNC110 - a thread ends it
@@ -350,12 +350,12 @@ def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> 
 
     async def body() -> None:
         clock: Any = _Later()
-        keeper = Keeper(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
-        keeper._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
-        keeper.switched(2, start)  # type: ignore[arg-type]  # only kept
+        autosaver = MapAutosaver(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
+        autosaver._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
+        autosaver.switched(2, start)  # type: ignore[arg-type]  # only kept
         used[0] = 2
-        keeper._go_on()
+        autosaver._go_on()
         assert saved == []
-        assert keeper._start is start
+        assert autosaver._start is start
 
     asyncio.run(body())

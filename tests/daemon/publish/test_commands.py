@@ -40,7 +40,7 @@ class Bench:
         self.orders = Orders(self.clock, feeds, lambda number, outcome: self.ended.append((number, outcome)))
 
     def ask(self, number: int, code: CommandCode, map_id: int = 0) -> None:
-        self.orders.take(Request(number, code, (1.0, 2.0, 0.5), map_id))
+        self.orders.handle(Request(number, code, (1.0, 2.0, 0.5), map_id))
 
 
 @pytest.mark.parametrize("order", [Order.SET_POSE, Order.RESET, Order.RELOCALISE])

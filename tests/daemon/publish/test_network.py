@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig, OdometryConfig, PoseConfig
 from daemon.health.faults import Fault
 from daemon.health.reasons import Reason
@@ -92,7 +92,7 @@ class Bench:
         async def warm() -> None:
             """Loaded already."""
 
-        world = World(
+        world = Environment(
             clock,
             opener=opener,
             make_worker=CycleWorker,
@@ -183,7 +183,7 @@ def test_datagrams_of_odometry_and_gyro_reach_the_cycle_and_poses_go_out() -> No
                     sender.send(encode(InputDatagram(ODOMETRY_MAGIC, 1, i, 0, 0.05 * i, (0.0, 0.0, 0.0))))
                     sender.send(encode(InputDatagram(IMU_MAGIC, 1, i, 0, 0.05 * i, (0.0,))))
                     await asyncio.sleep(0.05)
-            taken = bench.daemon.cycle.inbox.take()
+            taken = bench.daemon.cycle.inbox.drain()
             assert (taken.odometry_total, taken.imu_total) == (40, 40)
             assert bench.snapshots[-1].odometry_ok is True
             latest = registers.decode_datagram(receiver.recv(2000))

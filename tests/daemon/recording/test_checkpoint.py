@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.recording.checkpoint import take
+from daemon.recording.checkpoint import capture
 from daemon.recording.restore import restore
 from estimator.mapping.map_snapshot import restored
 from estimator.measurements import UNLIMITED, LightEpoch, Record, Scan
@@ -23,14 +23,14 @@ def state(submaps: int, loose: int = 0) -> State:
 
 
 def test_what_is_pickled_at_once_does_not_grow_with_the_submaps() -> None:
-    few, many = (len(take(state(count, loose=count - 1), {})._root) for count in (4, 104))
+    few, many = (len(capture(state(count, loose=count - 1), {})._root) for count in (4, 104))
     assert many - few < 100, "not even a reference to each"
 
 
 def test_submaps_are_those_that_were_there_when_it_was_taken() -> None:
     before = state(5)
     keys, places = list(before.atlas.submaps), [submap.place() for submap in before.atlas.submaps.values()]
-    taken = take(before, {"one": before.atlas.submaps[keys[2]]})
+    taken = capture(before, {"one": before.atlas.submaps[keys[2]]})
     del before.atlas.submaps[keys[0]]
     after, rest = restore(taken.pieces())
     assert list(after.atlas.submaps) == keys
@@ -50,7 +50,7 @@ def test_a_drive_in_which_the_laser_tells_light_the_way_goes_on_from_any_moment(
         if not isinstance(record, Scan | LightEpoch):
             continue
         if count % 37 == 36:
-            then, _ = restore(take(first, {}).pieces())
+            then, _ = restore(capture(first, {}).pieces())
             assert first.light is not None
             guided += first.light.told
         if isinstance(record, Scan) and 6.0 < record.t_end < 6.3:  # somebody stands before it, all at once

@@ -241,7 +241,7 @@ def test_a_ring_whose_run_was_killed_is_kept_as_a_dump_and_one_that_ended_goes(t
 def test_a_defect_of_the_flight_recorder_is_a_fault_and_the_cycle_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(checkpoint, "take", broken)
+    monkeypatch.setattr(checkpoint, "capture", broken)
     bench = record(tmp_path / "rec", long)
     assert bench.snapshots[-1].pose is not None
     assert bench.recorder.failing == {"flight recorder"}

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
 from daemon.replay.log_replay import replay
 from daemon.replay.recorded_inputs import Given
@@ -122,7 +122,7 @@ def make_daemon(lidar: LidarConfig, device: str, clock: Clock, opener: PortOpene
         load()
 
     settings = Config(lidar=msgspec.structs.replace(lidar, device=device), modbus=ModbusConfig(port=0))
-    world = World(
+    world = Environment(
         clock, opener=opener, make_worker=CycleWorker, make_budget=FixedBudget, stopwatch=None, warm_up=warm,
         draw_map_id=lambda: 1,
     )  # fmt: skip

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount
 from daemon.health.faults import Fault
@@ -86,13 +86,13 @@ class Bench:
         self.put_odometry = self.recorder.on_odometry(inbox.put_odometry)
         self.put_imu = self.recorder.on_imu(inbox.put_imu)
 
-    def _world(self) -> World:
+    def _world(self) -> Environment:
         async def warm() -> None:
             from daemon.runtime.warmup import load
 
             load()
 
-        return World(
+        return Environment(
             self.clock,
             opener=self.opener,
             make_worker=CycleWorker,

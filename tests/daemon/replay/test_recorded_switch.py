@@ -52,7 +52,7 @@ async def on_to_another_map_and_back(bench: Stored) -> None:
     await bench.until(decoded, 6.0)
     await bench.drive(4.0)
     first = cycle.map_id
-    assert await bench.ended(bench.daemon.keeper.ask) == ""
+    assert await bench.ended(bench.daemon.autosaver.ask) == ""
     cycle.inbox.put_command(Command(bench.loop.time(), Order.RESET))
     await bench.drive(4.0)
     assert cycle.map_id != first

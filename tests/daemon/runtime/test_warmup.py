@@ -307,7 +307,7 @@ def test_what_a_command_compiles_beyond_the_daemons_kernels_it_compiles_under_th
     taken: list[str] = []
     monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
     monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
-    monkeypatch.setattr(KernelLock, "take", lambda lock: taken.append("taken"))
+    monkeypatch.setattr(KernelLock, "acquire", lambda lock: taken.append("taken"))
     (tmp_path / "of_its_own.py").write_text("import numba\nnumba.njit('f8(f8)')(lambda x: x + 1.0)\n")
     monkeypatch.syspath_prepend(tmp_path)
     warmup.load_aloud(lambda text: None, "plan", lambda: taken.append("loaded"), "of_its_own")

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig, Mount
 from daemon.health.faults import Fault
 from daemon.health.reasons import Reason
@@ -74,7 +74,7 @@ class Bench:
             self.opener.plug(DEVICE, self.device)
         self.faults = FaultSchedule({"lidar": self.device})
         store, start = started(self.settings.map, None)
-        world = World(
+        world = Environment(
             clock,
             opener=self.opener,
             make_worker=CycleWorker,
@@ -172,7 +172,7 @@ def test_with_odometry_two_witnesses_agree() -> None:
     async def scenario(bench: Bench) -> None:
         await bench.until(State.MAPPING, 3.0)
         await bench.send_odometry(8.0)
-        assert bench.daemon.cycle.observer.witnesses.agree() is True
+        assert bench.daemon.cycle.observer.motion_consistency.agree() is True
         assert (bench.last.state, bench.last.odometry_ok) == (State.TRACKING, True)
 
     run_daemon(scenario)

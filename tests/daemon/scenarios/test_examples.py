@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config import loader
 from daemon.config.schema import Config
 from daemon.publish.modbus.client import Reader
@@ -88,7 +88,7 @@ def test_every_example_starts(file: Path) -> None:
         snapshots: list[Snapshot] = []
         buses, adc = plugged(clock, Lit((41, 49, 73, 81)), bus=settings.photodiode.bus)
         adc.add_level(lambda t_mono: np.full_like(t_mono, 0.4))
-        world = World(
+        world = Environment(
             clock,
             opener=open_whatever,
             make_worker=CycleWorker,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig
 from daemon.maps.initial_state import started
@@ -57,7 +57,7 @@ def published(config: MapConfig, seconds: float) -> tuple[list[Snapshot], Room]:
         opener.plug(DEVICE, FakeHokuyo(URG_04LX_UG01, room))
         settings = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0), map=config)
         store, start = started(config, None)
-        world = World(
+        world = Environment(
             clock,
             opener=opener,
             make_worker=CycleWorker,

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, LightsConfig, ModbusConfig, PhotodiodeConfig
 from daemon.config.survey_loader import SurveyError
@@ -70,7 +70,7 @@ class Bench:
         self.opener = FakeOpener(clock)
         self.opener.plug(LIDAR, self.device)
         self.faults = FaultSchedule({"adc": self.adc})
-        self.world = World(
+        self.world = Environment(
             clock,
             opener=self.opener,
             make_worker=CycleWorker,

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from daemon import app
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser, run
 from daemon.system import console
 from hal.clock import LoopClock, run_virtual
@@ -84,7 +84,7 @@ def test_a_start_that_hangs_is_not_excused_for_ever(monkeypatch: pytest.MonkeyPa
             asked.extend(clock.now() for word in words if word.startswith("EXTEND_TIMEOUT_USEC="))
 
         monkeypatch.setattr(app, "notify", notified)
-        world = World(clock, opener=FakeOpener(clock), warm_up=asyncio.Event().wait)
+        world = Environment(clock, opener=FakeOpener(clock), warm_up=asyncio.Event().wait)
         await during(Daemon(SETTINGS, world), asyncio.sleep(app.STARTING_S + 60.0))
 
     run_virtual(go())

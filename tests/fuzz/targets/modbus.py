@@ -75,10 +75,10 @@ def feeder() -> Callable[[bytes], None]:
 
     def serial(data: bytes) -> None:
         line = rtu_frames.RtuFrames(1)
-        for unit, body in [*line.take(data[:99]), *line.take(data[99:])]:
+        for unit, body in [*line.feed(data[:99]), *line.feed(data[99:])]:
             assert unit in (0, 1)
             check_answer(framed(1, unit, body), answering.answer(framed(1, unit, body)))
-        assert any(line.take(rtu_frames.framed(1, READ[7:])) == [(1, READ[7:])] for _ in range(2))
+        assert any(line.feed(rtu_frames.framed(1, READ[7:])) == [(1, READ[7:])] for _ in range(2))
 
     def feed(data: bytes) -> None:
         size = frame_size(data)

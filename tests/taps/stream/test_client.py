@@ -22,12 +22,12 @@ from daemon.publish.stream_messages import TYPES, Frame, Hello, NotTheStream
 from daemon.publish.stream_server import SCHEMA, TOPICS, StreamServer, framed
 from daemon.snapshot import (
     Condition,
+    CycleTiming,
     LightFix,
     LightLink,
     LightPicture,
     LinkUse,
     Part,
-    Pulse,
     Snapshot,
     State,
     Thread,
@@ -50,7 +50,7 @@ FULL = Snapshot(
     light=LightPicture(LightFix.GOOD, 1, 0.9, links=(LINK,)),
     loop_counter=1,
     trust=Trust(horizontal_m=0.1, laser=True),
-    pulse=Pulse(cycle=(1, 2, 3), stages=((1, 2, 3), None)),
+    pulse=CycleTiming(cycle=(1, 2, 3), stages=((1, 2, 3), None)),
     condition=Condition(5, (104,), down=frozenset({Part.LIDAR}), hanging=frozenset({Thread.MAP})),
 )
 

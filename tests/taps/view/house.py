@@ -15,7 +15,7 @@ from aiohttp import ClientSession, ClientWebSocketResponse, web
 
 from daemon.publish.stream_client import Stream
 from daemon.publish.stream_server import StreamServer
-from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
+from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
 from taps.view.access_guard import Guard
 from taps.view.page_hello import Scene
 from taps.view.replay_file import Film
@@ -36,7 +36,7 @@ def snapshot(seq: int, **other: Any) -> Snapshot:
     told: dict[str, Any] = {
         "pose": (0.01 * seq, 0.0, 0.1), "covariance": (1e-4, 0.0, 4e-4, 0.0, 0.0, 1e-4), "map_id": 7, "light": LIGHT,
         "links": 2, "cycle_us": 1500, "trust": Trust(horizontal_m=0.1, gap=1.0), "velocity": (0.4, 0.0, 0.0),
-        "pulse": Pulse(cycle=(1500, 2500, 4000), late=(100, 300, 900), stages=((100, 200, 300), None)),
+        "pulse": CycleTiming(cycle=(1500, 2500, 4000), late=(100, 300, 900), stages=((100, 200, 300), None)),
         "scan_rate": 40.0, "known": (True, True, True), "lidar_ok": True, **other,
     }  # fmt: skip
     return Snapshot(seq, t, t + 0.002, 1.7e9 + t + 0.002, told.pop("state", State.TRACKING), 0, **told)

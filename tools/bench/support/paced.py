@@ -26,7 +26,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
 from daemon.devices.light_setup import Lights
 from daemon.runtime.stall_watch import StallWatch
@@ -286,7 +286,7 @@ async def go(wanted: Wanted, drive: Any) -> Told:
     async def warm() -> object:
         return await warm_up(lights=lights)
 
-    world = World(
+    world = Environment(
         SystemClock(), make_lidar=lidar, make_adc=adc, lights=lights, warm_up=warm, make_worker=Solver,
         stream=Path(wanted.stream),
     )  # fmt: skip
@@ -295,7 +295,7 @@ async def go(wanted: Wanted, drive: Any) -> Told:
     await daemon.run(feeder.stop)
     if feeder.failure is not None:
         raise feeder.failure
-    feeder.told.stalls, feeder.told.said = daemon.cycle.taker.pulse.stalls, watch.said
+    feeder.told.stalls, feeder.told.said = daemon.cycle.timing.latest.stalls, watch.said
     return feeder.told
 
 

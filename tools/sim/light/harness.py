@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from daemon.app import World
+from daemon.app import Environment
 from daemon.config.schema import PhotodiodeConfig
 from daemon.devices.conversion import SampleBridge
 from daemon.devices.light_setup import Lights
@@ -38,7 +38,7 @@ def lights_of(scene: Scene) -> SceneLight | None:
     return light if isinstance(light, SceneLight) else None
 
 
-def light_up(world: World, light: SceneLight, clock: Clock) -> dict[str, Target]:
+def light_up(world: Environment, light: SceneLight, clock: Clock) -> dict[str, Target]:
     """Give the daemon's surroundings a converter under the lamps; returns what faults may be ordered of."""
     world.lights = Lights(light.survey, PROFILE_A)
     if light.lights.fidelity == LINK:
