@@ -1,6 +1,6 @@
 """Turns a cycle's time budget into caps, from measured times; nothing below the cycle reads a clock.
 
-Order of degradation when time is short (`estimator.DegradationLevel`): first iterations are cut and the scan is thinned,
+Order of degradation when time is short (`estimator.DegradationLevel`): first iterations are cut and the scan thinned,
 then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off for good.
 """
 
