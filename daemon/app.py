@@ -11,7 +11,6 @@ import gc
 import logging
 import math
 from collections.abc import Callable, Coroutine
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,28 +24,34 @@ from daemon.devices.photodiode import BlockWatch
 from daemon.devices.port_tap import tapped
 from daemon.environment import Environment, NoLidar
 from daemon.health.assessment import Vitals
+from daemon.health.present_faults import PresentFaults
 from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
 from daemon.health.thread_watch import COMPUTING_S, DISK_S, ThreadWatch
 from daemon.maps.autosave import About, MapAutosaver
-from daemon.maps.initial_state import CannotBegin, NoMap, new_state
+from daemon.maps.initial_state import CannotBegin, NoMap
 from daemon.maps.last_pose import LastPose
 from daemon.maps.schema import digest_of
-from daemon.maps.store import Start, judge_for
-from daemon.maps.switching import Maps, MapSwitch, Switch, take_over
+from daemon.maps.store import judge_for
+from daemon.maps.switching import Maps, MapSwitch, Switch
 from daemon.publish.feeds import Feeds
 from daemon.publish.network import Network
 from daemon.publish.stream_ticker import StreamBeat
-from daemon.runtime.cycle import Cycle, Parts, Step
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Parts, PendingSwitch
+from daemon.runtime.estimator_runner import EstimatorRunner
 from daemon.runtime.heartbeat import Heartbeat
+from daemon.runtime.inbox import Inbox
 from daemon.runtime.scheduler import Pacemaker
+from daemon.runtime.snapshot_builder import SnapshotBuilder
+from daemon.runtime.stage_times import StageTimer
 from daemon.runtime.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.runtime.warmup import Warmth
-from daemon.runtime.worker import ThreadWorker
+from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.snapshot import Snapshot, State, Thread
 from daemon.system.realtime import claim, line_up
 from daemon.system.sd_notify import notify
-from estimator import Command, Limits, Order, Record, StepResult, no_lap
+from estimator import Command, Order
 from hal.adc import BusStuck, RawSamples
 from hal.lidar import Lidar, RawScan
 from hal.net.inputs import OnImu, OnOdometry
@@ -55,7 +60,6 @@ from hal.replay.recording import Kind
 
 if TYPE_CHECKING:
     from daemon.recording.recorder import Recorder
-    from estimator import State as Estimate
 
 __all__ = ["Daemon", "Environment"]
 
@@ -80,58 +84,72 @@ class Daemon:
     """
 
     def __init__(self, settings: Config, environment: Environment, recorder: Recorder | None = None) -> None:
-        self.supervisor = Supervisor()
-        self._environment = environment
-        self._begun = environment.clock.now()
-        self._recorder = recorder
+        self._environment, self._recorder = environment, recorder
+        clock = environment.clock
+        self._begun = clock.now()
         lights = environment.lights or load_lights(settings)
+
         opener = environment.opener if recorder is None else recorder.tap(environment.opener)
-        opener = opener if environment.stream is None else tapped(opener, self._on_raw, environment.clock)
+        opener = opener if environment.stream is None else tapped(opener, self._on_raw, clock)
         fitted = settings.lidar.fitted
-        self.lidar: Lidar = environment.make_lidar(settings.lidar, environment.clock, opener) if fitted else NoLidar()
-        self.adc = (
-            None if lights is None else environment.make_adc(settings.photodiode, environment.clock, environment.buses)
-        )
-        self._estimator = _Estimator(lights, environment.start, settings.map.localise)
+        self.lidar: Lidar = environment.make_lidar(settings.lidar, clock, opener) if fitted else NoLidar()
+        self.adc = None if lights is None else environment.make_adc(settings.photodiode, clock, environment.buses)
+        adc = None if self.adc is None else self.adc.status
+
+        timer = StageTimer(environment.stopwatch)
+        self._estimator = EstimatorRunner(lights, environment.start, settings.map.localise, timer.lap)
+        inbox, snapshots, switch = Inbox(), SnapshotBuilder(self._first_map_id()), PendingSwitch()
+        worker = environment.make_worker()
+
+        self.autosaver = self._autosaver(settings, lights, snapshots)
+        self.last_pose = None if environment.store is None else LastPose(environment.store.folder, state_folder())
+        self.maps = self._map_switch(lights, switch)
+
+        self.supervisor, self.faults = Supervisor(), PresentFaults()
+        self.threads = self._watched_threads(worker)
+        reporter = Reporter(clock, self.supervisor, self.threads, self.faults, (self.lidar.status, adc))
+        self.network = Network(settings, clock, self._feeds(inbox, snapshots), environment.stream)
+
+        kept = [] if self.last_pose is None else [self.last_pose.on_snapshot]
         self.cycle = Cycle(
             Parts(
-                clock=environment.clock,
+                clock=clock,
                 step=self._estimator,
                 scans=ScanBridge(settings.lidar),
                 budget=environment.make_budget(),
-                worker=environment.make_worker(),
+                worker=worker,
                 status=self.lidar.status,
                 lidar=fitted,
                 odometry=settings.odometry.port > 0,
                 samples=None if lights is None else SampleBridge(lights.profile),
-                blocks=None if lights is None or self.adc is None else BlockWatch(self.adc.status, lights.profile),
+                blocks=None if lights is None or adc is None else BlockWatch(adc, lights.profile),
                 budget_us=1e3 * settings.cycle.budget_ms,
-                stopwatch=environment.stopwatch,
+                timer=timer,
+                inbox=inbox,
+                snapshots=snapshots,
+                switch=switch,
+                sinks=[*self.network.sinks, *kept, *environment.sinks, _FirstPose()],
                 tap=None if recorder is None else recorder.on_cycle,
-                map_id=environment.draw_map_id() if environment.start is None else environment.start.stored.meta.map_id,
+                fault=self.faults.gravest,
+                condition=reporter,
                 alert_m=settings.integrity.alert_m,
                 t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay begins at the same instant
             )
         )
-        self._estimator.lap = self.cycle.stage_timer.lap
-        self.autosaver = self._autosaver(settings, lights)
-        self.last_pose = None if environment.store is None else LastPose(environment.store.folder, state_folder())
-        self.maps = self._map_switch(lights)
-        self.pacemaker = Pacemaker(self.cycle)
-        self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
-        on_samples = self.pacemaker.on_samples
-        self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
-        self.network = Network(settings, environment.clock, self._feeds(), environment.stream)
-        kept = [] if self.last_pose is None else [self.last_pose.on_snapshot]
-        self.cycle.parts.sinks += [*self.network.sinks, *kept, *environment.sinks, _FirstPose()]
-        self.threads = self._watched_threads()
-        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle), lambda: self.threads.alive)
-        self.cycle.parts.fault = self.heartbeat.fault
-        drivers = self.lidar.status, None if self.adc is None else self.adc.status
-        reporter = Reporter(environment.clock, self.supervisor, self.threads, lambda: self.heartbeat.faults, drivers)
-        self.cycle.parts.condition = reporter
         if recorder is not None:
-            recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults)
+            recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.faults.faults)
+        self.heartbeat = Heartbeat(
+            self._vitals, lambda: statistics(self.cycle.facts()), lambda: self.threads.alive, self.faults
+        )
+        self.pacemaker = Pacemaker(self.cycle)
+        on_scan, on_samples = self.pacemaker.on_scan, self.pacemaker.on_samples
+        self._on_scan = on_scan if recorder is None else recorder.on_scan(on_scan)
+        self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
+
+    def _first_map_id(self) -> int:
+        """Of the stored map that the run begins with, else a new one."""
+        start = self._environment.start
+        return self._environment.draw_map_id() if start is None else start.stored.meta.map_id
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set.
@@ -210,37 +228,36 @@ class Daemon:
             log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
             self.cycle.inbox.put_command(Command(self._environment.clock.now(), Order.REMEMBERED, np.array(pose)))
 
-    def _autosaver(self, settings: Config, lights: Lights | None) -> MapAutosaver:
+    def _autosaver(self, settings: Config, lights: Lights | None, snapshots: SnapshotBuilder) -> MapAutosaver:
         survey = "" if lights is None else digest_of(lights.survey)
         about = About(settings.name, survey, settings.map.localise)
-        environment, cycle = self._environment, self.cycle
+        environment, estimator = self._environment, self._estimator
         return MapAutosaver(
             environment.store,
             environment.start,
-            lambda: self._estimator.state,
-            lambda: cycle.map_id,
+            lambda: estimator.state,
+            lambda: snapshots.map_id,
             about,
             environment.clock,
         )
 
-    def _map_switch(self, lights: Lights | None) -> MapSwitch:
+    def _map_switch(self, lights: Lights | None, pending: PendingSwitch) -> MapSwitch:
         keep = None if self._recorder is None else self._recorder.keep_switch
         maps = Maps(self._environment.store, judge_for(lights), self._estimator.made, keep)
-        return MapSwitch(maps, self.autosaver, self._put_switch)
+        estimator, autosaver = self._estimator, self.autosaver
 
-    def _put_switch(self, switch: Switch | None, taken: Callable[[], None]) -> None:
-        """The cycle takes it over (None: does not after all); what is kept of maps knows it in the same instant."""
-        if switch is None:
-            self.cycle.switch(None)
-            return
+        def put(switch: Switch | None, taken: Callable[[], None]) -> None:
+            """The cycle takes it over (None: does not after all); the autosaver has it at the same instant."""
 
-        def take_over() -> tuple[int, str]:
-            self._estimator.take_over(switch)
-            self.autosaver.switched(switch.map_id, switch.start)
-            taken()
-            return switch.map_id, switch.sha256
+            def take_over(switch: Switch) -> tuple[int, str]:
+                estimator.take_over(switch)
+                autosaver.switched(switch.map_id, switch.start)
+                taken()
+                return switch.map_id, switch.sha256
 
-        self.cycle.switch(take_over)
+            pending.take_over = None if switch is None else partial(take_over, switch)
+
+        return MapSwitch(maps, autosaver, put)
 
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
@@ -251,26 +268,26 @@ class Daemon:
             parts["photodiode"] = lambda: adc.run(self._take_samples)
         if self.network.stream is not None:
             beat = StreamBeat(
-                self.network.stream, self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults
+                self.network.stream, self.cycle.facts, lambda: self._estimator.state, lambda: self.faults.faults
             )
             parts["stream beat"] = beat.run
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
-    def _watched_threads(self) -> ThreadWatch:
+    def _watched_threads(self, worker: Worker) -> ThreadWatch:
         """The threads that are watched."""
-        answers, autosaver, worker = ThreadWatch(), self.autosaver, self.cycle.parts.worker
-        answers.watch(Thread.MAP, lambda: autosaver.busy_since, DISK_S)
+        threads, autosaver = ThreadWatch(), self.autosaver
+        threads.watch(Thread.MAP, lambda: autosaver.busy_since, DISK_S)
         if isinstance(worker, ThreadWorker):
-            answers.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
-            answers.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
+            threads.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
+            threads.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
         if (last := self.last_pose) is not None:
-            answers.watch(Thread.POSE, lambda: last.busy_since, DISK_S)
+            threads.watch(Thread.POSE, lambda: last.busy_since, DISK_S)
         if (recorder := self._recorder) is not None:
-            answers.watch(Thread.RECORDING, lambda: recorder.disk.busy_since, DISK_S)
+            threads.watch(Thread.RECORDING, lambda: recorder.disk.busy_since, DISK_S)
         if (adc := self.adc) is not None:
-            answers.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
-        return answers
+            threads.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
+        return threads
 
     def _on_raw(self, kind: Kind, t_mono: float, data: bytes) -> None:
         if self.network.stream is not None:
@@ -286,20 +303,20 @@ class Daemon:
         if self.network.stream is not None:
             self.network.stream.on_scan(scan)
 
-    def _feeds(self) -> Feeds:
-        cycle, recorder = self.cycle, self._recorder
-        on_odometry: OnOdometry = cycle.inbox.put_odometry
-        on_imu: OnImu = cycle.inbox.put_imu
+    def _feeds(self, inbox: Inbox, snapshots: SnapshotBuilder) -> Feeds:
+        recorder = self._recorder
+        on_odometry: OnOdometry = inbox.put_odometry
+        on_imu: OnImu = inbox.put_imu
         if recorder is not None:
             on_odometry, on_imu = recorder.on_odometry(on_odometry), recorder.on_imu(on_imu)
         return Feeds(
             on_odometry,
             on_imu,
-            on_command=cycle.inbox.put_command,
+            on_command=inbox.put_command,
             on_save=self.autosaver.ask,
             on_dump=None if recorder is None else recorder.box.dump,
             on_switch=self.maps.ask,
-            on_loop_seen=cycle.loops_seen,
+            on_loop_seen=snapshots.on_loops_seen,
         )
 
     def _keep_sample_clock(self) -> None:
@@ -324,47 +341,7 @@ class Daemon:
             failed.add("stored map")
         if self.threads.look() - {Thread.I2C}:  # a bus has faults of its own
             failed.add("thread")
-        return vitals(self.cycle, failed, max(lateness, self.pacemaker.latest()))
-
-
-class _Estimator:
-    """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
-
-    Attributes:
-        state: None until then. start: the map that it begins with. localise: maps are only used, never changed.
-        lap: told the name of each part of a step that has ended.
-    """
-
-    def __init__(self, lights: Lights | None, start: Start | None, localise: bool = False) -> None:
-        self.state: Estimate | None = None
-        self.localise = localise
-        self._lights = lights
-        self.start = start
-        self._step: Step | None = None
-        self.lap: Callable[[str], object] = no_lap
-
-    def made(self, start: Start) -> Estimate:
-        """A state as at a start in a stored map; may be called in another thread."""
-        import estimator
-
-        return new_state(self._lights, estimator.Settings(), replace(start, localise=self.localise))
-
-    def take_over(self, switch: Switch) -> None:
-        """Go on in another map."""
-        assert self.state is not None
-        take_over(self.state, switch.donor)
-
-    def load(self) -> Step:
-        """Load the estimator, and the map into it."""
-        import estimator
-
-        self.state = new_state(self._lights, estimator.Settings(localise=self.localise), self.start)
-        self._step = partial(estimator.step, self.state, lap=self.lap)
-        return self._step
-
-    def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
-        step = self._step or self.load()
-        return step(records, limits)
+        return vitals(self.cycle.facts(), failed, max(lateness, self.pacemaker.latest()))
 
 
 class _FirstPose:

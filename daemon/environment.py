@@ -17,7 +17,7 @@ from daemon.devices.photodiode import AdcMaker, make_adc
 from daemon.devices.sample_clock import SampleClock
 from daemon.maps.store import Start, Store
 from daemon.runtime.budget import Budget, MeasuredBudget
-from daemon.runtime.cycle import Sink
+from daemon.runtime.cycle_parts import Sink
 from daemon.runtime.warmup import warm_up
 from daemon.runtime.worker import ThreadWorker, Worker
 from hal.bus.i2c import BusOpener

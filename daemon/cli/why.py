@@ -28,7 +28,7 @@ from daemon.replay.results import Folder, OutputRefused
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import RecordingSource, Turn
 from daemon.runtime import warmup
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.system import console
 from daemon.system.extras import how_to_install
 from daemon.system.versions import made_elsewhere

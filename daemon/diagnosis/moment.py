@@ -10,7 +10,8 @@ from typing import Final, NamedTuple
 from daemon.health.reasons import Reason
 from daemon.integrity.motion_consistency import MotionComparison as Wheels
 from daemon.recording.recorder import CycleEntry
-from daemon.runtime.cycle import Cycle, CycleRecord
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.snapshot import Snapshot, State
 from estimator import StepResult
 

@@ -18,7 +18,7 @@ from daemon.health.reasons import REASONS, Reason
 from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.publish.allow_list import Access
 from daemon.publish.feeds import Feeds, OnOdometry
-from daemon.runtime.cycle import Sink
+from daemon.runtime.cycle_parts import Sink
 from hal.clock import Clock
 from hal.odometry import RawOdometry
 

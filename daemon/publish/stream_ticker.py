@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from daemon.health.faults import FAULTS, Fault
 from daemon.maps.tiles import MapTiles
 from daemon.publish.stream_server import StreamServer
-from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_facts import CycleFacts
 from daemon.runtime.vitals import process_age_s, resident_mb
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
@@ -23,17 +23,17 @@ class StreamBeat:
     """One of the daemon's parts.
 
     Args:
-        state: of the estimator, None before it is loaded. faults: that are present.
+        facts: about the cycle. state: of the estimator, None before it is loaded. faults: that are present.
     """
 
     def __init__(
         self,
         server: StreamServer,
-        cycle: Cycle,
+        facts: Callable[[], CycleFacts],
         state: Callable[[], State | None],
         faults: Callable[[], tuple[Fault, ...]],
     ) -> None:
-        self._server, self._cycle, self._faults = server, cycle, faults
+        self._server, self._facts, self._faults = server, facts, faults
         server.place = partial(place_of, state)
         self.tiles = server.tiles = MapTiles(state, server.on_tiles)
 
@@ -49,10 +49,9 @@ class StreamBeat:
 
     def beat(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tell once."""
-        server, cycle = self._server, self._cycle
-        now = cycle.parts.clock.now()
-        server.on_faults(now, in_words(self._faults()))
-        server.on_statistics(lambda: figures(cycle, now))
+        server, facts = self._server, self._facts()
+        server.on_faults(facts.t_mono, in_words(self._faults()))
+        server.on_statistics(lambda: figures(facts))
         if server.wanted("map"):
             self.tiles.follow(loop)
         else:
@@ -74,25 +73,25 @@ def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, f
     return x, y, yaw
 
 
-def figures(cycle: Cycle, t_mono: float) -> dict[str, object]:
+def figures(facts: CycleFacts) -> dict[str, object]:
     """Counters since the start, times in s unless said otherwise."""
-    status, blocks = cycle.parts.status, cycle.parts.blocks
+    lidar, photodiode = facts.lidar, facts.photodiode
     return {
-        "t_mono": t_mono,
+        "t_mono": facts.t_mono,
         "uptime": process_age_s(),
         "memory_mb": resident_mb(),
-        "cycles": cycle.cycles,
-        "overruns": cycle.overruns,
-        "cycle_us": cycle.cycle_us,
-        "jobs_failed": cycle.parts.worker.failed,
-        "scan_period": cycle.period.seconds,
-        "scans": status.scans,
-        "scans_missed": status.missed,
-        "scans_invalid": status.invalid,
-        "scans_dropped": cycle.inbox.dropped,
-        "resyncs": status.resyncs,
-        "reconnects": status.reconnects,
-        "blocks": None if blocks is None else cycle.blocks,
-        "blocks_lost": None if blocks is None else cycle.blocks_lost(),
-        "odometry_jumps": cycle.odometry.jumps,
+        "cycles": facts.cycles,
+        "overruns": facts.overruns,
+        "cycle_us": facts.cycle_us,
+        "jobs_failed": facts.jobs_failed,
+        "scan_period": facts.period,
+        "scans": lidar.scans,
+        "scans_missed": lidar.missed,
+        "scans_invalid": lidar.invalid,
+        "scans_dropped": facts.scans_dropped,
+        "resyncs": lidar.resyncs,
+        "reconnects": lidar.reconnects,
+        "blocks": None if photodiode is None else photodiode.blocks,
+        "blocks_lost": None if photodiode is None else photodiode.blocks_lost,
+        "odometry_jumps": facts.odometry_jumps,
     }

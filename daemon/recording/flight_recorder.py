@@ -22,7 +22,8 @@ from daemon.health.faults import FAULTS, Fault
 from daemon.recording.disk_writer import CLOCK, SEGMENT_BYTES, SegmentWriter, both
 from daemon.recording.replay_start import CYCLE_PARTS
 from daemon.recording.retention import ASKED, Begun, Flight
-from daemon.runtime.cycle import Cycle, CycleRecord
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.system.callbacks import OnDone
 from estimator import Job
 from hal.clock import Clock

@@ -25,7 +25,7 @@ from daemon.devices.port_tap import tapped
 from daemon.maps.store import START, Start
 from daemon.recording.disk_writer import SegmentWriter, both
 from daemon.recording.flight_recorder import BlackBox
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.snapshot import Snapshot
 from daemon.system.atomic_file import write_whole
 from daemon.system.versions import versions
@@ -60,7 +60,7 @@ class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
-    """A cycle as it is recorded; see `daemon.runtime.cycle.CycleRecord`. Fields are only ever added at the end.
+    """A cycle as it is recorded; see `daemon.runtime.cycle_parts.CycleRecord`. Fields are only ever added at the end.
 
     Attributes:
         limits: (ICP iterations, points, whether the map may be updated), None where nothing was stepped.
@@ -215,7 +215,7 @@ class Recorder:
         self.box.close(ended)
 
     def on_cycle(self, record: CycleRecord) -> None:
-        """Keep a cycle's decisions (`daemon.runtime.cycle.Tap`)."""
+        """Keep a cycle's decisions (`daemon.runtime.cycle_parts.Tap`)."""
         self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
         self.box.on_cycle(record)
 

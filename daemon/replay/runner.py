@@ -30,7 +30,8 @@ from daemon.recording.replay_start import Restored
 from daemon.replay.sources import Event, Source, Turn
 from daemon.replay.trajectories import Ledger
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, CycleRecord, Parts
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord, Parts
 from daemon.runtime.vitals import vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
 from estimator import UNLIMITED, Array, Grid, Identity, Limits, MapImage, Order, Record, StepResult, image_of
@@ -185,7 +186,7 @@ class Rerun:
         What the data say (:data:`~daemon.health.assessment.REPLAYED`) is said anew; all others are those that were
         published.
         """
-        now = vitals(self.cycle, set(), 0.0)
+        now = vitals(self.cycle.facts(), set(), 0.0)
         again = [fault for fault in assess(now, now) if fault in REPLAYED]
         return tuple(sorted([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)]))
 
@@ -248,7 +249,7 @@ class Rerun:
         for command in entry.orders():
             self.cycle.inbox.put_command(command)
         if entry.switched:
-            self.cycle.switch(partial(self._switch, entry.switched))
+            self.cycle.parts.switch.take_over = partial(self._switch, entry.switched)
         self._caps.now = entry.caps() or UNLIMITED
         self._answers[self.cycle.cycles + 1] = entry.answers
         self._source.status.link = Link.WAITING if entry.waiting else Link.STREAMING

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from daemon.replay.results import Trajectory
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from estimator import Array, Loop, StepResult, se2
 
 _FIELDS: Final = 12

@@ -71,6 +71,10 @@ class SnapshotBuilder:
     _loop: Loop | None = None
     _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
 
+    def on_loops_seen(self, counter: int) -> None:
+        """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
+        self.loop_seen = counter
+
     def build(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
         """One snapshot of this moment."""
         self._seq += 1

@@ -23,6 +23,11 @@ class StageTimer:
         self._stopwatch = stopwatch
         self._last = 0.0
 
+    @property
+    def measures(self) -> bool:
+        """Whether there is a stopwatch."""
+        return self._stopwatch is not None
+
     def begin(self) -> None:
         """A cycle begins."""
         self.us = {}

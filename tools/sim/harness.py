@@ -19,7 +19,8 @@ from daemon.app import Daemon, Environment
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, Sink
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Sink
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from hal.clock import LoopClock, run_virtual

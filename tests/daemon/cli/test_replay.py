@@ -16,7 +16,7 @@ from daemon.cli import parser
 from daemon.config.schema import Config, ModbusConfig
 from daemon.runtime import warmup
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.runtime.worker import CycleWorker
 from daemon.system import console
 from hal.clock import LoopClock, run_virtual

@@ -14,6 +14,7 @@ from daemon import app
 from daemon.environment import Environment
 from daemon.health.assessment import Vitals
 from daemon.health.faults import Fault
+from daemon.health.present_faults import PresentFaults
 from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
 from daemon.health.thread_watch import COMPUTING_S, DISK_S, ThreadWatch
@@ -93,14 +94,14 @@ def test_a_worker_says_since_when_a_job_runs() -> None:
 
 
 def test_the_condition_is_one_object_until_something_changes(tmp_path: Path) -> None:
-    clock, supervisor, faults = Stand(), Supervisor(), [(Fault.LIDAR_SILENT,)]
+    clock, supervisor, present = Stand(), Supervisor(), PresentFaults((Fault.LIDAR_SILENT,))
     lidar = LidarStatus()
-    reporter = Reporter(clock, supervisor, ThreadWatch(clock.now), lambda: faults[0], (lidar, None))
+    reporter = Reporter(clock, supervisor, ThreadWatch(clock.now), present, (lidar, None))
     first = reporter()
     clock.t += 0.5
     assert reporter() is first
     assert (first.uptime_s, first.faults) == (0, (104,))
-    faults[0] = (Fault.LIDAR_SILENT, Fault.OVERRUNS)
+    present.faults = (Fault.LIDAR_SILENT, Fault.OVERRUNS)
     assert reporter().faults == (104, 302)
     lidar.reconnects, lidar.resyncs = 2, 3
     supervisor.restarts.update({"pose": 4, "something new": 1, "lidar": 1})

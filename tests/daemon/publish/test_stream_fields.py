@@ -40,7 +40,7 @@ def test_every_topic_tells_what_is_written_down(tmp_path: Path) -> None:
                 break
         server.publish(replace(SNAPSHOT, light=LightPicture(), loop_counter=1))
         server.on_scan(raw_scan())
-        server.on_statistics(lambda: stream_ticker.figures(bench.cycle, 5.0))
+        server.on_statistics(lambda: stream_ticker.figures(bench.cycle.facts()))
         server.on_raw("lidar", "rx", 1.5, b"x")
         while told.keys() != set(TOPICS):
             frame = await tap.frame()

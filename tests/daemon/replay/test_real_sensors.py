@@ -21,7 +21,7 @@ from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
 from daemon.replay.log_replay import replay
 from daemon.replay.recorded_inputs import Given
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.runtime.worker import CycleWorker
 from estimator.numerics import se2
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual

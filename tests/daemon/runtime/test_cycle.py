@@ -15,9 +15,11 @@ from daemon.devices.conversion import ScanBridge
 from daemon.health.reasons import Reason
 from daemon.integrity.state_memory import Memory
 from daemon.runtime.budget import Budget, FixedBudget, MeasuredBudget, RecordedBudget
-from daemon.runtime.cycle import Cycle, CycleRecord, Parts
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord, Parts
 from daemon.runtime.scheduler import Pacemaker
 from daemon.runtime.snapshot_builder import Facts, SnapshotBuilder
+from daemon.runtime.stage_times import StageTimer
 from daemon.runtime.worker import CycleWorker, ScheduledWorker, Worker
 from daemon.snapshot import Snapshot, State
 from estimator import pipeline
@@ -68,7 +70,7 @@ class Bench:
             status=self.status,
             odometry=self.odometry,
             budget_us=self.budget_us,
-            stopwatch=self.stopwatch,
+            timer=StageTimer(self.stopwatch),
             sinks=[self.snapshots.append],
             tap=self.records.append,
         )
