@@ -28,7 +28,7 @@ from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
 from hal.fake.transport import FakeOpener
 from hal.net.inputs import InputPort
-from tests.daemon.lightroom import SURVEY, Lit, plugged
+from tests.daemon.support.light_room import SURVEY, Lit, plugged
 from tools.bench.world.room import LIDAR, room
 from tools.sim.feed import feed_odometry
 from tools.sim.harness import DEVICE, world

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import check, parser
+from daemon.cli import parser
 from daemon.diagnosis import map_folder
 from daemon.maps.store import Store
 from daemon.system import console
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.support.map_maker import Shape, content
 
 SURVEY = """
 lamp = [
@@ -192,7 +192,7 @@ def test_a_lock_of_the_same_number_on_another_disk_is_another_one(
     line = "1: FLOCK  ADVISORY  WRITE {} {:02x}:{:02x}:{} 0 EOF\n"
     place = (os.major(about.st_dev), os.minor(about.st_dev))
     foreign = line.format(11, place[0] + 1, place[1], about.st_ino)
-    monkeypatch.setattr(check, "LOCKS", listed)
+    monkeypatch.setattr(map_folder, "LOCKS", listed)
     with lock.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         listed.write_text(foreign)

@@ -18,7 +18,7 @@ from hal.errors import DeviceMissing, DeviceRefused
 from hal.photodiode.probe import BusFinding, Chip
 from hal.port.port import PortOpener
 from hal.probe import Finding
-from tests.daemon.room import URG
+from tests.daemon.support.room import URG
 
 LIDAR = Finding("/dev/ttyACM0", URG, "SOKUIKI Sensor URG-04LX", "SCIP 2.0", "Sensor works well.")
 NOTHING = Finding("/dev/ttyACM1", error=DeviceMissing("/dev/ttyACM1", "no such device", "plug it in"))

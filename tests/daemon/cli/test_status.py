@@ -20,7 +20,7 @@ import pytest
 from daemon.cli import status as cli_status
 from daemon.cli import status_table
 from daemon.config.schema import Config, ModbusConfig
-from daemon.publish.modbus import client, lights_block, registers
+from daemon.publish.modbus import lights_block, registers
 from daemon.snapshot import Snapshot, State
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -159,22 +159,6 @@ def test_a_program_reads_the_links(capsys: pytest.CaptureFixture[str]) -> None:
     assert reading["light_links"][1] == {"code": 60, "lamp": None, "use": "TWIN", "strength": 5e-7, "residual": None}
     assert len(reading["light_links"]) == 3
     assert not [key for key in reading if key.startswith("link_")]
-
-
-def test_watching_goes_on_until_interrupted(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    naps = iter(range(3))
-
-    def nap(_: float) -> None:
-        if next(naps, None) is None:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
-        status(address, watch=True, json=True)
-    lines = capsys.readouterr().out.splitlines()
-    assert [json.loads(line)["stalled"] for line in lines] == [False, True, True, True]
 
 
 @contextmanager
@@ -321,72 +305,6 @@ def test_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
     for host in ("no-such-host.invalid", "robot..local"):
         assert status(host) == 1
         assert "check the address" in capsys.readouterr().err
-
-
-def test_watching_shows_when_the_daemon_is_away(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    naps = iter(range(2))
-
-    def nap(_: float) -> None:
-        if next(naps, None) is None:
-            raise KeyboardInterrupt
-
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port = sock.getsockname()[1]
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    with pytest.raises(KeyboardInterrupt):
-        status(f"127.0.0.1:{port}", watch=True)
-    assert capsys.readouterr().err.count("nothing serves Modbus there") == 1  # of three looks
-
-
-def test_watching_says_anew_what_is_new(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    away, refused = client.NoAnswer("away"), client.NoAnswer("refused")
-    looks = iter([away, away, refused, {"seq": 1}, refused])
-
-    def read(_: client.Reader) -> Any:
-        look = next(looks, KeyboardInterrupt())
-        if isinstance(look, BaseException):
-            raise look
-        return look
-
-    monkeypatch.setattr(client.Reader, "read", read)
-    monkeypatch.setattr("daemon.cli.status.time.sleep", lambda _: None)
-    monkeypatch.setattr("daemon.cli.status._show", lambda *_: None)
-    with pytest.raises(KeyboardInterrupt):
-        status("127.0.0.1:1", watch=True)
-    said = [line.removeprefix("lumiloop: ") for line in capsys.readouterr().err.splitlines()]
-    assert said == ["away; waiting", "refused; waiting", "refused; waiting"]
-
-
-def test_on_a_small_terminal_watching_keeps_the_first_lines(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def nap(_: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda *_: os.terminal_size((40, 8)))
-    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
-        status(address, watch=True)
-    lines = capsys.readouterr().out.removeprefix("\x1b[H\x1b[2J").splitlines()
-    assert lines[0] == "state      TRACKING"
-    assert len(lines) == 7  # and the cursor's
-    assert max(map(len, lines)) <= 40
-    assert lines[-1] == "... 9 more lines: a higher window"
-
-
-def test_on_a_terminal_watching_repaints(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def nap(_: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
-        status(address, watch=True)
-    assert capsys.readouterr().out.startswith("\x1b[H\x1b[2Jstate      TRACKING\n")
 
 
 def test_a_time_that_is_none_is_not_made_up() -> None:

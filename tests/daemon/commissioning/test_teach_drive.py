@@ -11,7 +11,7 @@ from daemon.cli import parser
 from daemon.config.loader import load
 from daemon.config.survey_loader import read_survey
 from daemon.system import console
-from tests.daemon.teachrun import record
+from tests.daemon.commissioning.recorded_drive import record
 from tools.sim.light.harness import BUS
 
 

@@ -22,7 +22,7 @@ from daemon.publish.stream_messages import Fault, Faults
 from daemon.snapshot import LinkUse
 from daemon.system import console
 from tests.daemon.diagnosis.test_doctor import Computer
-from tests.daemon.mapmaker import LAMPS, Shape, image
+from tests.daemon.support.map_maker import LAMPS, Shape, image
 
 NOW = 1.8e9
 RNG = np.random.default_rng(4)

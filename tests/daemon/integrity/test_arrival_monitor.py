@@ -6,7 +6,7 @@ import pytest
 
 from daemon.integrity.arrival_monitor import Arrivals
 from daemon.runtime.inbox import DEEPEST, Inbox
-from tests.daemon.room import raw_odometry
+from tests.daemon.support.room import raw_odometry
 
 PERIOD = 0.1
 

@@ -17,8 +17,8 @@ from daemon.maps.autosave import ADRIFT, EVERY_S, FIRST_S, FIXED, NO_FOLDER, NO_
 from daemon.maps.schema import read
 from daemon.maps.store import Start, Store
 from estimator.state import new_state
-from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import content
+from tests.daemon.maps.autosave_bench import Bench
+from tests.daemon.support.map_maker import content
 
 
 def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from daemon.maps.autosave import EVERY_S, FIRST_S, LOOK_S, RETRY_S, About, MapAutosaver
 from daemon.maps.store import Store
 from estimator.state import new_state
-from tests.daemon.keeping import Bench
+from tests.daemon.maps.autosave_bench import Bench
 
 
 def second(folder: Path) -> tuple[Store, Bench]:

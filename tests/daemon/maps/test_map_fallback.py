@@ -16,10 +16,10 @@ from daemon.maps.schema import read
 from daemon.maps.store import Start, Store
 from estimator.relocalisation import unaligned_map
 from estimator.result import Loop, LoopReason, StepResult
-from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.runtime.test_cycle import Bench as Cycling
 from tests.daemon.runtime.test_cycle import on_bench
+from tests.daemon.support.map_maker import Shape, content
 
 NOW = StepResult(1.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.ones(3), None, -1, None, 0, np.zeros(3), 0)
 ASIDE = replace(NOW, aside=True)

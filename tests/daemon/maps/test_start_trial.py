@@ -21,10 +21,10 @@ from daemon.maps.store import Start
 from daemon.runtime.warmup import CannotLoad
 from hal.clock import LoopClock, run_virtual
 from hal.fake.transport import FakeOpener
-from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.maps.test_store import name, names, store_with
 from tests.daemon.scenarios.test_daemon import SETTINGS
+from tests.daemon.support.map_maker import Shape, content
 
 
 def begin(folder: Path, lasts: bool = False, ends: bool = False) -> Start | None:

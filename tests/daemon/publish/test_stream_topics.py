@@ -19,8 +19,8 @@ from estimator.measurements import UNLIMITED, Scan
 from estimator.state import State
 from hal.adc import Blemish, RawSamples
 from tests.daemon.publish.test_stream_server import Tap, connected, run, until, wanting
-from tests.daemon.room import HALF_X, HALF_Y, ranges_m
 from tests.daemon.runtime.test_cycle import on_bench
+from tests.daemon.support.room import HALF_X, HALF_Y, ranges_m
 
 SILENT = (104, "no valid scan", "check the cable")
 

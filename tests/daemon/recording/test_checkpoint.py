@@ -13,7 +13,7 @@ from estimator.measurements import UNLIMITED, LightEpoch, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import step
 from estimator.state import State
-from tests.daemon.mapmaker import Shape, image
+from tests.daemon.support.map_maker import Shape, image
 from tests.estimator.lit import lit_state, scans, together
 from tools.sim.light.link_drive import room_run
 

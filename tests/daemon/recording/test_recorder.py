@@ -26,7 +26,7 @@ from hal.errors import DeviceMissing, HalError
 from hal.port.port import Port, memory_pair
 from hal.replay.recording import Frame, Kind, open_recording
 from hal.replay.report import LogReport
-from tests.daemon.mapmaker import SURVEY
+from tests.daemon.support.map_maker import SURVEY
 
 
 @pytest.fixture(autouse=True)

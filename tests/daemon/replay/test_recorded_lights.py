@@ -33,11 +33,11 @@ from hal.clock import run_virtual
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
 from hal.replay.report import LogReport
-from tests.daemon.driven import during
-from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.replay.test_recorded_run import assert_the_same
 from tests.daemon.scenarios.test_lights import LIDAR, Bench, decoded, settings
 from tests.daemon.scenarios.test_residual_maps import even_map
+from tests.daemon.support.light_room import BUS, SURVEY
+from tests.daemon.support.whole_daemon import during
 
 
 class UnevenBudget(FixedBudget):

@@ -16,7 +16,7 @@ from daemon.cli import parser
 from daemon.cli.why import spans
 from daemon.snapshot import State
 from daemon.system import console
-from tests.daemon.scenarios.test_process import ROOT, fake_lidar, running
+from tests.daemon.processes.test_process import ROOT, fake_lidar, running
 from tests.taps.documented import documented
 
 

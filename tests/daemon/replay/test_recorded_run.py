@@ -38,8 +38,8 @@ from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
 from hal.replay.report import LogReport
-from tests.daemon.driven import during
 from tests.daemon.replay.room import read_tum
+from tests.daemon.support.whole_daemon import during
 
 USB, SERIAL = "/dev/ttyACM0", "/dev/ttyUSB0"
 SETTINGS = Config(lidar=LidarConfig(device=USB, mount=Mount(0.1, -0.02, 30.0)), modbus=ModbusConfig(port=0))

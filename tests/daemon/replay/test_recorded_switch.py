@@ -18,11 +18,11 @@ from daemon.recording.recorder import Recorder
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.measurements import Command, Order
 from hal.clock import run_virtual
-from tests.daemon.driven import during
-from tests.daemon.lightroom import SURVEY
 from tests.daemon.replay.test_dump import let_write, replayed
 from tests.daemon.replay.test_recorded_lights import Recorded
 from tests.daemon.scenarios.test_lights import decoded, settings
+from tests.daemon.support.light_room import SURVEY
+from tests.daemon.support.whole_daemon import during
 
 KEEP_S = 5.0
 Ask = Callable[[Callable[[str], None]], None]

@@ -14,8 +14,8 @@ from daemon.runtime.scan_period import IDLE_PERIOD_S, ScanPeriod
 from estimator.measurements import Command, Order
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
-from tests.daemon.lightroom import raw_block
-from tests.daemon.room import URG, raw_scan
+from tests.daemon.support.light_room import raw_block
+from tests.daemon.support.room import URG, raw_scan
 
 SCAN = raw_scan(0, 0.0)
 

@@ -22,7 +22,7 @@ from hal.fake.lidar.models import UST_10LX, Unit
 from hal.fake.lidar.scan_world import Room
 from hal.fake.transport import FakeOpener
 from hal.port.port import Port
-from tests.daemon.lightroom import Lit, plugged
+from tests.daemon.support.light_room import Lit, plugged
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "systemd").glob("*.toml"))
 

@@ -29,8 +29,8 @@ from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
 from hal.fake.schedule import FaultSchedule
 from hal.fake.transport import FakeOpener
-from tests.daemon.driven import during
-from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged, raw_block
+from tests.daemon.support.light_room import BUS, CODES, SURVEY, Lit, plugged, raw_block
+from tests.daemon.support.whole_daemon import during
 
 LIDAR = "/dev/ttyACM0"
 BLOCK_S = PROFILE_A.epoch_s

@@ -9,8 +9,8 @@ from daemon.runtime.budget import MeasuredBudget, RecordedBudget
 from daemon.runtime.worker import ScheduledWorker
 from daemon.snapshot import State
 from estimator.measurements import DegradationLevel
-from tests.daemon.room import error
 from tests.daemon.runtime.test_cycle import Bench, on_bench
+from tests.daemon.support.room import error
 
 pytestmark = pytest.mark.jit
 

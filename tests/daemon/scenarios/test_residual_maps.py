@@ -25,8 +25,8 @@ from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Survey
 from hal.clock import SystemClock
 from hal.replay.recording import Kind, open_recording
-from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.recording.test_recorder import wait_for
+from tests.daemon.support.light_room import BUS, SURVEY
 
 SHIFT = 0.1
 

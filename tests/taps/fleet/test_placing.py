@@ -15,8 +15,8 @@ from estimator.cdma.air_interface import PROFILES
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from taps.fleet.messages import Held
 from taps.fleet.placing import MAP, RECORD, SURVEY, Offer, Records, Refused, check, chosen, offer_of, place
-from tests.daemon import mapmaker
-from tests.daemon.mapmaker import Shape
+from tests.daemon.support import map_maker
+from tests.daemon.support.map_maker import Shape
 
 LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(4))
 SHARED = Survey(LAMPS, Receiver(x=0.5))
@@ -32,7 +32,7 @@ def survey(tmp_path: Path) -> Path:
 @pytest.fixture
 def shared_map(tmp_path: Path) -> Path:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(map_id=0x77)))
     return path
 
 
@@ -119,7 +119,7 @@ def test_a_map_is_what_the_next_start_takes(tmp_path: Path, shared_map: Path) ->
     given = settings(tmp_path)
     maps = Path(given.map.folder)
     maps.mkdir()
-    (maps / "map-00001234-00000004.lumimap").write_bytes(mapmaker.content(Shape()))
+    (maps / "map-00001234-00000004.lumimap").write_bytes(map_maker.content(Shape()))
     offer, content = offer_of(MAP, shared_map, 1)
     assert offer.map_id == 0x77
     where, _ = place(offer, content, given, None)
@@ -134,14 +134,14 @@ def test_beside_a_running_daemon_another_map_is_put_and_its_own_is_not_touched(
 ) -> None:
     given = settings(tmp_path)
     daemon = Store(Path(given.map.folder))
-    daemon.save(mapmaker.content(Shape()), 0x1234)  # which takes the folder
+    daemon.save(map_maker.content(Shape()), 0x1234)  # which takes the folder
     offer, content = offer_of(MAP, shared_map, 1)
     try:
         where, note = place(offer, content, given, None)
         assert where.name == "map-00000077-00000002.lumimap"
         assert "--switch" in note
         assert daemon.load_map(0x77).stored.meta.map_id == 0x77
-        daemon.save(mapmaker.content(Shape(submaps=5)), 0x1234)
+        daemon.save(map_maker.content(Shape(submaps=5)), 0x1234)
         assert where.exists()
         with pytest.raises(Refused, match="a running daemon keeps map 00000077 there itself; stop it"):
             place(offer, content, given, None)

@@ -20,8 +20,8 @@ from taps.fleet.fetch import Fetcher
 from taps.fleet.placing import MAP, SURVEY, Offer, Records, offer_of
 from taps.fleet.share import key_of, share
 from taps.zenoh_session import config, joined, listed
-from tests.daemon import mapmaker
-from tests.daemon.mapmaker import Shape
+from tests.daemon.support import map_maker
+from tests.daemon.support.map_maker import Shape
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 
 LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(4))
@@ -134,7 +134,7 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
     assert path.stat().st_size > 1_000_000
     asked: list[tuple[str, str, int, int]] = []
 
@@ -159,7 +159,7 @@ def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(map_id=0x77)))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     outcomes = ["refused", "refused", "done"]
 
@@ -183,7 +183,7 @@ def test_what_was_deleted_or_is_wanted_elsewhere_is_fetched_again(
     tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(map_id=0x77)))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
     def fetch(made: Router, **more: Any) -> str:

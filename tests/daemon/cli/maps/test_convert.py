@@ -27,7 +27,7 @@ from estimator.mapping.map_snapshot import Identity, MapImage, image_of
 from estimator.mapping.occupancy_grid import Grid
 from estimator.measurements import Array, Beam
 from estimator.numerics import se2
-from tests.daemon.mapmaker import Shape, content, image
+from tests.daemon.support.map_maker import Shape, content, image
 from tests.estimator.circuit import driven
 
 pytestmark = pytest.mark.jit

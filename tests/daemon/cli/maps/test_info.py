@@ -11,7 +11,7 @@ import pytest
 
 from daemon.cli import parser
 from daemon.system import console
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.support.map_maker import Shape, content
 
 ROOT = Path(__file__).parents[4]
 

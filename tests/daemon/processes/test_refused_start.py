@@ -20,8 +20,8 @@ from daemon.cli import parser, run
 from daemon.system import console
 from hal.clock import LoopClock, run_virtual
 from hal.fake.transport import FakeOpener
-from tests.daemon.driven import during
 from tests.daemon.scenarios.test_daemon import SETTINGS
+from tests.daemon.support.whole_daemon import during
 
 ROOT = Path(__file__).parents[3]
 

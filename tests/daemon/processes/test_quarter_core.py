@@ -23,8 +23,8 @@ from daemon.runtime.warmup import load
 from daemon.snapshot import State
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
-from tests.daemon.heldback import PERIOD_US, cpu_s, held_back
-from tests.daemon.scenarios.test_process import ROOT, Running, running
+from tests.daemon.processes.cpu_quota import PERIOD_US, cpu_s, held_back
+from tests.daemon.processes.test_process import ROOT, Running, running
 
 # real time without slack: for a machine that does nothing else, so not among the quick system tests
 pytestmark = [pytest.mark.realtime, pytest.mark.system, pytest.mark.slow]

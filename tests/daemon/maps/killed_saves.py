@@ -1,4 +1,4 @@
-"""``python -m tests.daemon.killsave FOLDER KILLS SEED``: saves of maps, killed at random moments by SIGKILL.
+"""``python -m tests.daemon.maps.killed_saves FOLDER KILLS SEED``: saves of maps, killed at random moments by SIGKILL.
 
 A child saves one map after the other and tells each that is done; after a random time it is killed. Whatever is found
 then must be a whole map: the last that was told, or the one after it. Prints what was found, as JSON.
@@ -18,7 +18,7 @@ from typing import Final
 from daemon.maps.container import pack, unpack
 from daemon.maps.schema import Meta, read
 from daemon.maps.store import Store
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.support.map_maker import Shape, content
 
 MAP: Final = 0x51
 LONGEST_S: Final = 0.08

@@ -24,8 +24,8 @@ from daemon.runtime.warmup import load
 from estimator.cdma.air_interface import PROFILE_A
 from hal.bus.i2c_server import BusServer
 from hal.clock import SystemClock
-from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged
-from tests.daemon.scenarios.test_process import ROOT, Running, running
+from tests.daemon.processes.test_process import ROOT, Running, running
+from tests.daemon.support.light_room import BUS, CODES, SURVEY, Lit, plugged
 
 pytestmark = [pytest.mark.realtime, pytest.mark.system]
 

@@ -16,9 +16,9 @@ from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
 from daemon.snapshot import State
 from estimator.cdma.air_interface import PROFILE_A
-from tests.daemon.lightroom import SURVEY
-from tests.daemon.scenarios.test_lights_process import served
-from tests.daemon.scenarios.test_process import ROOT, fake_lidar, running
+from tests.daemon.processes.test_lights_process import served
+from tests.daemon.processes.test_process import ROOT, fake_lidar, running
+from tests.daemon.support.light_room import SURVEY
 
 COMPILES_S = 600.0
 DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef)

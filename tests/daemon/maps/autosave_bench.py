@@ -10,7 +10,7 @@ from daemon.maps.autosave import About, MapAutosaver
 from daemon.maps.store import Start, Store
 from estimator.mapping.map_snapshot import restored
 from estimator.state import State
-from tests.daemon.mapmaker import Shape, image
+from tests.daemon.support.map_maker import Shape, image
 
 
 @dataclass

@@ -16,9 +16,9 @@ import pytest
 
 from daemon.publish.modbus.holding import CommandCode, Outcome
 from daemon.snapshot import State
-from tests.daemon.room import ranges_m
-from tests.daemon.scenarios.test_process import PATIENCE_S, ROOT, running
-from tests.daemon.scenarios.test_store_process import ask
+from tests.daemon.processes.test_process import PATIENCE_S, ROOT, running
+from tests.daemon.processes.test_store_process import ask
+from tests.daemon.support.room import ranges_m
 
 pytestmark = [pytest.mark.realtime, pytest.mark.system]
 

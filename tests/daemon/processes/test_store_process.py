@@ -14,7 +14,7 @@ import pytest
 from daemon.health.faults import Fault
 from daemon.publish.modbus.holding import COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.snapshot import State
-from tests.daemon.scenarios.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
+from tests.daemon.processes.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
 
 pytestmark = [pytest.mark.realtime, pytest.mark.system]
 
