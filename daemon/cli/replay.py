@@ -12,12 +12,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from daemon.replay.log_replay import Outcome, replay
-from daemon.replay.recorded_inputs import (
-    Given,
-)
-from daemon.replay.report import (
-    write_all,
-)
+from daemon.replay.recorded_inputs import Given
+from daemon.replay.report import write_all
 from daemon.replay.results import Folder, OutputRefused, guessed
 from daemon.runtime import warmup
 from daemon.system import console

@@ -12,10 +12,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from daemon.cli.status_table import (
-    as_object,
-    as_table,
-)
+from daemon.cli.status_table import as_object, as_table
 from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.publish.modbus.points import Value
 from daemon.publish.port_owner import Whose

@@ -9,13 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.config.schema import Config
-from daemon.replay.recorded_inputs import (
-    NOTHING_GIVEN,
-    Given,
-    config_for,
-    lights_for,
-    start_for,
-)
+from daemon.replay.recorded_inputs import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import Source, open_log
 from daemon.runtime import warmup

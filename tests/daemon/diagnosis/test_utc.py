@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.why import NoMoment, find, spans
+from daemon.diagnosis.recorded_spans import NoMoment, find, spans
 from daemon.diagnosis.utc import Part, parts
 from daemon.recording import disk_writer
 from daemon.recording.disk_writer import CLOCK, SegmentWriter

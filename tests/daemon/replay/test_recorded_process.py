@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.why import spans
+from daemon.diagnosis.recorded_spans import spans
 from daemon.snapshot import State
 from daemon.system import console
 from tests.daemon.processes.test_process import ROOT, fake_lidar, running
