@@ -40,9 +40,10 @@ class Arrivals:
         self._at.append(t_rx)
 
     def seldom(self, t_mono: float, period: float) -> bool:
-        """Whether readings come more seldom than they used to, or than is asked for; asked for once a second.
+        """Whether readings come more seldom than they used to, or than is required; learns the usual rate on the way.
 
-        What is asked for goes by the lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
+        The rate is learned once in half a window at most, however often this is called. The required rate goes by the
+        lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
         """
         window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
         recent = sum(t_mono - t <= window for t in self._at)

@@ -53,7 +53,7 @@ class Cycle:
         blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
         alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
         paused: by a command: map and laser are left alone, light and odometry carry the pose.
-        laps: stages of the latest cycle. taker: makes the published picture of how the cycle is doing.
+        stage_timer: stages of the latest cycle. timing: quantiles, degradation and stalls as they are published.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -85,8 +85,8 @@ class Cycle:
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
-        laps = self.stage_timer
-        laps.begin()
+        timer = self.stage_timer
+        timer.begin()
         self.cycles += 1
         t_mono = self.parts.clock.now()
         taken = self.inbox.drain()
@@ -94,14 +94,14 @@ class Cycle:
         answers = self._answers(t_mono)
         orders = [command for command in taken.commands if command.order not in (Order.PAUSE, Order.RESUME)]
         records = (*answers, *orders, *self._bridge(taken))
-        laps.lap("bridge")
+        timer.lap("bridge")
         limits = self._step(records)
         self._watch_lamps(t_mono, records, limits)
         verdict = self._judge(t_mono, records, None if limits is None else self.result)
         snapshot = self._builder.build(self.result, verdict, self._facts(self.parts.clock.now()))
-        laps.lap("judge")
+        timer.lap("judge")
         self._publish(snapshot)
-        laps.lap("publish")
+        timer.lap("publish")
         self._account(t_mono, records, limits)
         if self.parts.tap is not None:
             record = CycleRecord(
@@ -116,7 +116,7 @@ class Cycle:
                 limits=limits,
                 result=self.result,
                 snapshot=snapshot,
-                stage_us=laps.us,
+                stage_us=timer.us,
                 samples=taken.samples_total,
                 switched=self._switched,
                 waiting=self.parts.status.link is Link.WAITING,
