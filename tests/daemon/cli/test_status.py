@@ -20,7 +20,7 @@ import pytest
 from daemon.cli import status as cli_status
 from daemon.cli import status_table
 from daemon.config.schema import Config, ModbusConfig
-from daemon.publish.modbus import lights_block, registers
+from daemon.publish.modbus import client, lights_block, registers
 from daemon.snapshot import Snapshot, State
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -189,7 +189,7 @@ def stranger(block: bytes, head: bytes = b"\x00\x00\x00\x83\x01\x04\x80", silent
 def test_a_lost_datagram_is_asked_for_again(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli_status, "_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(client, "_TIMEOUT_S", 0.1)
     with stranger(registers.encode_block(snapshot(reason=0, fault=0)), silent=2) as address:
         assert status(address) == 0
     assert "TRACKING" in capsys.readouterr().out
@@ -263,7 +263,7 @@ def test_whose_registers_are_shown_is_said(
 
 
 def test_silence(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli_status, "_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(client, "_TIMEOUT_S", 0.02)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         assert status(f"127.0.0.1:{sock.getsockname()[1]}") == 1

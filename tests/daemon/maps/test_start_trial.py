@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from daemon import app
 from daemon.app import Daemon, Environment, Pacemaker
 from daemon.config.schema import MapConfig
 from daemon.maps import autosave, start_trial
 from daemon.maps.initial_state import started
 from daemon.maps.start_trial import MOST, NAME, PROOF_S
 from daemon.maps.store import Start
+from daemon.runtime import estimator_runner
 from daemon.runtime.warmup import CannotLoad
 from hal.clock import LoopClock, run_virtual
 from hal.fake.transport import FakeOpener
@@ -180,7 +180,7 @@ def test_only_a_start_that_has_come_to_its_map_counts(
         world = Environment(clock, opener=FakeOpener(clock), warm_up=warm_up, store=store, start=start)
         await Daemon(SETTINGS, world).run(asyncio.Event())
 
-    monkeypatch.setattr(app, "new_state", ended)
+    monkeypatch.setattr(estimator_runner, "new_state", ended)
     with pytest.raises(CannotLoad):
         run_virtual(go())
     assert (tmp_path / NAME).exists() is counts

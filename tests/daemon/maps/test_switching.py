@@ -210,7 +210,7 @@ def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_
 
 
 class Quiet:
-    """A autosaver that has nothing to save, or cannot."""
+    """An autosaver that has nothing to save, or cannot."""
 
     def __init__(self, reason: str = "", ready: bool = True) -> None:
         self.ready, self.map_id, self._reason = ready, FIRST, reason
