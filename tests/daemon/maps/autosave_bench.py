@@ -26,7 +26,7 @@ class Clock:
 
 @dataclass
 class Bench:
-    """A autosaver with everything around it in hand."""
+    """An autosaver with everything around it in hand."""
 
     folder: Path
     state: State | None = field(default_factory=lambda: restored(image(Shape())))
