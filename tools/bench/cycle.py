@@ -191,7 +191,7 @@ def instrument(stages: Stages, daemon: Daemon) -> None:
     cycle = daemon.cycle
     for owner, attribute, stage in (
         (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"), (cycle, "_publish",
-        "publish"), (SnapshotBuilder, "paint", "judge"), (decoder, "decode", "decode"), (decoder, "search", "search"),
+        "publish"), (SnapshotBuilder, "build", "judge"), (decoder, "decode", "decode"), (decoder, "search", "search"),
         (light_filter, "update", "lights"), (light_filter, "predict", "lights"), (map_odom_filter, "on_lights",
         "lights"), (pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match"), (pipeline, "fuse", "fuse"),
         (pipeline, "predict", "fuse"), (pipeline, "keyframe_due", "map"), (pipeline, "lay_keyframe", "map"), (pipeline,
