@@ -36,7 +36,7 @@ from daemon.maps.store import judge_for
 from daemon.maps.switching import Maps, MapSwitch, Switch
 from daemon.publish.feeds import Feeds
 from daemon.publish.network import Network
-from daemon.publish.stream_ticker import StreamBeat
+from daemon.publish.stream.ticker import StreamBeat
 from daemon.runtime.cycle import Cycle
 from daemon.runtime.cycle_parts import Parts, PendingSwitch
 from daemon.runtime.estimator_runner import EstimatorRunner

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Final
 
 from daemon.health.faults import Fault
-from daemon.publish.stream_client import Stream
-from daemon.publish.stream_messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
 from daemon.snapshot import LinkUse
 from hal.bus import i2c_linux
 from hal.hokuyo import discover

@@ -24,7 +24,7 @@ from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:
     from daemon.publish.modbus.server import ModbusPublisher
-    from daemon.publish.stream_server import StreamServer
+    from daemon.publish.stream.server import StreamServer
     from daemon.publish.udp_sender import PoseSender
 
 log = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ class Network:
         self.parts["pose"] = lambda: _open(sender.start, sender.close)
 
     def _add_stream(self, path: Path) -> None:
-        from daemon.publish.stream_server import StreamServer
+        from daemon.publish.stream.server import StreamServer
 
         server = StreamServer(path, self._settings.name, lambda reason: REASONS[Reason(reason)])
         self.stream = server

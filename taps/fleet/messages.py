@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from daemon.publish.stream_messages import Fault, Faults, Loop, Pose, Triple
+from daemon.publish.stream.messages import Fault, Faults, Loop, Pose, Triple
 
 SCHEMA: Final = 1
 ROOT: Final = "lumiloop"

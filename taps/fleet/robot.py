@@ -21,8 +21,8 @@ from daemon.config.paths import maps_folder
 from daemon.maps.container import BadMap
 from daemon.maps.schema import read
 from daemon.maps.store import Store
-from daemon.publish.stream_client import Lost, Stream
-from daemon.publish.stream_messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
 from daemon.system import console
 from hal.run_server import work_until_told
 from taps.fleet import messages

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final
 
 from daemon.config.schema import Config
-from daemon.publish.stream_client import Lost, Stream
-from daemon.publish.stream_messages import Hello, NotTheStream
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Hello, NotTheStream
 from daemon.system import console
 from hal.run_server import work_until_told
 from taps.mcap.writer import FLUSH_S, McapFile, NoRoom

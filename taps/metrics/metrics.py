@@ -9,8 +9,8 @@ from typing import Final
 
 import msgspec
 
-from daemon.publish.stream_client import Lost
-from daemon.publish.stream_messages import Faults, Frame, Hello, Lights, Pose, Statistics
+from daemon.publish.stream.client import Lost
+from daemon.publish.stream.messages import Faults, Frame, Hello, Lights, Pose, Statistics
 from daemon.snapshot import LinkUse, Part, Stage, State
 
 OLD_S: Final = 3.0

@@ -13,8 +13,8 @@ import time
 from typing import Final
 
 from daemon.config.endpoints import in_url, parse_endpoint
-from daemon.publish.stream_client import Stream
-from daemon.publish.stream_messages import NotTheStream
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
 from hal.run_server import work_until_told
 from taps.metrics import vda5050

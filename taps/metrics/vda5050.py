@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from daemon.publish.stream_messages import Pose
+from daemon.publish.stream.messages import Pose
 from daemon.snapshot import State
 
 LOCALISED = (State.TRACKING, State.MAPPING, State.DEGRADED)

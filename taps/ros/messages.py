@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.config.schema import Mount
-from daemon.publish.stream_messages import (
+from daemon.publish.stream.messages import (
     Faults,
     Frame,
     Lights,

@@ -14,8 +14,8 @@ from typing import Final
 
 import zenoh
 
-from daemon.publish.stream_client import Stream
-from daemon.publish.stream_messages import NotTheStream
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
 from hal.run_server import work_until_told
 from taps.ros import rmw_zenoh, types

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from daemon.config.schema import Config
 from daemon.health.reasons import REASONS, Reason
-from daemon.publish import stream_messages as messages
-from daemon.publish import stream_server
-from daemon.publish.stream_messages import Frame, Raw
-from daemon.publish.stream_server import Client, StreamServer
-from daemon.publish.stream_ticker import BEAT_S, in_words
+from daemon.publish.stream import messages
+from daemon.publish.stream import server as stream_server
+from daemon.publish.stream.messages import Frame, Raw
+from daemon.publish.stream.server import Client, StreamServer
+from daemon.publish.stream.ticker import BEAT_S, in_words
 from daemon.replay.recorded_inputs import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import Source, open_log

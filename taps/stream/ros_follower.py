@@ -6,8 +6,8 @@ import contextlib
 from typing import Protocol
 
 from daemon.config.schema import Config
-from daemon.publish.stream_client import Lost, Stream
-from daemon.publish.stream_messages import Hello
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Hello
 from daemon.system import console
 from taps.ros.messages import Out, Translator
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from daemon.maps import map_server
 from daemon.maps.tiles import RESOLUTION_M
-from daemon.publish.stream_messages import MapTiles
+from daemon.publish.stream.messages import MapTiles
 
 LogOdds = npt.NDArray[np.float32]
 NOTHING: Final = np.zeros((1, 1), np.float32)

@@ -26,7 +26,7 @@ from daemon.config.endpoints import in_url
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError
 from daemon.publish.modbus.client import NoAnswer
-from daemon.publish.stream_client import Stream
+from daemon.publish.stream.client import Stream
 from daemon.system import console
 from daemon.system.logging import to_journal
 from hal.run_server import stopping

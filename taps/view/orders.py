@@ -16,7 +16,7 @@ from typing import Any, Final, cast
 
 from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.publish.port_owner import whose
-from daemon.publish.stream_client import Stream
+from daemon.publish.stream.client import Stream
 from hal.blocking_calls import beside
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10

@@ -21,9 +21,9 @@ from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError
 from daemon.health.reasons import REASONS, Reason
 from daemon.maps.tiles import MapTiles
-from daemon.publish import stream_messages as messages
-from daemon.publish.stream_server import Client, StreamServer
-from daemon.publish.stream_ticker import in_words, place_of
+from daemon.publish.stream import messages
+from daemon.publish.stream.server import Client, StreamServer
+from daemon.publish.stream.ticker import in_words, place_of
 from daemon.replay.recorded_inputs import Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import open_log

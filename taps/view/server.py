@@ -19,8 +19,8 @@ from typing import Any, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from daemon.publish.stream_client import Lost, Stream
-from daemon.publish.stream_messages import Hello, NotTheStream, Refused
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Hello, NotTheStream, Refused
 from taps.view.access_guard import HEADERS, Guard
 from taps.view.orders import OrderRefused, Orders
 from taps.view.page_hello import CannotLook, Scene, welcome

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 
 import msgspec
 
-from daemon.publish.stream_messages import TYPES, Data, Lights, MapTiles, Pose
+from daemon.publish.stream.messages import TYPES, Data, Lights, MapTiles, Pose
 
 KEPT: Final = 64
 """Of what happens once."""

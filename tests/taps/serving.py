@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from daemon.maps.tiles import MapTiles
-from daemon.publish.stream_server import SIDE, StreamServer
+from daemon.publish.stream.server import SIDE, StreamServer
 from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
-from tests.daemon.publish.test_stream_server import raw_scan
+from tests.daemon.publish.stream.test_server import raw_scan
 
 LINKS = (
     LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01),

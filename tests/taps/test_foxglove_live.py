@@ -15,7 +15,7 @@ pytest.importorskip("foxglove", reason="pip install 'lumiloop[foxglove]'")
 import aiohttp
 
 from daemon.config.schema import Config
-from daemon.publish.stream_client import Stream
+from daemon.publish.stream.client import Stream
 from taps import foxglove_live
 from taps.foxglove_live import Bridge
 from taps.ros import types

@@ -17,7 +17,7 @@ import pytest
 from daemon.cli.doctor import examine
 from daemon.diagnosis.host import Heard, Host, Mute
 from daemon.maps.store import Store
-from daemon.publish.stream_messages import Fault, Faults, Pose
+from daemon.publish.stream.messages import Fault, Faults, Pose
 from daemon.system import console
 from hal.errors import DeviceFault
 from hal.lidar import LidarGeometry

@@ -18,7 +18,7 @@ from daemon.diagnosis.lamp_history import DAY_S, BadHistory, Look, by_lamp, in_m
 from daemon.diagnosis.lamp_trend import YEAR_S, Array, Finding, Verdict, judge, together
 from daemon.health.faults import Fault as Said
 from daemon.maps.image import meta_of, packed
-from daemon.publish.stream_messages import Fault, Faults
+from daemon.publish.stream.messages import Fault, Faults
 from daemon.snapshot import LinkUse
 from daemon.system import console
 from tests.daemon.diagnosis.test_doctor import Computer

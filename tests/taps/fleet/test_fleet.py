@@ -16,7 +16,7 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
 from daemon.cli import parser
-from daemon.publish.stream_client import Stream
+from daemon.publish.stream.client import Stream
 from daemon.system import console
 from taps import zenoh_session
 from taps.fleet import messages, robot, show

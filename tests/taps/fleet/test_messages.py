@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.publish.stream_messages import Fault, Pose, Trust
+from daemon.publish.stream.messages import Fault, Pose, Trust
 from taps.fleet import drawing, messages
 from taps.fleet.messages import Held, MapHead, PoseTold, StateTold, Unreadable
 from taps.fleet.roster import Roster

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from daemon.cli import parser
-from daemon.publish.stream_server import framed
+from daemon.publish.stream.server import framed
 from daemon.system import console
 
 pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")

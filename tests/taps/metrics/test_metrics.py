@@ -14,8 +14,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.publish.stream_client import Lost, Stream
-from daemon.publish.stream_messages import Fault, Faults, Hello, Pose, Statistics
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Fault, Faults, Hello, Pose, Statistics
 from daemon.snapshot import State
 from taps.metrics import server
 from taps.metrics.metrics import Told, exposition

@@ -14,11 +14,11 @@ pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
 from rosbags.typesys import Stores, get_typestore
 
 from daemon.config.schema import Mount
-from daemon.publish.stream_messages import MapTiles, Pose, Scan
-from daemon.publish.stream_server import SIDE, scan_message
+from daemon.publish.stream.messages import MapTiles, Pose, Scan
+from daemon.publish.stream.server import SIDE, scan_message
 from daemon.snapshot import State
 from taps.ros.messages import AGAIN_S, Translator
-from tests.daemon.publish.test_stream_server import GEOMETRY, raw_scan
+from tests.daemon.publish.stream.test_server import GEOMETRY, raw_scan
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 

@@ -15,7 +15,7 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from daemon.publish.stream_client import Stream
+from daemon.publish.stream.client import Stream
 from taps.ros import node, rmw_zenoh, types
 from taps.ros.messages import TOPICS
 from taps.zenoh_session import config

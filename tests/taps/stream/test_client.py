@@ -15,11 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.config.paths import stream_path
-from daemon.publish import stream_client as client
-from daemon.publish import stream_messages as messages
-from daemon.publish.stream_client import Lost, Stream
-from daemon.publish.stream_messages import TYPES, Frame, Hello, NotTheStream
-from daemon.publish.stream_server import SCHEMA, TOPICS, StreamServer, framed
+from daemon.publish.stream import client, messages
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import TYPES, Frame, Hello, NotTheStream
+from daemon.publish.stream.server import SCHEMA, TOPICS, StreamServer, framed
 from daemon.snapshot import (
     Condition,
     CycleTiming,
@@ -34,7 +33,7 @@ from daemon.snapshot import (
     Trust,
 )
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.test_stream_server import raw_scan, run
+from tests.daemon.publish.stream.test_server import raw_scan, run
 from tests.taps.serving import served
 
 LINK = LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01)

@@ -11,7 +11,7 @@ from daemon.config.schema import Config
 from daemon.health.assessment import REPLAYED
 from daemon.health.faults import FAULTS, Fault
 from daemon.integrity.lamp_monitor import LASTS_S
-from daemon.publish.stream_messages import Faults
+from daemon.publish.stream.messages import Faults
 from taps.stream.recording_source import Retold
 from tests.daemon.replay.test_recorded_lights import Recorded, record
 from tests.daemon.replay.test_recorded_run import pulled

@@ -13,14 +13,14 @@ from typing import Any
 import msgspec
 from aiohttp import ClientSession, ClientWebSocketResponse, web
 
-from daemon.publish.stream_client import Stream
-from daemon.publish.stream_server import StreamServer
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.server import StreamServer
 from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
 from taps.view.access_guard import Guard
 from taps.view.page_hello import Scene
 from taps.view.replay_file import Film
 from taps.view.server import TOPICS, View
-from tests.daemon.publish.test_stream_server import until
+from tests.daemon.publish.stream.test_server import until
 
 TOKEN = "a-token-of-more-than-sixteen-letters"
 PATIENCE_S = 5.0

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from daemon.publish.stream_messages import MapTiles
+from daemon.publish.stream.messages import MapTiles
 from taps.view import server
 from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, serving, snapshot

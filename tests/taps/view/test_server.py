@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from aiohttp import WSServerHandshakeError
 
-from daemon.publish import stream_server as daemon_stream
-from daemon.publish.stream_messages import Loop, MapTiles, Scan
+from daemon.publish.stream import server as daemon_stream
+from daemon.publish.stream.messages import Loop, MapTiles, Scan
 from daemon.snapshot import State
 from taps.view import server, viewers
 from taps.view.access_guard import Guard
-from tests.daemon.publish.test_stream_server import raw_scan, until
+from tests.daemon.publish.stream.test_server import raw_scan, until
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 
 

@@ -16,7 +16,7 @@ from taps.view import orders
 from taps.view.access_guard import Guard
 from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing
-from tests.daemon.publish.test_stream_server import until
+from tests.daemon.publish.stream.test_server import until
 from tests.taps.view.house import TOKEN, House, Page, serving
 from tests.taps.view.test_server import run
 

@@ -17,7 +17,7 @@ from typing import Final
 
 from aiohttp import ClientError, ClientSession, WSMsgType, web
 
-from daemon.publish.stream_client import Stream
+from daemon.publish.stream.client import Stream
 from taps.view.access_guard import Guard
 from taps.view.command import NICENESS
 from taps.view.page_hello import Scene

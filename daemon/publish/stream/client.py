@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Final
 
 from daemon.config.paths import SERVICE, daemons_in, stream_path
-from daemon.publish import stream_messages as messages
-from daemon.publish.stream_messages import LONGEST, Frame, NotTheStream, Refused
-from daemon.publish.stream_server import TOPICS
+from daemon.publish.stream import messages
+from daemon.publish.stream.messages import LONGEST, Frame, NotTheStream, Refused
+from daemon.publish.stream.server import TOPICS
 
 FIRST_RETRY_S: Final = 0.2
 LAST_RETRY_S: Final = 2.0

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from daemon.maps.tiles import MapTiles
-from daemon.publish import stream_ticker
-from daemon.publish.stream_fields import FIELDS, RECORDS
-from daemon.publish.stream_server import SIDE, TOPICS, StreamServer
+from daemon.publish.stream import ticker as stream_ticker
+from daemon.publish.stream.fields import FIELDS, RECORDS
+from daemon.publish.stream.server import SIDE, TOPICS, StreamServer
 from daemon.snapshot import LightPicture
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.test_stream_server import SNAPSHOT, connected, raw_scan, run
+from tests.daemon.publish.stream.test_server import SNAPSHOT, connected, raw_scan, run
 from tests.daemon.runtime.test_cycle import on_bench
 
 

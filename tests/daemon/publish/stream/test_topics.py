@@ -11,14 +11,16 @@ import pytest
 
 from daemon.maps import tiles as maps_tiles
 from daemon.maps.tiles import MapTiles
-from daemon.publish import stream_server, stream_session, stream_ticker
-from daemon.publish.stream_server import StreamServer
+from daemon.publish.stream import server as stream_server
+from daemon.publish.stream import session as stream_session
+from daemon.publish.stream import ticker as stream_ticker
+from daemon.publish.stream.server import StreamServer
 from estimator import pipeline
 from estimator.mapping import grid_patches, live_grid
 from estimator.measurements import UNLIMITED, Scan
 from estimator.state import State
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.test_stream_server import Tap, connected, run, until, wanting
+from tests.daemon.publish.stream.test_server import Tap, connected, run, until, wanting
 from tests.daemon.runtime.test_cycle import on_bench
 from tests.daemon.support.room import HALF_X, HALF_Y, ranges_m
 

@@ -18,15 +18,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.publish import stream_server, stream_session
-from daemon.publish.stream_server import Client, StreamServer, scan_message
+from daemon.publish.stream import server as stream_server
+from daemon.publish.stream import session as stream_session
+from daemon.publish.stream.server import Client, StreamServer, scan_message
 from daemon.snapshot import Snapshot, State
 from hal.clock import run_virtual
 from hal.errors import DeviceRefused
 from hal.lidar import VALID, LidarGeometry, RawScan
 from tests.daemon.publish.network import Wire
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 GEOMETRY = LidarGeometry("m", "s", "f", 1440.0, 540.0, 0, 1080, 23, 60000, 0.001, 0.025, 0.0)
 SNAPSHOT = Snapshot(7, 1.0, 1.1, 2.0, State.TRACKING, 3, pose=(1.0, 2.0, 3.0))
 

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from daemon.maps.tiles import NOTHING_SHOWN, RESOLUTION_M, MapTiles
-from daemon.publish.stream_session import CLIENTS, LATEST, ONCE, RAW, SCHEMA, TOPICS, Client, encode, framed
+from daemon.publish.stream.session import CLIENTS, LATEST, ONCE, RAW, SCHEMA, TOPICS, Client, encode, framed
 from daemon.snapshot import Snapshot
 from hal.adc import RawSamples
 from hal.errors import DeviceRefused

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from daemon.health.faults import FAULTS, Fault
 from daemon.maps.tiles import MapTiles
-from daemon.publish.stream_server import StreamServer
+from daemon.publish.stream.server import StreamServer
 from daemon.runtime.cycle_facts import CycleFacts
 from daemon.runtime.vitals import process_age_s, resident_mb
 

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from daemon.publish.stream_server import SCHEMA, framed
+from daemon.publish.stream.server import SCHEMA, framed
 
 Triple = tuple[float, float, float]
 LONGEST: Final = 8 << 20
