@@ -1,4 +1,4 @@
-"""The one picture of the world that every publisher shows: built once per cycle, never changed afterwards."""
+"""The snapshot: everything that is published of one cycle, immutable."""
 
 from __future__ import annotations
 

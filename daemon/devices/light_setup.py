@@ -1,4 +1,4 @@
-"""What the estimator is told of ceiling lights before it starts: the survey, the air interface, the sample clock.
+"""Setup of the light channel: the survey, the air interface, the sample clock, and the residual map.
 
 It is read once, kept in a recording, and taken from there by a replay: the survey file may have changed since. All
 of it is in the head of every segment but the residual map, which is large: a file in the recording's folder holds it.

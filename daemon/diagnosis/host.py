@@ -1,4 +1,4 @@
-"""What a check may ask: of the computer, of its devices, and of the daemon, if one runs. Tests have their own."""
+"""The host that the checks query: the computer, its devices, and a running daemon. Tests replace it."""
 
 from __future__ import annotations
 

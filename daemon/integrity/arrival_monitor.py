@@ -1,4 +1,4 @@
-"""When odometry readings arrived: whether they come, and as often as they used to."""
+"""Arrival monitor of odometry: whether readings arrive, and at their usual rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the data say of their devices beyond coming or not: too late, lost, and at odds with everything else.
+"""Input monitor: scans and readings that are late, lost, or inconsistent with the other sensors.
 
 Counters and facts for the vitals, fed by the cycle; nothing here changes what is done with the data.
 """

@@ -1,4 +1,4 @@
-"""Do the wheels and the laser tell the same motion? A sliding window over the last seconds.
+"""Consistency of odometry and laser: compares their motion over a sliding window of the last seconds.
 
 The laser's witness is ``T_odom_base`` at scans whose match fixed every axis; the wheels' witness is the bare chain of
 odometry increments, which the laser never touches. Where a match did not fix an axis, the pose took that axis from the

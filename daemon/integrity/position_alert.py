@@ -1,4 +1,4 @@
-"""The alert: raised while the bound on the position error is above the limit that is set, or there is none."""
+"""The position alert: raised while the protection level exceeds the alert limit, or there is none."""
 
 from __future__ import annotations
 

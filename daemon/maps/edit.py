@@ -1,4 +1,4 @@
-"""``lumiloop map align`` and ``lumiloop map name``: a map file changed as a whole, written as the next generation.
+"""Changes of a map file as a whole: a rigid motion of its frame, or a name. Written as the next generation.
 
 Nothing here loads the estimator's compiler.
 """

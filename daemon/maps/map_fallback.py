@@ -1,4 +1,4 @@
-"""Says in the log what becomes of a stored map in a frame of its own while light tells the robot's place.
+"""Fallback from a stored map in its own frame to a new one where light fixes the pose; logs each change.
 
 See `estimator.relocalisation.unaligned_map`: it is put aside, and found on the way or let go of.
 """

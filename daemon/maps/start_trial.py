@@ -1,4 +1,4 @@
-"""A stored map with which every start comes to grief: after three in a row the generation before it has its turn.
+"""Guard against a stored map with which every start fails: after three failures the generation before it is used.
 
 Such a file is good by all that can be told from it, and meets a defect of the software. A service that is started again
 and again with it would never come up; without it the robot works. What counts are starts since the computer was

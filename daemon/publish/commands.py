@@ -1,4 +1,4 @@
-"""Orders that come in over Modbus: each goes to who carries it out, and its end back to the client.
+"""Commands from Modbus: dispatches each to its handler and returns its outcome to the client.
 
 A controller may repeat an order at any rate (it writes a new number in every turn of its program): the log then gets
 some of them and their count.

@@ -1,4 +1,4 @@
-"""The moment at which the replay of a recording begins that has no beginning, or none that is wanted."""
+"""Start of a replay within a recording: the stored state that it begins from."""
 
 from __future__ import annotations
 

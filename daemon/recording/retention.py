@@ -1,4 +1,4 @@
-"""What becomes of a recording's segments: states beside them, the oldest taken away, dumps. In a thread of its own.
+"""Retention of a recording's segments: states beside them, removal of the oldest, dumps. Runs in its own thread.
 
 A recording can be replayed from its beginning, and from every segment with a state beside it. What is taken away is
 therefore everything before such a segment, and never the last of them. A dump is a folder of links to the segments that

@@ -1,4 +1,4 @@
-"""Samples what the heartbeat judges, and says how the process itself is doing."""
+"""Vitals for the heartbeat and the line of statistics, from the facts about the cycle and the process."""
 
 from __future__ import annotations
 

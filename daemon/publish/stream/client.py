@@ -1,4 +1,4 @@
-"""Client of the daemon's local stream: connects, says what it wants, comes again when the daemon has gone.
+"""Client of the daemon's local stream: connects, subscribes to topics, and reconnects after a loss.
 
 async for frame in Stream(path, ("pose", "scan")).frames():
     match frame:

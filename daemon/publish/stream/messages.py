@@ -1,4 +1,4 @@
-"""What the local stream tells, with types: bytes in, records out, no I/O (docs/stream.md is the contract).
+"""Typed messages of the local stream: bytes in, records out, no I/O (docs/stream.md is the contract).
 
 Fields that this version does not know are skipped; states and faults stay numbers, of which a newer
 daemon may have more.

@@ -1,4 +1,4 @@
-"""One tap of the local stream: what it wants, what it has not taken yet, and when it is let go.
+"""Session of one client of the local stream: its topics, its queue, and when it is disconnected.
 
 What is the latest of its kind replaces what a slow one has not taken (and is counted); what happens once is kept for
 it, up to a bound.

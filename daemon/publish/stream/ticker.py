@@ -1,4 +1,4 @@
-"""What the local stream tells once a second: faults, statistics, tiles of the map."""
+"""Messages of the local stream once a second: faults, statistics, tiles of the map."""
 
 from __future__ import annotations
 
