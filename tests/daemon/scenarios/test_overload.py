@@ -50,7 +50,7 @@ def test_where_odometry_carries_the_pose_the_laser_is_left_out_and_that_is_said(
     last = bench.snapshots[-1]
     assert last.state is State.TRACKING
     assert last.pulse is not None
-    assert last.pulse.level == 0
+    assert last.pulse.rung == 0
     assert last.pulse.carried == len(carried)
     assert max(error(s.pose, s.t_mono)[0] for s in bench.snapshots[-50:] if s.pose is not None) < 0.02
     assert bench.cycle.timing.short >= len(carried)
