@@ -21,9 +21,10 @@ from daemon.runtime.cycle_parts import Sink
 from daemon.runtime.warmup import warm_up
 from daemon.runtime.worker import ThreadWorker, Worker
 from hal.bus.i2c import BusOpener
+from hal.bus.opening import open_bus
 from hal.clock import Clock
 from hal.lidar import Lidar, LidarGeometry, LidarStatus, RawScan
-from hal.port.opening import open_bus, open_port
+from hal.port.opening import open_port
 from hal.port.port import PortOpener
 
 

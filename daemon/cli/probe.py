@@ -10,10 +10,11 @@ import sys
 from daemon.config.endpoints import LidarPlace, is_bus, parse_lidar
 from daemon.system import console
 from hal.bus import i2c_linux
+from hal.bus.opening import open_bus
 from hal.hokuyo import discover
+from hal.hokuyo.probe import Finding, identify_at
 from hal.photodiode.probe import BusFinding, Chip, probe_bus
-from hal.port.opening import open_bus, open_port
-from hal.probe import Finding, identify_at
+from hal.port.opening import open_port
 
 NOTHING = (
     "nothing to look at: no serial device that may be a HOKUYO is plugged in, and there is no I2C bus\n"

@@ -46,7 +46,7 @@ def _metrics(parser: argparse.ArgumentParser) -> None:
 def _foxglove(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
     listening(parser)
-    parser.set_defaults(body=needing("foxglove", "taps.foxglove_live", "main"))
+    parser.set_defaults(body=needing("foxglove", "taps.foxglove.live", "main"))
 
 
 def _ros2(parser: argparse.ArgumentParser) -> None:

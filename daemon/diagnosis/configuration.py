@@ -69,8 +69,8 @@ def _look_at_bus(name: str) -> str:
     """One line about the photodiode's bus, which is opened and closed again."""
     import asyncio
 
+    from hal.bus.opening import open_bus
     from hal.errors import HalError
-    from hal.port.opening import open_bus
 
     async def look() -> str:
         bus = await open_bus(name)

@@ -20,10 +20,11 @@ from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
 from daemon.snapshot import LinkUse
 from hal.bus import i2c_linux
+from hal.bus.opening import open_bus
 from hal.hokuyo import discover
+from hal.hokuyo.probe import Finding, identify_at
 from hal.photodiode.probe import BusFinding, probe_bus
-from hal.port.opening import open_bus, open_port
-from hal.probe import Finding, identify_at
+from hal.port.opening import open_port
 
 LISTEN_S: Final = 3.0
 LISTENERS: Final = "lumiloop-stream"

@@ -28,10 +28,10 @@ from typing import Final
 from hal.bus import i2c_frames as frames
 from hal.bus.i2c import AsyncBus, BusOpener, Message, Transferred, check
 from hal.bus.i2c_remote import clock_name, parse_address
+from hal.bus.opening import open_bus
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceRefused, HalError
 from hal.net.inet import resolve
-from hal.port.opening import open_bus
 from hal.run_server import say, until_told
 
 AHEAD: Final = 8

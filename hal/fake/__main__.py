@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hal.errors import HalError
-from hal.fake.control import Control, serve_control
-from hal.fake.faults import FaultError
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import MODELS, LidarModel, Unit
 from hal.fake.lidar.scan import ScanSource
 from hal.fake.lidar.scan_world import RecordedRanges, Room
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
 from hal.run_server import say, until_told
 
 

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Final
 
-from hal.fake.faults import Fault, Parameter, Vocabulary, Word
-from hal.fake.schedule import Orders
+from hal.fake.faults.orders import Fault, Parameter, Vocabulary, Word
+from hal.fake.faults.schedule import Orders
 
 Pose = tuple[float, float, float]
 Source = Callable[[float], tuple[float, Pose] | None]
@@ -50,7 +50,7 @@ def datagram(session: int, seq: int, t_mono: float, pose: Pose) -> bytes:
 
 
 class FakeOdometry:
-    """Sends readings when they are due; a :class:`hal.fake.schedule.Target` of fault orders.
+    """Sends readings when they are due; a :class:`hal.fake.faults.schedule.Target` of fault orders.
 
     Args:
         source: of readings, times in the loop's. send: takes a datagram, at the instant it arrives.

@@ -60,7 +60,7 @@ class PhotodiodeAdc:
     Args:
         bus: name of the bus, as the opener takes it. address: 7-bit address of the converter.
         chip: MCP3221, ADC121C021 or ADC121C027, in any case of letters.
-        clock: the loop's. opener: opens buses (:func:`hal.port.opening.open_bus`).
+        clock: the loop's. opener: opens buses (:func:`hal.bus.opening.open_bus`).
         sampling: length of blocks, DC channel.
 
     Raises:

@@ -72,7 +72,7 @@ async def probe_buses(opener: BusOpener, buses: Sequence[str]) -> list[BusFindin
     """Look at each bus; never raises for anything a bus does.
 
     Args:
-        opener: opens buses (:func:`hal.port.opening.open_bus`).
+        opener: opens buses (:func:`hal.bus.opening.open_bus`).
         buses: their names; those of this computer are :func:`hal.bus.i2c_linux.buses`.
     """
     return [await probe_bus(opener, bus) for bus in buses]

@@ -17,9 +17,9 @@ from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
 from hal.run_server import work_until_told
+from taps.access_guard import Guard
 from taps.metrics import vda5050
 from taps.metrics.metrics import CONTENT_TYPE, Told, exposition
-from taps.view.access_guard import Guard
 
 LONGEST_REQUEST: Final = 8192
 PATIENCE_S: Final = 5.0

@@ -20,7 +20,7 @@ from daemon.system import console
 from hal.run_server import work_until_told
 from taps.ros import rmw_zenoh, types
 from taps.ros.messages import TOPICS, Out
-from taps.stream.ros_follower import follow
+from taps.ros.stream_follower import follow
 from taps.zenoh_session import BadEndpoint, joined, listed, watched, withdraw
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")

@@ -30,7 +30,7 @@ from daemon.publish.stream.client import Stream
 from daemon.system import console
 from daemon.system.logging import to_journal
 from hal.run_server import stopping
-from taps.view.access_guard import Guard, TokenRefused, token_for
+from taps.access_guard import Guard, TokenRefused, token_for
 from taps.view.page_hello import CannotLook, Scene, scene_of
 from taps.view.replay_file import Film
 from taps.view.server import TOPICS, View

@@ -21,7 +21,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Hello, NotTheStream, Refused
-from taps.view.access_guard import HEADERS, Guard
+from taps.access_guard import HEADERS, Guard
 from taps.view.orders import OrderRefused, Orders
 from taps.view.page_hello import CannotLook, Scene, welcome
 from taps.view.replay_file import Film

@@ -25,11 +25,11 @@ from daemon.maps.store import Start
 from daemon.snapshot import Snapshot, State
 from estimator.mapping.map_snapshot import Identity, image_of
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
 from hal.fake.odometry import FakeOdometry
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.ceiling.effects import IDEAL

@@ -20,13 +20,13 @@ from hal.bus import i2c_frames as frames
 from hal.bus.i2c import MAX_LENGTH, MAX_MESSAGES, AsyncBus, Message, OnRead, Transferred, read, write
 from hal.bus.i2c_remote import RemoteBus, clock_name
 from hal.bus.i2c_server import BusServer
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import HalError
 from hal.photodiode.adapter_limits import Capability
 from hal.photodiode.diagnosis import Judge
 from hal.photodiode.mcp3221 import CHIP
 from hal.photodiode.sampler import Sampler
-from hal.port.opening import open_bus
 
 SIZES = [pytest.param(400_000, id="quick"), pytest.param(10_000_000, id="10MB", marks=pytest.mark.slow)]
 PROTOCOL = 4096

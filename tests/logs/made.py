@@ -26,7 +26,7 @@ from estimator.cdma.air_interface import PROFILE_A
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tests.daemon.support.light_room import SURVEY, Lit, plugged
 from tools.bench.world.room import LIDAR, room

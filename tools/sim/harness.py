@@ -24,10 +24,10 @@ from daemon.runtime.cycle_parts import Sink
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule, Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.schedule import FaultSchedule, Target
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.building.world import Array
 from tools.sim.feed import feed_odometry

@@ -28,13 +28,13 @@ import numpy as np
 
 from daemon.config.survey_loader import SurveyError
 from hal.errors import HalError
-from hal.fake.control import Control, serve_control
-from hal.fake.faults import FaultError
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule, Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import MODELS, Unit
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule, Target
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
 from hal.run_server import work_until_told
 from tools.sim.building.buildings import BUILDINGS
 from tools.sim.ceiling.ceiling import Effects

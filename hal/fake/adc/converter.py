@@ -21,8 +21,8 @@ from hal.fake.adc.faults import ADC
 from hal.fake.adc.i2c_adapters import BCM2835, Adapter
 from hal.fake.adc.i2c_bus import FakeBus, Transaction
 from hal.fake.adc.i2c_timing import Times
-from hal.fake.faults import Fault, FaultError, Vocabulary
-from hal.fake.schedule import Orders
+from hal.fake.faults.orders import Fault, FaultError, Vocabulary
+from hal.fake.faults.schedule import Orders
 
 MIDDLE: Final = 0.5
 """What an AC-coupled input rests at."""
@@ -40,7 +40,7 @@ CHIPS: Final[dict[str, Callable[[SampleSource], FakeChip]]] = {
 
 
 class FakeAdc:
-    """One bus with one converter, and a DC channel if there is one; a :class:`hal.fake.schedule.Target`.
+    """One bus with one converter, and a DC channel if there is one; a :class:`hal.fake.faults.schedule.Target`.
 
     Args:
         source: the signal at the converter. clock: the loop's.

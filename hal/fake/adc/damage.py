@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from hal.fake.faults import Fault
+from hal.fake.faults.orders import Fault
 
 Harm = Callable[[bytes, Fault, Random], bytes]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 
-from hal.fake.faults import Parameter, Vocabulary, Word
+from hal.fake.faults.orders import Parameter, Vocabulary, Word
 
 ERRORS = (
     *("EIO", "ENXIO", "EREMOTEIO", "ETIMEDOUT", "EAGAIN", "EBUSY", "EOPNOTSUPP", "EINVAL"),

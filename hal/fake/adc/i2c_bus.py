@@ -18,8 +18,8 @@ from hal.fake.adc.damage import DAMAGE
 from hal.fake.adc.faults import number_of
 from hal.fake.adc.i2c_adapters import Adapter
 from hal.fake.adc.i2c_timing import Line
-from hal.fake.faults import Fault
-from hal.fake.schedule import Orders
+from hal.fake.faults.orders import Fault
+from hal.fake.faults.schedule import Orders
 
 BLOCK: int = 60
 """Bytes of a read from which on it counts as a block."""

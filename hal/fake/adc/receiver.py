@@ -25,9 +25,9 @@ from hal.fake.adc.chips import SampleSource
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import ADAPTERS
 from hal.fake.adc.light import OrdinaryLamps, RecordedLight
-from hal.fake.control import Control, serve_control
-from hal.fake.faults import FaultError
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule
 from hal.run_server import say, until_told
 
 BUS = "simulated"

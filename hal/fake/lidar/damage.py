@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from hal.fake.faults import Fault
+from hal.fake.faults.orders import Fault
 
 HEAD_LINES = 2
 """Echo and status; data lines follow, and an empty line ends the reply."""

@@ -15,7 +15,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from hal.fake.faults import Fault, FaultError, Vocabulary
+from hal.fake.faults.orders import Fault, FaultError, Vocabulary
+from hal.fake.faults.schedule import Orders
 from hal.fake.lidar.console import Console
 from hal.fake.lidar.device_state import Core
 from hal.fake.lidar.dialect_grid import State
@@ -26,7 +27,6 @@ from hal.fake.lidar.output_line import HostEnd, OutletCounts
 from hal.fake.lidar.rotor import EvenRotor, Rotor
 from hal.fake.lidar.scan import ScanSource
 from hal.fake.lidar.sensor_clock import SensorClock
-from hal.fake.schedule import Orders
 
 LINK_UP = 0.5
 """Share of the start-up after which a USB or Ethernet sensor can be opened again."""
@@ -40,7 +40,7 @@ def _nothing(_fault: Fault) -> None:
 
 
 class FakeHokuyo:
-    """One simulated sensor; a :class:`hal.fake.schedule.Target` of fault orders.
+    """One simulated sensor; a :class:`hal.fake.faults.schedule.Target` of fault orders.
 
     Args:
         model: which type.

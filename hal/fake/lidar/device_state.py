@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Callable
 from random import Random
 
+from hal.fake.faults.schedule import Orders
 from hal.fake.lidar.damage import DAMAGE, splice
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import LidarModel, Unit
 from hal.fake.lidar.output_line import Outlet, Pacing
 from hal.fake.lidar.sensor_clock import SensorClock
-from hal.fake.schedule import Orders
 
 LINE_RATES = {"usb": 1.0e6, "ethernet": 12.5e6}
 """Bytes per second; RS-232 follows its baud rate, ten bit times a byte."""

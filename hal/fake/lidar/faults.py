@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hal.fake.faults import Parameter, Vocabulary, Word
+from hal.fake.faults.orders import Parameter, Vocabulary, Word
 from hal.fake.lidar.commands import PARAMETERS, SINGLES, STREAMS
 from hal.fake.lidar.output_line import MAX_JOIN
 from hal.fake.lidar.scip_encoder import MAX_3

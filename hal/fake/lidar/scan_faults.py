@@ -7,9 +7,9 @@ from random import Random
 
 import numpy as np
 
+from hal.fake.faults.schedule import Orders
 from hal.fake.lidar.models import LidarModel
 from hal.fake.lidar.scan import FakeScan
-from hal.fake.schedule import Orders
 
 
 def altered(scan: FakeScan, orders: Orders, model: LidarModel, chance: Random) -> FakeScan:

@@ -15,9 +15,9 @@ from daemon.config import endpoints
 from daemon.config.schema import Config, PhotodiodeConfig
 from hal.bus.i2c import BusOpener
 from hal.errors import DeviceMissing, DeviceRefused
+from hal.hokuyo.probe import Finding
 from hal.photodiode.probe import BusFinding, Chip
 from hal.port.port import PortOpener
-from hal.probe import Finding
 from tests.daemon.support.room import URG
 
 LIDAR = Finding("/dev/ttyACM0", URG, "SOKUIKI Sensor URG-04LX", "SCIP 2.0", "Sensor works well.")

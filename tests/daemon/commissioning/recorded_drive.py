@@ -12,7 +12,7 @@ from daemon.recording.recorder import Recorder
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.building.buildings import building
 from tools.sim.feed import feed_odometry

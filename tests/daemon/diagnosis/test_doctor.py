@@ -20,9 +20,9 @@ from daemon.maps.store import Store
 from daemon.publish.stream.messages import Fault, Faults, Pose
 from daemon.system import console
 from hal.errors import DeviceFault
+from hal.hokuyo.probe import Finding
 from hal.lidar import LidarGeometry
 from hal.photodiode.probe import BusFinding, Chip
-from hal.probe import Finding
 from tests.taps.serving import served
 
 ROOT = Path(__file__).parents[3]

@@ -20,7 +20,7 @@ from daemon.maps.store import Start
 from daemon.runtime import estimator_runner
 from daemon.runtime.warmup import CannotLoad
 from hal.clock import LoopClock, run_virtual
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.maps.test_store import name, names, store_with
 from tests.daemon.scenarios.test_daemon import SETTINGS

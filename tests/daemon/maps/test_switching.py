@@ -35,7 +35,7 @@ from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from tests.daemon.replay.test_recorded_run import assert_the_same
 from tests.daemon.scenarios.test_imported_map import DEVICE, MOVED, draw, warm
 from tests.daemon.support.map_maker import content

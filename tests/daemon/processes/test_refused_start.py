@@ -19,7 +19,7 @@ from daemon.app import Daemon, Environment
 from daemon.cli import parser, run
 from daemon.system import console
 from hal.clock import LoopClock, run_virtual
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from tests.daemon.scenarios.test_daemon import SETTINGS
 from tests.daemon.support.whole_daemon import during
 

@@ -29,8 +29,8 @@ from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01, UTM_30LX, LidarModel, Unit
 from hal.fake.lidar.rotor import TimetableRotor
 from hal.fake.lidar.scan import FakeScan
-from hal.fake.pty_server import PtyServer
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
+from hal.fake.transport.pty_server import PtyServer
 from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
 from hal.port.opening import open_port

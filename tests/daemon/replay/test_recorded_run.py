@@ -29,11 +29,11 @@ from daemon.system import console
 from estimator.measurements import Command, Limits, Order
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX, URG_04LX_UG01, LidarModel
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head

@@ -21,12 +21,12 @@ from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State as Sensor
 from hal.fake.lidar.models import URG_04LX_UG01, LidarModel, Unit
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from tests.daemon.support.whole_daemon import during

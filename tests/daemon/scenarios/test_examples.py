@@ -20,7 +20,7 @@ from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UST_10LX, Unit
 from hal.fake.lidar.scan_world import Room
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.port.port import Port
 from tests.daemon.support.light_room import Lit, plugged
 

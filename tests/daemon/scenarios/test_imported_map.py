@@ -22,7 +22,7 @@ from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import COLUMN, ROOM, Room
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 
 pytestmark = pytest.mark.jit
 DEVICE = "/dev/ttyACM0"

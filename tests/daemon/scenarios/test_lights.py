@@ -24,11 +24,11 @@ from daemon.snapshot import LightPicture, Snapshot
 from estimator.cdma.air_interface import PROFILE_A, PROFILE_B
 from hal.adc import AdcStatus
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from tests.daemon.support.light_room import BUS, CODES, SURVEY, Lit, plugged, raw_block
 from tests.daemon.support.whole_daemon import during
 

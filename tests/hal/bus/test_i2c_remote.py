@@ -22,12 +22,12 @@ from hal.bus import i2c_frames as frames
 from hal.bus.i2c import read, write
 from hal.bus.i2c_remote import RemoteClock, clock_name, open_remote, parse_address
 from hal.bus.i2c_server import BusServer
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc.converter import FakeAdc, FakeBuses
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.driver import PhotodiodeAdc
-from hal.port.opening import open_bus
 from tests.hal.photodiode.bench import Bench, Light, falsehoods
 
 KINDS = ("unix", "tcp")

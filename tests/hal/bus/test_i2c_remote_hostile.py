@@ -18,11 +18,11 @@ from hal.bus import i2c_frames as frames
 from hal.bus.i2c import read, write
 from hal.bus.i2c_remote import RemoteClock, open_remote
 from hal.bus.i2c_server import CLIENTS, BusServer
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc.converter import FakeBuses
 from hal.photodiode.driver import PhotodiodeAdc
-from hal.port.opening import open_bus
 from tests.hal.bus.test_i2c_remote import Server, greet, served
 
 Reads = tuple[bytes, ...]

@@ -21,14 +21,14 @@ import serial
 
 from hal.errors import DataInvalid, DeviceMissing, DeviceRefused
 from hal.fake.__main__ import main
-from hal.fake.control import Control, serve_control
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel
 from hal.fake.lidar.scan_world import NO_OBJECT, RecordedRanges, Room
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
 from tests.hal.fake.bench import ramp, read
 
 ROOT = Path(__file__).parents[3]

@@ -12,7 +12,7 @@ from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceRefused
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, MCP2221, Adapter
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.adapter_limits import Capability, measure
 from tests.hal.photodiode.bench import Light
 

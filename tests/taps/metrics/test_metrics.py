@@ -17,11 +17,11 @@ import pytest
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Fault, Faults, Hello, Pose, Statistics
 from daemon.snapshot import State
+from taps.access_guard import Guard
 from taps.metrics import server
 from taps.metrics.metrics import Told, exposition
 from taps.metrics.server import serve
 from taps.metrics.vda5050 import position, position_v2
-from taps.view.access_guard import Guard
 from tests.taps.serving import served
 
 families = pytest.importorskip("prometheus_client.parser").text_string_to_metric_families

@@ -16,7 +16,7 @@ from aiohttp import ClientSession, ClientWebSocketResponse, web
 from daemon.publish.stream.client import Stream
 from daemon.publish.stream.server import StreamServer
 from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
-from taps.view.access_guard import Guard
+from taps.access_guard import Guard
 from taps.view.page_hello import Scene
 from taps.view.replay_file import Film
 from taps.view.server import TOPICS, View

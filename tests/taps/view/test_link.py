@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from daemon.publish.stream.messages import MapTiles
+from taps.access_guard import Guard
 from taps.view import server
-from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 from tools.docs.browser import CHROMIUM, Tab, chromium, tab
 

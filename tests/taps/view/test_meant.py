@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from daemon.config.paths import stream_path
-from taps.view.access_guard import Guard
+from taps.access_guard import Guard
 from taps.view.orders import OrderRefused, switch_map
 from tests.taps.view.house import TOKEN, serving
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from taps.access_guard import Guard
 from taps.view import server
-from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, snapshot
 from tests.taps.view.test_server import run
 

@@ -19,8 +19,8 @@ from aiohttp import WSServerHandshakeError
 from daemon.publish.stream import server as daemon_stream
 from daemon.publish.stream.messages import Loop, MapTiles, Scan
 from daemon.snapshot import State
+from taps.access_guard import Guard
 from taps.view import server, viewers
-from taps.view.access_guard import Guard
 from tests.daemon.publish.stream.test_server import raw_scan, until
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 

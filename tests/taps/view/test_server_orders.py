@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from daemon.publish.modbus.holding import CommandCode, Outcome, Request
+from taps.access_guard import Guard
 from taps.view import orders
-from taps.view.access_guard import Guard
 from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing
 from tests.daemon.publish.stream.test_server import until

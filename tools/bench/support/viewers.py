@@ -18,7 +18,7 @@ from typing import Final
 from aiohttp import ClientError, ClientSession, WSMsgType, web
 
 from daemon.publish.stream.client import Stream
-from taps.view.access_guard import Guard
+from taps.access_guard import Guard
 from taps.view.command import NICENESS
 from taps.view.page_hello import Scene
 from taps.view.server import TOPICS, View

@@ -18,7 +18,7 @@ from hal.adc import AdcStatus, Blemish, RawSamples
 from hal.bus.i2c import BusOpener
 from hal.clock import Clock
 from hal.fake.adc.converter import FakeBuses
-from hal.fake.schedule import Target
+from hal.fake.faults.schedule import Target
 from hal.lidar import Link
 from tools.sim.ceiling.links import EPOCH_S, PERIOD_S
 from tools.sim.light.scene import LINK, SceneLight

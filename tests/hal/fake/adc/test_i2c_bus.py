@@ -12,7 +12,7 @@ from hal.bus.i2c import Message, Transferred, read, write
 from hal.fake.adc.converter import FakeAdc
 from hal.fake.adc.faults import ADC
 from hal.fake.adc.i2c_adapters import ADAPTERS, BCM2835, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
-from hal.fake.faults import FaultError, read_fault
+from hal.fake.faults.orders import FaultError, read_fault
 
 BLOCK = (read(0x4D, 1000),)
 QUIET = Adapter("quiet", jitter_s=0.0, nack=errno.ENXIO)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Protocol
 
-from hal.fake.faults import Fault, FaultError, Vocabulary, read_schedule
+from hal.fake.faults.orders import Fault, FaultError, Vocabulary, read_schedule
 
 
 @dataclass(slots=True)

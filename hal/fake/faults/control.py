@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from hal.errors import DeviceRefused
-from hal.fake.faults import FaultError, Word, read_fault
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.orders import FaultError, Word, read_fault
+from hal.fake.faults.schedule import FaultSchedule
 
 
 def _value(text: str) -> Any:

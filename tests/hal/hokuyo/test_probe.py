@@ -12,10 +12,10 @@ from hal.errors import DeviceFault, DeviceMissing
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import URG_04LX, UTM_30LX, Unit
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.hokuyo import discover
+from hal.hokuyo.probe import Finding, identify_at, probe
 from hal.port.port import Port, memory_pair
-from hal.probe import Finding, identify_at, probe
 from tests.hal.hokuyo.bench import Scene
 
 

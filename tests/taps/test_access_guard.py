@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.parser import main
+from taps.access_guard import Guard, TokenRefused, is_loopback, token_for
 from taps.view import command
-from taps.view.access_guard import Guard, TokenRefused, is_loopback, token_for
 from taps.view.command import address
 
 TOKEN = "0123456789abcdef"

@@ -9,10 +9,10 @@ from typing import ClassVar
 import pytest
 
 from hal.clock import run_virtual
-from hal.fake.control import Control
-from hal.fake.faults import Fault, FaultError, Parameter, Vocabulary, Word, read_schedule
+from hal.fake.faults.control import Control
+from hal.fake.faults.orders import Fault, FaultError, Parameter, Vocabulary, Word, read_schedule
+from hal.fake.faults.schedule import FaultSchedule, Orders
 from hal.fake.lidar.faults import LIDAR
-from hal.fake.schedule import FaultSchedule, Orders
 
 TWO: dict[str, Vocabulary] = {"lidar": LIDAR, "adc": {"off": Word("no power", "lasts")}}
 

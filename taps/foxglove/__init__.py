@@ -1,0 +1,1 @@
+"""A tap that serves the live stream to Foxglove as ROS messages."""
