@@ -18,7 +18,7 @@ from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import BCM2835, DESIGNWARE, FT260, Adapter
 from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.probe import ADDRESSES, BusFinding, probe_buses
-from tests.hal.i2c_kernel import kernel
+from tests.hal.bus.i2c_kernel import kernel
 from tests.hal.photodiode.bench import Light
 
 
