@@ -21,7 +21,7 @@ import zenoh
 
 from daemon.config.endpoints import in_url, parse_endpoint
 from daemon.system import console
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 
 LEASE_S: Final = 5.0
 """Who has been silent for so long is gone, for the other side; who does not answer so long is not there."""
@@ -124,7 +124,7 @@ async def joined(router: str, file: Path | None = None, say: Say = console.say) 
     said = False
     while True:
         try:
-            session = await beside(partial(zenoh.open, made), "zenoh")
+            session = await run_in_thread(partial(zenoh.open, made), "zenoh")
             break
         except zenoh.ZError as error:
             if not said:
@@ -138,7 +138,7 @@ async def joined(router: str, file: Path | None = None, say: Say = console.say) 
     finally:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_S):
-                await beside(session.close, "zenoh")
+                await run_in_thread(session.close, "zenoh")
 
 
 async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = console.say) -> None:
@@ -156,7 +156,7 @@ async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say:
 
 async def listed(session: zenoh.Session, key: str) -> list[str]:
     """Liveliness tokens that there are."""
-    replies = await beside(lambda: list(session.liveliness().get(key, timeout=ASK_S)), "zenoh")
+    replies = await run_in_thread(lambda: list(session.liveliness().get(key, timeout=ASK_S)), "zenoh")
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
@@ -171,7 +171,7 @@ async def answers(
         )
         return [parts(reply.ok) for reply in islice(replies, most) if reply.ok is not None]
 
-    return await beside(ask, "zenoh")
+    return await run_in_thread(ask, "zenoh")
 
 
 class Declared(Protocol):

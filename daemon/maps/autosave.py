@@ -25,7 +25,7 @@ from daemon.maps.start_trial import PROOF_S
 from daemon.maps.store import Start, Store
 from daemon.system.callbacks import OnDone
 from daemon.system.versions import release
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.clock import Clock
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
@@ -172,7 +172,7 @@ class MapAutosaver:
         self._proved_at, self._lasted = math.inf, True
         if self._store is not None:
             with contextlib.suppress(RuntimeError):  # no thread: the next start has one less to go
-                await beside(self._store.lasted, "map")
+                await run_in_thread(self._store.lasted, "map")
 
     async def finish(self, in_order: bool = True) -> None:
         """Save what has changed since the last time, wait for it, but not for ever.
@@ -184,7 +184,7 @@ class MapAutosaver:
             async with asyncio.timeout(STOP_S):
                 if in_order and not self._lasted and self._store is not None:
                     with contextlib.suppress(RuntimeError):
-                        await beside(self._store.trial.ended, "map")
+                        await run_in_thread(self._store.trial.ended, "map")
                 await self._over.wait()
                 if in_order or self._lasted:
                     self._due, self._last = self._clock.now(), True

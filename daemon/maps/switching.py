@@ -21,7 +21,7 @@ from daemon.maps.container import BadMap
 from daemon.maps.generations import said
 from daemon.maps.store import Judge, Start, Store
 from daemon.system.callbacks import OnDone
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from estimator import State
@@ -132,7 +132,7 @@ class MapSwitch:
         if map_id == self._autosaver.map_id:
             return IN_USE
         try:
-            there = {one.map_id for one in await beside(store.generations, "switch") if one.map_id >= 0}
+            there = {one.map_id for one in await run_in_thread(store.generations, "switch") if one.map_id >= 0}
         except OSError as error:
             return f"{store.folder}: {said(error)}"
         if map_id not in there:
@@ -141,7 +141,7 @@ class MapSwitch:
         if (reason := await self._saved()) not in NOTHING_TO_SAVE:
             return f"the map in use cannot be saved: {reason}"
         try:
-            switch = await beside(partial(self._load, store, map_id), "switch")
+            switch = await run_in_thread(partial(self._load, store, map_id), "switch")
         except (BadMap, OSError) as error:
             return f"map {map_id:08x} cannot be used: {said(error) if isinstance(error, OSError) else error}"
         taken = asyncio.Event()

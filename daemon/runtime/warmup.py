@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.system.kernel_lock import KernelLock, before_compiling, waits
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 
 if TYPE_CHECKING:
     from daemon.devices.light_setup import Lights
@@ -78,7 +78,7 @@ async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | N
     What belongs to light is loaded only where ``lights`` says that there is a photodiode.
     """
     begun = time.monotonic()
-    loading = beside(load if lights is None else partial(load, lights), "warm-up")
+    loading = run_in_thread(load if lights is None else partial(load, lights), "warm-up")
     while not loading.done():
         await asyncio.wait([loading], timeout=REPORT_S)
         if not loading.done() and (line := _progress_line(time.monotonic() - begun, lights is not None)):

@@ -1,4 +1,4 @@
-"""Look for devices and say who they are, without keeping them: the eyes of ``lumiloop probe``."""
+"""Identifies the lidars at this computer's ports and leaves them idle (``lumiloop probe``)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _USB_BAUD = 115200
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What is at one port: a lidar with its geometry, or an error with its remedy.
+    """The result at one port: a lidar with its geometry, or an error with its remedy.
 
     Attributes:
         device: the port. geometry: None where nothing was identified. product, protocol: of VV.
-        state: what the sensor says of its health. baud: of an RS-232 line, else 0. error: None for a lidar.
+        state: the sensor's health text. baud: of an RS-232 line, else 0. error: None for a lidar.
     """
 
     device: str
@@ -49,19 +49,19 @@ class Finding:
 
 
 async def probe(opener: PortOpener, devices: Sequence[str] = ()) -> list[Finding]:
-    """Identify what is at each device; a sensor that streams is stopped, and left idle.
+    """Identify the lidar at each device; a streaming sensor is stopped and left idle.
 
     Args:
         opener: opens ports (:func:`hal.port.opening.open_port`).
-        devices: paths and ``tcp://`` names; none: every port at which a HOKUYO may be.
+        devices: paths and ``tcp://`` names; empty: every port at which a HOKUYO may be.
     """
     return [await identify_at(opener, device) for device in devices or discover.candidates()]
 
 
 async def identify_at(opener: PortOpener, device: str, baud: int = 0) -> Finding:
-    """Identify what is at one device; never raises for anything the device does.
+    """Identify the lidar at one device; errors of the device are returned, not raised.
 
-    ``baud``: of an RS-232 line, looked for at first; 0: not known.
+    ``baud``: the rate of an RS-232 line to try first; 0: unknown.
     """
     try:
         rs232 = discover.is_rs232(device, baud)
@@ -73,8 +73,8 @@ async def identify_at(opener: PortOpener, device: str, baud: int = 0) -> Finding
             await session.settle()
             identity = await session.identify()
             await session.quiet()
-        except DeviceMissing as error:  # a server of something else hangs up on whom it does not understand
-            raise session.stranger(session.line.heard) if session.line.strange else error from error
+        except DeviceMissing as error:  # a server of another protocol hangs up
+            raise session.foreign_device(session.line.first_bytes) if session.line.is_foreign else error from error
         finally:
             session.line.close()
     except HalError as error:

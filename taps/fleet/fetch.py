@@ -16,7 +16,7 @@ from daemon.cli.status import address_of
 from daemon.publish.modbus.client import NoAnswer
 from daemon.system import console
 from daemon.system.atomic_file import reason_of
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, Unreadable, printable
 from taps.fleet.placing import KINDS, MAP, Offer, Records, Refused, Taken, chosen, home, place, sha256_of
@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     fetcher = Fetcher(args)
     try:
-        asyncio.run(work_until_told(fetcher.run()) if args.follow else fetcher.run())
+        asyncio.run(run_until_stopped(fetcher.run()) if args.follow else fetcher.run())
     except BadEndpoint as error:
         return console.fail(str(error), console.USAGE)
     except NoAnswer as error:

@@ -24,7 +24,7 @@ from daemon.maps.store import Store
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
 from daemon.system import console
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.fleet import messages
 from taps.fleet.claim import Claim
 from taps.fleet.messages import MapHead, PoseTold, StateTold
@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     stream = Stream(args.stream or args.settings.name, WANTED)
     try:
-        asyncio.run(work_until_told(tell(args, stream)))
+        asyncio.run(run_until_stopped(tell(args, stream)))
     except BadEndpoint as error:
         return console.fail(str(error), console.USAGE)
     except NotTheStream as error:

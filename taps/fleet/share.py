@@ -9,7 +9,7 @@ import socket
 import zenoh
 
 from daemon.system import console
-from hal.run_server import until_told, work_until_told
+from hal.run_server import run_until_stopped, until_stopped
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, encode
 from taps.fleet.placing import MAP, SURVEY, Offer, Refused, offer_of
@@ -23,7 +23,7 @@ def main(args: argparse.Namespace) -> int:
         return console.fail("say what to share: --survey FILE, --map FILE", console.USAGE)
     try:
         offers = [offer_of(kind, path, args.version) for kind, path in asked]
-        asyncio.run(work_until_told(share(args, offers)))
+        asyncio.run(run_until_stopped(share(args, offers)))
     except Refused as error:
         return console.fail(str(error))
     except BadEndpoint as error:
@@ -70,7 +70,7 @@ def router(args: argparse.Namespace) -> int:
     try:
         with zenoh.open(config("router", args.listen, args.zenoh)):
             console.say(f"router at {args.listen}")
-            asyncio.run(until_told())
+            asyncio.run(until_stopped())
     except BadEndpoint as error:
         return console.fail(str(error), console.USAGE)
     except zenoh.ZError as error:

@@ -17,7 +17,7 @@ import zenoh
 from daemon.maps.png import encode_png
 from daemon.system import console
 from daemon.system.atomic_file import reason_of, write_whole
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.fleet import drawing, messages
 from taps.fleet.roster import MOST_MAPS, MOST_ROBOTS, Roster
 from taps.zenoh_session import BadEndpoint, answers, joined, parts, watched
@@ -46,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     roster = Roster()
     try:
-        asyncio.run(work_until_told(show(args, roster), seconds=0.0) if args.watch else show(args, roster))
+        asyncio.run(run_until_stopped(show(args, roster), seconds=0.0) if args.watch else show(args, roster))
     except BadEndpoint as error:
         return console.fail(str(error), console.USAGE)
     except NoRouter as error:

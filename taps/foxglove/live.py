@@ -17,7 +17,7 @@ from daemon.config.endpoints import in_url, parse_endpoint
 from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.ros import types
 from taps.ros.messages import TOPICS, Out
 from taps.ros.stream_follower import follow
@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     console.say(f"ws://{in_url(host)}:{bridge.port}")
     try:
         stream = Stream(args.stream or args.settings.name, WANTED)
-        asyncio.run(work_until_told(follow(stream, args.settings, bridge)))
+        asyncio.run(run_until_stopped(follow(stream, args.settings, bridge)))
     except NotTheStream as error:
         return console.fail(str(error))
     finally:

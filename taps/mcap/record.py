@@ -17,7 +17,7 @@ from daemon.config.schema import Config
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Hello, NotTheStream
 from daemon.system import console
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.mcap.writer import FLUSH_S, McapFile, NoRoom
 from taps.ros.messages import Translator
 
@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
     file = None
     try:
         with McapFile(args.out, reserve=round(args.reserve * (1 << 20))) as file:
-            asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))
+            asyncio.run(run_until_stopped(record(stream, args.settings, file), seconds=args.seconds or 0.0))
     except NotTheStream as error:
         return console.fail(str(error))
     except NoRoom as error:

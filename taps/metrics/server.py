@@ -16,7 +16,7 @@ from daemon.config.endpoints import in_url, parse_endpoint
 from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.access_guard import Guard
 from taps.metrics import vda5050
 from taps.metrics.metrics import CONTENT_TYPE, Told, exposition
@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         host, port = parse_endpoint(args.listen)
         stream = Stream(args.stream or args.settings.name, TOPICS)
-        asyncio.run(work_until_told(serve(stream, host, port)))
+        asyncio.run(run_until_stopped(serve(stream, host, port)))
     except ValueError as error:
         return console.fail(f"--listen: {error}", console.USAGE)
     except NotTheStream as error:

@@ -17,7 +17,7 @@ import zenoh
 from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
-from hal.run_server import work_until_told
+from hal.run_server import run_until_stopped
 from taps.ros import rmw_zenoh, types
 from taps.ros.messages import TOPICS, Out
 from taps.ros.stream_follower import follow
@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         namespace = rmw_zenoh.namespace_of(args.namespace)
         stream = Stream(args.stream or args.settings.name, WANTED)
-        asyncio.run(work_until_told(serve(args, namespace, stream)))
+        asyncio.run(run_until_stopped(serve(args, namespace, stream)))
     except ValueError as error:
         return console.fail(f"--namespace: {error}", console.USAGE)
     except BadEndpoint as error:

@@ -29,7 +29,7 @@ from daemon.publish.modbus.client import NoAnswer
 from daemon.publish.stream.client import Stream
 from daemon.system import console
 from daemon.system.logging import to_journal
-from hal.run_server import stopping
+from hal.run_server import stop_event
 from taps.access_guard import Guard, TokenRefused, token_for
 from taps.view.page_hello import CannotLook, Scene, scene_of
 from taps.view.replay_file import Film
@@ -150,7 +150,7 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
 
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
-    stop = stopping()
+    stop = stop_event()
     runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:

@@ -17,7 +17,7 @@ from typing import Any, Final, cast
 from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
 from daemon.publish.port_owner import whose
 from daemon.publish.stream.client import Stream
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
 TRIES: Final = 4
@@ -119,7 +119,7 @@ class Wire(asyncio.DatagramProtocol):
         """
         assert self._transport is not None
         host, port = self._transport.get_extra_info("peername")[:2]
-        found = await beside(partial(whose, meant, host, port), "whose")
+        found = await run_in_thread(partial(whose, meant, host, port), "whose")
         if found.another:
             raise OrderRefused(
                 f"{host}:{port} is answered by {found}, not by the daemon that is meant (process {found.meant}): name "

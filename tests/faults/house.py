@@ -136,7 +136,7 @@ class House:
         assert light is not None
         adc = light_up(self.world, light, self.clock)["adc"]
         self._port = InputPort(self.clock, "", _PORT)
-        self.wheels = FakeOdometry(self._reading, lambda data: self._port.take(data, self.clock.now()))
+        self.wheels = FakeOdometry(self._reading, lambda data: self._port.receive(data, self.clock.now()))
         self._rolling = asyncio.create_task(self.wheels.run())
         self.faults = FaultSchedule({"lidar": self.lidar, "adc": adc, "odometry": self.wheels})
         self._ear = _Ear(self.loop.time)

@@ -107,7 +107,7 @@ async def _recorded(making: Making, folder: Path) -> None:
     for part in ("odometry", "imu"):
         daemon.network.parts.pop(part, None)
     port.send_odometry_to(recorder.on_odometry(daemon.cycle.inbox.put_odometry))
-    rolling = asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
+    rolling = asyncio.create_task(feed_odometry(scene, lambda data: port.receive(data, clock.now())))
     stop = asyncio.Event()
     asyncio.get_running_loop().call_later(making.seconds, stop.set)
     try:

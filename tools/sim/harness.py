@@ -203,7 +203,7 @@ def _connect_wheels(daemon: Daemon, scene: Scene, clock: LoopClock) -> asyncio.T
         daemon.network.parts.pop(part)
     port = InputPort(clock, "", _ANY_PORT)
     port.send_odometry_to(daemon.cycle.inbox.put_odometry)
-    return asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
+    return asyncio.create_task(feed_odometry(scene, lambda data: port.receive(data, clock.now())))
 
 
 def _collect(log: _Log, scene: Scene, scans_sent: int) -> Run:

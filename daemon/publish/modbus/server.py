@@ -134,5 +134,5 @@ class ModbusPublisher:
         t_rx = self._clock.now() - self._age_s
         if written.restarted:
             self._continuity.restart()
-        x, y, yaw = self._continuity.follow(written.x, written.y, written.yaw)
+        x, y, yaw = self._continuity.transform(written.x, written.y, written.yaw)
         self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_rx - written.age, x=x, y=y, yaw=yaw))

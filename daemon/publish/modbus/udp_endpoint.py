@@ -9,8 +9,8 @@ from typing import Final
 from daemon.publish.modbus.counts import STRANGE, Allowed, Counts, everyone
 from daemon.publish.modbus.requests import MAX_FRAME, Responder, frame_size
 from hal.net.fair_share import Reader, Share
-from hal.net.reply_address import ASKED_SPACE, Source, asked_at, send_from, tell_asked
-from hal.net.rx_timestamp import STAMP_SPACE, kernel_age, stamp_arrivals
+from hal.net.reply_address import PACKET_INFO_SPACE, ReplySource, enable_packet_info, reply_source, send_from
+from hal.net.rx_timestamp import STAMP_SPACE, enable_rx_timestamps, kernel_age
 
 UDP_PER_TURN: Final = 8
 
@@ -32,10 +32,10 @@ class UdpEndpoint:
         self._on_age = on_age
         self._space = 0  # for what the kernel tells about a datagram
         if on_age is not None:
-            stamp_arrivals(sock)
+            enable_rx_timestamps(sock)
             self._space += STAMP_SPACE
-        if tell_asked(sock):
-            self._space += ASKED_SPACE
+        if enable_packet_info(sock):
+            self._space += PACKET_INFO_SPACE
         self._allowed = allowed
         self._responder = responder
         self._counts = counts
@@ -55,11 +55,11 @@ class UdpEndpoint:
 
     def _serve_some(self) -> None:
         for _ in range(UDP_PER_TURN):
-            source: Source = ()
+            source: ReplySource = ()
             try:
                 if self._space:
                     frame, told, _, peer = self._sock.recvmsg(MAX_FRAME + 1, self._space)
-                    source = asked_at(told)
+                    source = reply_source(told)
                     if self._on_age is not None:
                         self._on_age(kernel_age(told))
                 else:

@@ -1,4 +1,4 @@
-"""The words in which faults of a photodiode's converter, its bus and its light are ordered."""
+"""The vocabulary of faults of the fake light receiver: converter, bus, light."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ ADC: Vocabulary = {
     "dark": Word("no light: only the electronics' own noise", "lasts"),
     "saturated": Word("so much light that the amplifier stands at its limit", "lasts"),
 }
-"""By word. ``off stuck garbage wrong slow delayed intermittent`` mean what they mean for any device."""
+"""By word. ``off stuck garbage wrong slow delayed intermittent`` are common to all devices."""
 
 
 def number_of(name: str) -> int:

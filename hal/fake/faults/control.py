@@ -1,4 +1,4 @@
-"""Fault orders while the devices run: one line in, a few lines out, over a unix socket or by a method call.
+"""Control interface for fault orders while the devices run: text lines over a unix socket or a method call.
 
 ::
 
@@ -27,7 +27,7 @@ from hal.fake.faults.schedule import FaultSchedule
 
 
 def _value(text: str) -> Any:
-    """A TOML value; a bare word is a text, since quoting is a nuisance on a command line."""
+    """A TOML value; an unquoted word is a text."""
     try:
         return tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
@@ -40,7 +40,7 @@ def _described(name: str, word: Word) -> str:
 
 
 class Control:
-    """Understands control lines and passes orders to a schedule."""
+    """Parses control lines and passes orders to a schedule."""
 
     def __init__(self, schedule: FaultSchedule) -> None:
         self._schedule = schedule
@@ -48,11 +48,11 @@ class Control:
     def answer(self, line: str) -> str:
         """Carry out one line; the answer ends with ``ok`` or ``refused: why`` and a newline."""
         try:
-            return "".join(f"{text}\n" for text in self._obey(line)) + "ok\n"
+            return "".join(f"{text}\n" for text in self._execute(line)) + "ok\n"
         except (FaultError, ValueError) as error:  # ValueError: quotes that do not close
             return f"refused: {error}\n"
 
-    def _obey(self, line: str) -> Iterable[str]:
+    def _execute(self, line: str) -> Iterable[str]:
         verb, *words = shlex.split(line, posix=False) or ["list"]
         if verb == "order":
             return self._order(words)
@@ -86,17 +86,17 @@ def _make_way(path: Path) -> None:
 
 
 async def serve_control(control: Control, path: Path) -> asyncio.Server:
-    """Answer control lines on a unix socket until the server returned is closed.
+    """Answer control lines on a unix socket until the returned server is closed.
 
     Raises:
-        DeviceRefused: there is something at ``path`` that is no socket.
+        DeviceRefused: ``path`` exists and is no socket.
     """
     _make_way(path)
 
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(ConnectionError, ValueError), contextlib.closing(writer):  # ValueError: endless line
             while line := await reader.readline():
                 writer.write(control.answer(line.decode("utf-8", errors="replace")).encode())
                 await writer.drain()
 
-    return await asyncio.start_unix_server(talk, path)
+    return await asyncio.start_unix_server(serve, path)

@@ -1,4 +1,4 @@
-"""Fault orders as data: one TOML schedule of what goes wrong, where, when and for how long.
+"""Fault orders as data: a TOML schedule with kind, device, time and duration of each fault.
 
 ::
 
@@ -12,8 +12,8 @@
     share = 0.1           # strikes with this probability
     part = "data"         # the word's own parameters
 
-Nothing here knows a device: each brings its own vocabulary, so that the orders for a lidar, an ADC and an odometry
-sender stand in one file. An unknown word, a wrong key or a value out of range is refused with its path.
+Each device supplies its own vocabulary, so that orders for a lidar, an ADC and an odometry sender stand in one file. An
+unknown word, a wrong key or a value out of range is refused with its path.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Value = float | int | str | bool
 
 
 class FaultError(ValueError):
-    """An order that cannot be understood. ``path`` names the place (``fault[2].part``)."""
+    """An invalid order. ``path`` names the place (``fault[2].part``)."""
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__(f"{path}: {problem}")
@@ -51,11 +51,11 @@ class Word:
     """One kind of fault.
 
     Attributes:
-        help: what it does, in one clause.
+        help: its effect, in one clause.
         kind: ``strikes`` hits single frames or replies (takes ``for count every share``), ``lasts`` is a condition
             (takes ``for``), ``once`` is an event.
         parameters: its own parameters, by name.
-        share: probability of a strike where the order names none.
+        share: default probability of a strike.
     """
 
     help: str
@@ -113,13 +113,13 @@ def _check(path: str, value: Any, rule: Parameter) -> Value:
 
 
 def _near(word: Any, known: Iterable[str]) -> str:
-    """What may have been meant by a word that is not known."""
+    """Suggestion of the closest known word."""
     close = difflib.get_close_matches(str(word), list(known), n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 def _named(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocabulary]) -> tuple[str, str]:
-    """Device and word of an order; where it names no device, the only one that knows the word."""
+    """Device and word of an order; without a device, the only one whose vocabulary has the word."""
     for key in ("what", "where"):
         if not isinstance(table.get(key, ""), str):
             raise FaultError(f"{path}.{key}", f"expected a text, got {table[key]!r}")
@@ -133,12 +133,12 @@ def _named(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocab
     where = able[0] if where is None else where
     if where not in vocabularies:
         there = sorted(vocabularies)
-        told = f"{where!r} is no device here; there are: {', '.join(there)}"
-        raise FaultError(f"{path}.where", f"{told}{_near(where, there)}")
+        problem = f"{where!r} is no device here; there are: {', '.join(there)}"
+        raise FaultError(f"{path}.where", f"{problem}{_near(where, there)}")
     if what is None or what not in vocabularies[where]:
         known = sorted(vocabularies[where])
-        told = f"{what!r} is no fault of {where!r}; known: {', '.join(known)}"
-        raise FaultError(f"{path}.what", f"{told}{_near(what, known)}")
+        problem = f"{what!r} is no fault of {where!r}; known: {', '.join(known)}"
+        raise FaultError(f"{path}.what", f"{problem}{_near(what, known)}")
     return where, what
 
 
@@ -179,7 +179,7 @@ def read_schedule(text: str, vocabularies: Mapping[str, Vocabulary]) -> list[Fau
         vocabularies: by device name.
 
     Raises:
-        FaultError: the text is no TOML, or an order in it is wrong; the message begins with the path of the place.
+        FaultError: not TOML, or an invalid order; the message begins with the path of the place.
     """
     try:
         tree = tomllib.loads(text)

@@ -1,4 +1,4 @@
-"""Faults in time: which are in force, when they strike, and orders given while the devices run."""
+"""Fault orders over time: timers that begin and end faults, the faults in force, and their strikes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class _Force:
     struck: int = 0
 
 
-class Orders:
+class ActiveFaults:
     """The faults in force at one device.
 
     Args:
-        seed: of the strikes that are left to chance.
+        seed: of the random strikes.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -35,21 +35,21 @@ class Orders:
         self._forces.setdefault(fault.what, []).append(_Force(fault))
 
     def remove(self, fault: Fault) -> None:
-        """Lift a fault; nothing happens when it has spent itself already."""
+        """Lift a fault; does nothing where its strikes are used up."""
         kept = [force for force in self._forces.get(fault.what, []) if force.fault is not fault]
         self._forces[fault.what] = kept
 
     def on(self, what: str) -> Fault | None:
-        """The fault of that word in force, if any; does not count as a strike."""
+        """The fault of that word in force, or None; does not count as a strike."""
         forces = self._forces.get(what)
         return forces[-1].fault if forces else None
 
     def strike(self, what: str, **match: str) -> Fault | None:
-        """Give the faults of a word an opportunity; the one that strikes, if any.
+        """Offer the faults of a word an opportunity; return the one that strikes, or None.
 
         Args:
             what: the word.
-            match: parameters that an order must have (or have as ``all``) for this opportunity to be one for it.
+            match: parameter values that a fault must have (or have as ``all``) to be considered.
         """
         for force in self._forces.get(what, ()):
             fault = force.fault
@@ -71,11 +71,11 @@ class Orders:
 
 
 class Target(Protocol):
-    """A fake device that takes orders."""
+    """A fake device that accepts fault orders."""
 
     @property
     def vocabulary(self) -> Vocabulary:
-        """The words it knows."""
+        """Its words."""
         ...
 
     def check(self, fault: Fault) -> None:
@@ -83,7 +83,7 @@ class Target(Protocol):
         ...
 
     def in_force(self) -> list[Fault]:
-        """Faults that have not been lifted and have not spent themselves."""
+        """Faults neither lifted nor used up."""
         ...
 
     def begin(self, fault: Fault) -> None:
@@ -99,7 +99,7 @@ class FaultSchedule:
     """Applies orders to devices at the loop's (virtual) times.
 
     Args:
-        targets: devices by the name that ``where`` uses.
+        targets: devices by their ``where`` names.
         loop: the clock; default the running loop.
     """
 
@@ -115,7 +115,7 @@ class FaultSchedule:
         return {name: target.vocabulary for name, target in self._targets.items()}
 
     def load(self, text: str) -> list[Fault]:
-        """Read a TOML schedule and start it now. Raises `FaultError` before any order has been taken."""
+        """Read a TOML schedule and start it now. Raises `FaultError` before any order is in force."""
         faults = read_schedule(text, self.vocabularies)
         for fault in faults:
             self._targets[fault.where].check(fault)
@@ -124,14 +124,14 @@ class FaultSchedule:
         return faults
 
     def order(self, fault: Fault) -> None:
-        """Take one order; ``when`` counts from now."""
+        """Schedule one order; ``when`` counts from now."""
         if fault.where not in self._targets:
             raise FaultError("where", f"{fault.where!r} is no device here; there are: {', '.join(self._targets)}")
         self._targets[fault.where].check(fault)
         self._timers[fault] = self._loop.call_at(self._loop.time() + fault.when, self._begin, fault)
 
     def clear(self, what: str = "", where: str = "") -> list[Fault]:
-        """Lift the faults in force and forget those to come, all or those of a word or a device; tells which."""
+        """Lift faults in force and cancel pending ones, all or those of a word or device; returns them."""
         known = dict.fromkeys([*self._in_force, *self._timers])
         chosen = [f for f in known if what in ("", f.what) and where in ("", f.where)]
         for fault in chosen:
@@ -142,7 +142,7 @@ class FaultSchedule:
         return chosen
 
     def listing(self) -> Iterable[str]:
-        """One line for every fault in force or to come."""
+        """One line for every fault in force or pending."""
         for target in self._targets.values():
             yield from (f"in force {fault}" for fault in target.in_force())
         yield from (f"to come {fault}" for fault in self._timers if fault not in self._in_force)

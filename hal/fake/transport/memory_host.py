@@ -1,4 +1,4 @@
-"""The fake device on memory ports: bytes inside one event loop, in virtual or real time."""
+"""The fake lidar on memory ports: bytes inside one event loop, in virtual or real time."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class MemoryHost:
         device.attach(self)
         port.start(lambda data, _t: device.receive(data), self._lost)
 
-    def take(self, data: bytes) -> bool:
+    def accept(self, data: bytes) -> bool:
         """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         try:
             self._port.write(data)
-        except DeviceMissing:  # the host has just closed; `_lost` comes in the next turn of the loop
+        except DeviceMissing:  # the host has just closed; `_lost` follows in the next turn of the loop
             return False
         return True
 
@@ -60,7 +60,7 @@ class FakeOpener:
         self._devices[name] = device
 
     def unplug(self, name: str) -> None:
-        """Take the device away; whoever has it open loses it."""
+        """Remove the device; an open port to it is lost."""
         del self._devices[name]
         if name in self._hosts:
             self._hosts.pop(name).hang_up()
@@ -69,8 +69,8 @@ class FakeOpener:
         """Open a plugged-in device.
 
         Raises:
-            DeviceMissing: nothing is plugged in under that name, or it has no power.
-            DeviceRefused: it is open already.
+            DeviceMissing: no device of that name, or it has no power.
+            DeviceRefused: already open.
         """
         fake = self._devices.get(device)
         if fake is None or not fake.reachable:

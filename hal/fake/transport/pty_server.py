@@ -1,7 +1,7 @@
-"""The fake device as a serial port of this computer.
+"""The fake lidar as a serial port of this computer: a pseudo-terminal.
 
-Everything runs on the event loop without threads. A host that does not read makes the queue of the pty full; the
-sensor then loses whole replies and they are counted (:attr:`hal.fake.lidar.output_line.OutletCounts.refused_by_host`).
+Everything runs on the event loop without threads. When a host does not read, the pty's queue fills up; the sensor then
+loses whole replies, which are counted (:attr:`hal.fake.lidar.output_line.OutputCounts.refused_by_host`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hal.errors import DeviceRefused
 from hal.fake.lidar.device import FakeHokuyo
 
 PTY_POLL_S = 0.02
-"""How often a pty looks whether a host has opened it; Linux gives no event for that."""
+"""Interval of checks whether a host has opened the pty; Linux has no event for it."""
 TCGETS2 = 0x802C542A
 TERMIOS2 = struct.Struct("4I20B2I")
 """``struct termios2`` of Linux (asm-generic): flags, line discipline and characters, input and output speed."""
@@ -27,8 +27,8 @@ TERMIOS2 = struct.Struct("4I20B2I")
 class PtyServer:
     """The device as a serial port: a pty, found by a symbolic link that survives unplugging.
 
-    The sensor notices neither that a host opens the port nor that it leaves: it goes on streaming to nobody. A pulled
-    plug closes the pty and removes the link; plugged in again it is a new pty behind the same link.
+    The sensor notices neither the opening nor the closing of the port: it streams on. Unplugging closes the pty and
+    removes the link; plugging in makes a new pty behind the same link.
 
     Args:
         device: the sensor.
@@ -41,19 +41,19 @@ class PtyServer:
         self._master = -1
         self._path = ""
         self._rest = b""
-        self._heard = False
+        self._has_host = False
         self._timer: asyncio.TimerHandle | None = None
         if link is not None and link.exists() and not link.is_symlink():
             raise DeviceRefused(str(link), "there is something that is no symbolic link", "choose another path")
-        device.watch(self._reachable)
+        device.on_reachable(self._reachable)
         self._reachable(device.reachable)
 
     @property
     def path(self) -> str:
-        """What to open: the link, or the pty itself; empty while unplugged."""
+        """Path for the host: the link, or the pty itself; empty while unplugged."""
         return str(self._link) if self._link is not None else self._path
 
-    def take(self, data: bytes) -> bool:
+    def accept(self, data: bytes) -> bool:
         """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self._rest:
             return False
@@ -91,7 +91,7 @@ class PtyServer:
         if self._link is not None:
             self._link.unlink(missing_ok=True)
             self._link.symlink_to(self._path)
-        self._look()
+        self._poll_host()
 
     def _shut(self) -> None:
         if self._master < 0:
@@ -103,22 +103,22 @@ class PtyServer:
         os.close(self._master)
         self._master, self._path = -1, ""
 
-    def _look(self) -> None:
-        """While nobody has the slave open the master reports a hang-up; see whether that has changed."""
+    def _poll_host(self) -> None:
+        """Check whether a host has opened the slave: until then the master reports a hang-up."""
         poll = select.poll()
         poll.register(self._master, 0)
         if poll.poll(0):
-            self._timer = self._loop.call_later(PTY_POLL_S, self._look)
+            self._timer = self._loop.call_later(PTY_POLL_S, self._poll_host)
             return
         self._timer = None
-        tty.setraw(self._master)  # applies to the slave: no echo, whatever the host has set or not yet set
-        self._heard = True
+        tty.setraw(self._master)  # applies to the slave: no echo, before the host sets it
+        self._has_host = True
         self._loop.add_reader(self._master, self._read)
         self._device.attach(self)
 
     def _forget_host(self) -> None:
-        if self._heard:
-            self._heard = False
+        if self._has_host:
+            self._has_host = False
             self._rest = b""
             self._loop.remove_reader(self._master)
             self._loop.remove_writer(self._master)
@@ -131,7 +131,7 @@ class PtyServer:
         except OSError:  # EIO: the last host has closed the slave
             self._forget_host()
             self._device.detach()
-            self._look()
+            self._poll_host()
             return
         self._device.receive(data)
 
@@ -140,7 +140,7 @@ class PtyServer:
             written = os.write(self._master, data)
         except BlockingIOError:
             return False
-        except OSError:  # EIO: closed meanwhile, `_read` learns of it
+        except OSError:  # EIO: closed meanwhile, handled in `_read`
             return False
         self._rest = data[written:]
         if self._rest:

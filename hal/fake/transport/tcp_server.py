@@ -1,4 +1,4 @@
-"""The fake device as a network sensor (SCIP over TCP, port 10940 on a real one)."""
+"""The fake lidar as a network sensor: SCIP over TCP (port 10940 on a real one)."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import asyncio
 from hal.fake.lidar.device import FakeHokuyo
 
 TCP_QUEUE = 128 * 1024
-"""Bytes that may wait for a host that does not read before replies are lost."""
+"""Bytes queued for a host that does not read, before replies are lost."""
 
 
 class TcpServer:
-    """The device as a network sensor: one host at a time, a second one is turned away; a closed connection stops it.
+    """Serves the device over TCP to one host; a second host is rejected; a closed connection stops the sensor.
 
-    An unreachable sensor (no power, cable pulled) hangs up on whoever connects; a real one would not answer at all.
+    An unreachable sensor (no power, cable pulled) closes new connections at once; a real one would not answer.
     """
 
     def __init__(self, device: FakeHokuyo) -> None:
         self._device = device
         self._transport: asyncio.Transport | None = None
         self._server: asyncio.Server | None = None
-        self.turned_away = 0
+        self.rejected = 0
 
     async def listen(self, host: str = "127.0.0.1", port: int = 0) -> int:
         """Begin to accept; returns the port (a real sensor's is 10940; 0 chooses a free one)."""
@@ -35,10 +35,10 @@ class TcpServer:
             self._server.close()
             await self._server.wait_closed()
 
-    def accept(self, transport: asyncio.Transport) -> bool:
-        """A host has connected; False turns it away."""
+    def host_connected(self, transport: asyncio.Transport) -> bool:
+        """Accept or reject (False) a new connection."""
         if self._transport is not None or not self._device.reachable:
-            self.turned_away += 1
+            self.rejected += 1
             transport.abort()
             return False
         self._transport = transport
@@ -49,12 +49,12 @@ class TcpServer:
         """Bytes from the host."""
         self._device.receive(data)
 
-    def left(self) -> None:
-        """The host has closed."""
+    def host_disconnected(self) -> None:
+        """The host has closed the connection."""
         self._transport = None
         self._device.detach()
 
-    def take(self, data: bytes) -> bool:
+    def accept(self, data: bytes) -> bool:
         """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self._transport is None or self._transport.get_write_buffer_size() > TCP_QUEUE:
             return False
@@ -78,7 +78,7 @@ class _TcpConnection(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
-        self._accepted = self._server.accept(transport)
+        self._accepted = self._server.host_connected(transport)
 
     def data_received(self, data: bytes) -> None:
         if self._accepted:
@@ -87,4 +87,4 @@ class _TcpConnection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         if self._accepted:
             self._accepted = False
-            self._server.left()
+            self._server.host_disconnected()

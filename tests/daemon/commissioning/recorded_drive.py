@@ -56,7 +56,7 @@ async def _record(folder: Path, seconds: float) -> SimulatedScene:
         daemon.network.parts.pop(part)
     port = InputPort(clock, "", 1)
     port.send_odometry_to(recorder.on_odometry(daemon.cycle.inbox.put_odometry))
-    wheels = asyncio.create_task(feed_odometry(made, lambda data: port.take(data, clock.now())))
+    wheels = asyncio.create_task(feed_odometry(made, lambda data: port.receive(data, clock.now())))
     stop = asyncio.Event()
     asyncio.get_running_loop().call_later(seconds, stop.set)
     try:

@@ -1,4 +1,4 @@
-"""Orders and odometry that come in over Modbus and UDP, through real sockets to the estimate and back."""
+"""ActiveFaults and odometry that come in over Modbus and UDP, through real sockets to the estimate and back."""
 
 from __future__ import annotations
 

@@ -374,10 +374,10 @@ def test_times_of_another_computer_are_translated(tmp_path: Path) -> None:
 
 def test_the_difference_of_clocks_is_bounded_from_both_sides() -> None:
     clock = RemoteClock(same=False)
-    clock.learn(ordered=10.0, received=110.5, sent=110.6, answered=10.7)  # between 99.9 and 100.5
-    clock.learn(ordered=20.0, received=120.2, sent=120.3, answered=20.4)  # between 99.9 and 100.2
-    assert clock.ours(150.05) == pytest.approx(50.0)
-    assert RemoteClock(same=True).ours(5.0) == 5.0
+    clock.add(ordered=10.0, received=110.5, sent=110.6, answered=10.7)  # between 99.9 and 100.5
+    clock.add(ordered=20.0, received=120.2, sent=120.3, answered=20.4)  # between 99.9 and 100.2
+    assert clock.to_local(150.05) == pytest.approx(50.0)
+    assert RemoteClock(same=True).to_local(5.0) == 5.0
 
 
 @pytest.mark.parametrize(

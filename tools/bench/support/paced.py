@@ -38,7 +38,7 @@ from estimator.mapping.loop_closure import solve_graph
 from estimator.measurements import Answer, Job
 from estimator.pipeline import new_state
 from hal.adc import AdcStatus, RawSamples
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.bus.i2c import BusOpener
 from hal.clock import Clock, SystemClock
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
@@ -183,7 +183,7 @@ class Feeder:
         self._turn("")
         self.told.missed, self.told.scans = daemon.cycle.inbox.dropped, self._number
         os.write(1, b"ended\n")
-        await beside(sys.stdin.readline, "parent")
+        await run_in_thread(sys.stdin.readline, "parent")
         self.stop.set()
         await asyncio.Event().wait()
 

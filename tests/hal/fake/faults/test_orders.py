@@ -11,7 +11,7 @@ import pytest
 from hal.clock import run_virtual
 from hal.fake.faults.control import Control
 from hal.fake.faults.orders import Fault, FaultError, Parameter, Vocabulary, Word, read_schedule
-from hal.fake.faults.schedule import FaultSchedule, Orders
+from hal.fake.faults.schedule import ActiveFaults, FaultSchedule
 from hal.fake.lidar.faults import LIDAR
 
 TWO: dict[str, Vocabulary] = {"lidar": LIDAR, "adc": {"off": Word("no power", "lasts")}}
@@ -107,7 +107,7 @@ def _toml(value: object) -> str:
     return '"AT\\r"' if value == "AT\r" else repr(value)
 
 
-def strikes(orders: Orders, what: str, times: int, **match: str) -> str:
+def strikes(orders: ActiveFaults, what: str, times: int, **match: str) -> str:
     return "".join("x" if orders.strike(what, **match) else "." for _ in range(times))
 
 
@@ -122,7 +122,7 @@ def strikes(orders: Orders, what: str, times: int, **match: str) -> str:
     ],
 )
 def test_when_a_fault_strikes(fault: Fault, pattern: str) -> None:
-    orders = Orders()
+    orders = ActiveFaults()
     orders.add(fault)
     assert strikes(orders, "f", 12) == pattern
     assert orders.struck.get("f", 0) == pattern.count("x")
@@ -130,7 +130,7 @@ def test_when_a_fault_strikes(fault: Fault, pattern: str) -> None:
 
 def test_share_is_left_to_a_seeded_chance() -> None:
     def run(seed: int) -> str:
-        orders = Orders(seed)
+        orders = ActiveFaults(seed)
         orders.add(Fault("f", "lidar", share=0.3))
         return strikes(orders, "f", 1000)
 
@@ -139,7 +139,7 @@ def test_share_is_left_to_a_seeded_chance() -> None:
 
 
 def test_a_fault_may_be_meant_for_some_opportunities_only() -> None:
-    orders = Orders()
+    orders = ActiveFaults()
     orders.add(Fault("f", "lidar", count=2, values={"on": "replies"}))
     assert strikes(orders, "f", 3, on="scans") == "..."
     assert strikes(orders, "f", 3, on="replies") == "xx."
