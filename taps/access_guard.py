@@ -1,8 +1,8 @@
-"""Who may look and who may give orders: the Host and Origin of a request, and the token. Pure: no sockets.
+"""Access control of the web servers: Host and Origin of a request, and the token. Pure: no sockets.
 
-On loopback everybody on this computer may look. Whoever listens on other addresses, or takes orders, has a token; the
-page brings it in its first words on the WebSocket, never in an address that ends up in a log. A page of somebody
-else's in the same browser is kept out by its Origin, and by the Host that it would have to use.
+On loopback every user of this computer may watch. A server on other addresses, or one that accepts commands, requires a
+token. The page sends it in its first WebSocket message, never in a URL that reaches a log. Pages of other sites in the
+same browser are rejected by their Origin, and by the Host that they would have to use.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",
 }
-"""Of every answer. Nothing is fetched from outside, nothing inline runs, nobody frames it."""
+"""Headers of every response: no external resources, no inline scripts, no framing."""
 
 
 class TokenRefused(Exception):
-    """A token that cannot be used; the text says why and what to do."""
+    """An unusable token; the text gives the cause and a remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Guard:
     """The rules of one server.
 
     Attributes:
-        bind: address that is listened on. token: None: there is none. write: whether orders are taken at all.
+        bind: listening address. token: None: none is required. write: whether commands are accepted.
     """
 
     bind: str
@@ -52,16 +52,16 @@ class Guard:
 
     @property
     def local(self) -> bool:
-        """Whether only this computer reaches it."""
+        """Whether only this computer can connect."""
         return is_loopback(self.bind)
 
     @property
     def looks_need_token(self) -> bool:
-        """Whether the token is asked of those who only look."""
+        """Whether watching requires the token."""
         return not self.local
 
     def host_ok(self, host: str) -> bool:
-        """Whether a Host header names this computer: a name that somebody else's DNS turned to it does not."""
+        """Whether a Host header names this computer (against DNS rebinding)."""
         name = _name_of(host)
         if name in LOOPBACK or (name and name == self.bind.lower()):
             return True
@@ -71,29 +71,29 @@ class Guard:
         return _is_address(name) or name in (own, f"{own}.local", own.partition(".")[0])
 
     def origin_ok(self, origin: str | None, host: str) -> bool:
-        """Whether a WebSocket is opened by this page: browsers always say by which; other programs do not."""
+        """Whether a WebSocket was opened by this page: browsers always send an Origin, other programs do not."""
         return origin is None or origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
-    def token_ok(self, told: object) -> bool:
-        """Whether it is the token, in a time that tells nothing."""
-        if self.token is None or not isinstance(told, str) or len(told) > LONGEST_TOKEN:
+    def token_ok(self, token: object) -> bool:
+        """Compare a token in constant time."""
+        if self.token is None or not isinstance(token, str) or len(token) > LONGEST_TOKEN:
             return False
-        return hmac.compare_digest(told.encode(), self.token.encode())
+        return hmac.compare_digest(token.encode(), self.token.encode())
 
-    def may_look(self, told: object) -> bool:
-        """Whether one who told this may look."""
-        return self.local or self.token_ok(told)
+    def may_look(self, token: object) -> bool:
+        """Whether this token permits watching."""
+        return self.local or self.token_ok(token)
 
-    def may_order(self, told: object) -> bool:
-        """Whether one who told this may give orders."""
-        return self.write and self.token_ok(told)
+    def may_order(self, token: object) -> bool:
+        """Whether this token permits commands."""
+        return self.write and self.token_ok(token)
 
 
 def token_for(bind: str, write: bool, file: Path | None) -> str | None:
-    """The token to be used: of a file, else a fresh one where one is needed, else None.
+    """The token of a file, else a random one where one is required, else None.
 
     Raises:
-        TokenRefused: the file cannot be read, or what it holds is too short to be one.
+        TokenRefused: the file cannot be read, or its content is no valid token.
     """
     if file is None:
         return secrets.token_urlsafe(18) if write or not is_loopback(bind) else None
@@ -112,7 +112,7 @@ def token_for(bind: str, write: bool, file: Path | None) -> str | None:
 
 
 def is_loopback(bind: str) -> bool:
-    """Whether an address to listen on is reached from this computer only."""
+    """Whether a listening address can be reached from this computer only."""
     try:
         return bind == "localhost" or ipaddress.ip_address(bind).is_loopback
     except ValueError:

@@ -29,7 +29,17 @@ MAY_IMPORT = {
 
 ORDER = {
     "estimator": (
-        *("numerics", "measurements", "cdma", "result", "light_filter", "scan_matching", "fusion", "mapping"),
+        *(
+            "lazy_exports",
+            "numerics",
+            "measurements",
+            "cdma",
+            "result",
+            "light_filter",
+            "scan_matching",
+            "fusion",
+            "mapping",
+        ),
         *("relocalisation", "commands", "state", "pipeline", "calibration", "paper"),
     ),
     "hal": (
@@ -37,7 +47,7 @@ ORDER = {
         *("net", "port", "bus", "hokuyo", "photodiode", "registry", "replay", "fake"),
     ),
     "daemon": (
-        *("system", "config", "snapshot", "health", "devices", "maps", "integrity", "recording", "runtime"),
+        *("system", "config", "snapshot", "health", "devices", "maps", "integrity", "runtime", "recording"),
         *("publish", "environment", "app", "replay", "diagnosis", "commissioning", "cli", "__main__"),
     ),
     "taps": ("stream", "access_guard", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics", "fleet"),

@@ -1,1 +1,1 @@
-"""A tap that serves the live stream to Foxglove as ROS messages."""
+"""A live Foxglove server of the stream's ROS 2 messages."""

@@ -1,6 +1,6 @@
-"""`lumiloop foxglove`: a running daemon, live, for the Foxglove app: open a connection to ws://ADDRESS:8765.
+"""`lumiloop foxglove`: a WebSocket server of the running daemon for the Foxglove app (ws://ADDRESS:8765).
 
-The messages are those of the MCAP files. What stands still (map, mount, state) is said again to whoever subscribes.
+The messages are those of the MCAP files. Static data (map, mount, state) are repeated to a new subscriber.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
 from hal.run_server import run_until_stopped
 from taps.ros import types
-from taps.ros.messages import TOPICS, Out
-from taps.ros.stream_follower import follow
+from taps.ros.messages import TOPICS, RosMessage
+from taps.ros.stream_follower import forward
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     console.say(f"ws://{in_url(host)}:{bridge.port}")
     try:
         stream = Stream(args.stream or args.settings.name, WANTED)
-        asyncio.run(run_until_stopped(follow(stream, args.settings, bridge)))
+        asyncio.run(run_until_stopped(forward(stream, args.settings, bridge)))
     except NotTheStream as error:
         return console.fail(str(error))
     finally:
@@ -46,13 +46,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 class Bridge(ServerListener):
-    """The live server, and a channel for each topic."""
+    """The live server with a channel for each topic."""
 
     def __init__(self, host: str, port: int, name: str) -> None:
-        """Begin to serve; raises OSError or RuntimeError where it cannot be listened."""
+        """Begin to serve; raises OSError or RuntimeError where the address cannot be used."""
         self._context = foxglove.Context()
-        self._latest: dict[str, Out] = {}
-        self._again: set[str] = set()
+        self._latest: dict[str, RosMessage] = {}
+        self._repeat: set[str] = set()
         self._lock = threading.Lock()
         self._channels = {
             topic: foxglove.Channel(
@@ -69,12 +69,12 @@ class Bridge(ServerListener):
         )
         self.port = int(self._server.port)
 
-    def send(self, out: Out) -> None:
-        """One message to whoever has subscribed; before it what those who are new have missed."""
-        if self._again:
+    def send(self, out: RosMessage) -> None:
+        """Send one message to the subscribers; first repeat the latched ones that new subscribers lack."""
+        if self._repeat:
             with self._lock:
-                again, self._again = self._again, set()
-            for topic in again & set(self._latest):
+                repeat, self._repeat = self._repeat, set()
+            for topic in repeat & set(self._latest):
                 self._channels[topic].log(self._latest[topic].data, log_time=self._latest[topic].t_ns)
         channel = self._channels.get(out.topic)
         if channel is None:
@@ -85,9 +85,9 @@ class Bridge(ServerListener):
             channel.log(out.data, log_time=out.t_ns)
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """A client wants a topic: what was said of it last will be said again; called by the server's thread."""
+        """Repeat the topic's last message for a new subscriber; called by the server's thread."""
         with self._lock:
-            self._again.add(channel.topic)
+            self._repeat.add(channel.topic)
 
     def close(self) -> None:
         """Stop serving."""

@@ -1,8 +1,7 @@
-"""`lumiloop record-mcap OUT.mcap`: what a running daemon tells, as an MCAP file of ROS 2 messages, until interrupted.
+"""`lumiloop record-mcap OUT.mcap`: records the running daemon's stream as an MCAP file of ROS 2 messages.
 
-It ends while the disk still has room for the daemon's maps (``--reserve``). A recorder that is killed leaves a file
-without an index, which lacks at most half a second; `lumiloop export FILE.mcap --mcap WHOLE.mcap` makes a whole one of
-it.
+It stops while the disk still has room for the daemon's maps (``--reserve``). A killed recorder leaves a file without an
+index that lacks at most half a second; `lumiloop export FILE.mcap --mcap WHOLE.mcap` recovers it.
 """
 
 from __future__ import annotations
@@ -48,27 +47,27 @@ def main(args: argparse.Namespace) -> int:
         return console.fail(f"{args.out}: {error.strerror}; free space or name another file")
     finally:
         if file is not None and not file.messages:
-            _leave_none(args.out)
+            _remove_if_file(args.out)
     if not file.messages:
         return console.fail("nothing was told, and no file is left; is the daemon running?")
     console.say(f"{args.out}: {file.messages} messages")
     return console.OK
 
 
-def _leave_none(path: Path) -> None:
-    """An empty file is worth nothing, and who keeps so many of the latest files would give up a full one for it."""
-    if path.is_file():  # and no device
+def _remove_if_file(path: Path) -> None:
+    """Remove an empty file: a rotation of the latest files would delete a full one for it."""
+    if path.is_file():  # not a device
         with contextlib.suppress(OSError):
             path.unlink()
 
 
 async def record(stream: Stream, settings: Config, file: McapFile) -> None:
-    """Write all that is told, until cancelled.
+    """Write the stream until cancelled.
 
     Raises:
         NotTheStream: the other end is no daemon of this version.
         OSError: the file cannot be written.
-        NoRoom: its disk has no room but what is to stay free.
+        NoRoom: its disk has no room beyond the reserve.
     """
     translator = Translator(settings.lidar.mount)
     flushing = asyncio.ensure_future(_flush(file))
@@ -81,7 +80,7 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
                     console.say(f"recording {frame.name} into {file.path}")
                     translator = Translator(settings.lidar.mount)
                 else:
-                    for out in translator.take(frame):
+                    for out in translator.convert(frame):
                         file.write(out)
     finally:
         flushing.cancel()
@@ -89,9 +88,9 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
 
 
 async def _flush(file: McapFile) -> None:
-    """What has been told reaches the kernel also when nothing more comes."""
+    """Flush buffered messages also when no further ones arrive."""
     while True:
         await asyncio.sleep(FLUSH_S)
         if file.waiting:
-            with contextlib.suppress(NoRoom):  # the next message says it
+            with contextlib.suppress(NoRoom):  # the next message raises it again
                 file.flush()

@@ -1,4 +1,4 @@
-"""A running daemon's stream as ROS 2 messages, one after the other, for whoever sends them on."""
+"""Reads the daemon's live stream and passes it as ROS 2 messages to a sender (a node, a Foxglove server)."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from daemon.config.schema import Config
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Hello
 from daemon.system import console
-from taps.ros.messages import Out, Translator
+from taps.ros.messages import RosMessage, Translator
 
 
 class Sender(Protocol):
-    """Whoever sends them on."""
+    """A receiver of ROS 2 messages."""
 
-    def send(self, out: Out) -> None:
-        """One message."""
+    def send(self, out: RosMessage) -> None:
+        """Send one message."""
 
 
-async def follow(stream: Stream, settings: Config, sender: Sender) -> None:
-    """Pass on all that is told, until cancelled.
+async def forward(stream: Stream, settings: Config, sender: Sender) -> None:
+    """Convert and send the whole stream until cancelled.
 
     Raises:
         NotTheStream: the other end is no daemon of this version.
@@ -33,5 +33,5 @@ async def follow(stream: Stream, settings: Config, sender: Sender) -> None:
             elif isinstance(frame, Hello):
                 translator = Translator(settings.lidar.mount)
             else:
-                for out in translator.take(frame):
+                for out in translator.convert(frame):
                     sender.send(out)

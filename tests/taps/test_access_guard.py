@@ -86,7 +86,7 @@ def test_the_journal_is_told_no_token(
 ) -> None:
     said: list[str] = []
     monkeypatch.setattr(command, "to_journal", lambda: True)
-    monkeypatch.setattr(command, "stopping", stopped)
+    monkeypatch.setattr(command, "stop_event", stopped)
     monkeypatch.setattr("daemon.system.console.say", said.append)
     assert main(["view", "--write", "--port", "0"]) == 1
     assert "--token FILE" in capsys.readouterr().err

@@ -12,7 +12,7 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
 from daemon.cli import parser
 from daemon.system import console
-from taps.zenoh_session import BadEndpoint, config
+from taps.zenoh_session import BadEndpoint, session_config
 from tests.taps.routers import router
 
 
@@ -67,7 +67,7 @@ def test_a_certificate_that_is_none_is_said_and_not_waited_for(tmp_path: Path, c
     if content is not None:
         pem.write_text(content)
     with pytest.raises(BadEndpoint, match=said):
-        config("client", "tls/localhost:1", file)
+        session_config("client", "tls/localhost:1", file)
 
 
 async def interrupted(seconds: float) -> None:

@@ -20,7 +20,7 @@ from taps.foxglove import live
 from taps.foxglove.live import Bridge
 from taps.ros import types
 from taps.ros.messages import TOPICS
-from taps.ros.stream_follower import follow
+from taps.ros.stream_follower import forward
 from tests.taps.serving import served
 
 
@@ -49,7 +49,7 @@ async def watched(port: int, wanted: set[str]) -> tuple[dict[str, Any], dict[str
 def test_the_app_sees_every_topic_and_who_comes_late_gets_the_map(tmp_path: Path) -> None:
     async def run() -> tuple[dict[str, Any], dict[str, bytes]]:
         bridge = Bridge("127.0.0.1", 0, "agv")
-        running = asyncio.ensure_future(follow(Stream(tmp_path / "s", live.WANTED), Config(), bridge))
+        running = asyncio.ensure_future(forward(Stream(tmp_path / "s", live.WANTED), Config(), bridge))
         try:
             await asyncio.sleep(0.5)  # the map has been told by now, and is not told again
             return await watched(bridge.port, {"/scan", "/pose", "/map", "/tf", "/tf_static"})

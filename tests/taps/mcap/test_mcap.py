@@ -39,7 +39,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from taps.mcap import export
 from taps.mcap.recover import NotMcap, recover
 from taps.mcap.writer import McapFile
-from taps.ros.messages import TOPICS, Out
+from taps.ros.messages import TOPICS, RosMessage
 
 ROOT = Path(__file__).parents[3]
 MOUNT = (0.1, -0.02, math.radians(30.0))
@@ -181,7 +181,7 @@ def whole_file(path: Path, count: int = 400) -> None:
 def fill(file: McapFile, count: int) -> None:
     noise = np.random.default_rng(1)
     for number in range(count):
-        file.write(Out("/lumiloop/raw", 10**18 + number * 25_000_000, noise.bytes(200)))
+        file.write(RosMessage("/lumiloop/raw", 10**18 + number * 25_000_000, noise.bytes(200)))
 
 
 def test_an_export_of_another_build_s_recording_says_so(
@@ -202,7 +202,7 @@ def test_an_export_that_is_told_to_stop_leaves_nothing_half_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(args: argparse.Namespace) -> int:
-        with export._beside(args.tum) as part:
+        with export._replaced_on_success(args.tum) as part:
             part.write_bytes(b"half of it")
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(5.0)
@@ -231,9 +231,9 @@ def test_of_a_killed_writer_all_but_the_last_half_second_is_there(
     torn, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
     child = (
         "import os, time\nfrom pathlib import Path\n"
-        "from taps.mcap.writer import McapFile\nfrom taps.ros.messages import Out\n"
+        "from taps.mcap.writer import McapFile\nfrom taps.ros.messages import RosMessage\n"
         f"file = McapFile(Path({str(torn)!r}))\n"
-        "for n in range(400): file.write(Out('/lumiloop/raw', 10**18 + n * 25_000_000, os.urandom(200)))\n"
+        "for n in range(400): file.write(RosMessage('/lumiloop/raw', 10**18 + n * 25_000_000, os.urandom(200)))\n"
         "print('written', flush=True)\ntime.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", child], cwd=ROOT, stdout=subprocess.PIPE) as process:

@@ -18,7 +18,7 @@ from daemon.publish.stream.server import StreamServer
 from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
 from taps.access_guard import Guard
 from taps.view.page_hello import Scene
-from taps.view.replay_file import Film
+from taps.view.replay_file import ReplayFile
 from taps.view.server import TOPICS, View
 from tests.daemon.publish.stream.test_server import until
 
@@ -95,7 +95,7 @@ class Page:
 async def serving(
     folder: Path,
     guard: Guard | None = None,
-    film: Film | None = None,
+    film: ReplayFile | None = None,
     modbus: int = 0,
     scene: Scene | None = None,
     again: Callable[[], Scene] | None = None,
